@@ -1,0 +1,71 @@
+"""What a backend is: requests in, completions out, order kept.
+
+A backend batches, threads or loops inside as suits its engine; nothing else in the program knows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+Role = Literal["ego", "helper"]
+FinishReason = Literal["stop", "length", "error"]
+
+
+@dataclass(frozen=True)
+class Request:
+    """One question to a small language model.
+
+    Attributes:
+        id: unique in a run, `<scene>/<viewer>`.
+        role: which prompt of the version was rendered, and which schema the answer has.
+        messages: chat messages, `{"role": "system" | "user", "content": text}`.
+        actions: meta-action names, in the environment's order.
+        max_tokens: most tokens the answer may have.
+        thinking: whether the model was asked to think first (where its template can).
+        view: the viewer's own scene graph. Only backends that are no language model read it
+            (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
+        truth: scene graph with everything in view; None unless the card is `privileged`.
+    """
+
+    id: str
+    role: Role
+    messages: tuple[Mapping[str, str], ...]
+    actions: tuple[str, ...]
+    max_tokens: int
+    thinking: bool = False
+    view: Mapping[str, Any] | None = None
+    truth: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Completion:
+    """One answer.
+
+    Attributes:
+        request_id: the request's id.
+        text: what the model said, untouched; empty on error.
+        prompt_tokens: tokens in; None if the engine has no tokenizer.
+        completion_tokens: tokens out; None if the engine has no tokenizer.
+        finish_reason: `stop`, `length` (cut off by max_tokens) or `error`.
+        seconds: time of this answer, only where it was asked alone (batch_size 1), else None:
+            a batch's wall time is nobody's latency.
+        batch_size: how many requests went through the engine together.
+        error: the engine's message when finish_reason is `error`.
+    """
+
+    request_id: str
+    text: str
+    prompt_tokens: int | None
+    completion_tokens: int | None
+    finish_reason: FinishReason
+    seconds: float | None
+    batch_size: int
+    error: str | None = None
+
+
+class Backend(Protocol):
+    """An engine that answers."""
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in the same order. A failed request is a completion with an error."""
+        ...

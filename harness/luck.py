@@ -1,0 +1,21 @@
+"""Random draws keyed by content.
+
+A draw depends on what it is for (run seed, scene, link), never on when it was made, so order, batch
+size, workers and a resume cannot change it, and two operating points see the same luck.
+"""
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def generator(*key: object) -> np.random.Generator:
+    """Generator for one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
+    seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
+    return np.random.Generator(np.random.PCG64(int.from_bytes(seed, "big")))
+
+
+def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:
+    """Uniform draws in [0, 1) for one key."""
+    return generator(*key).random(shape)
