@@ -1,0 +1,159 @@
+"""The ego-centric scene graph: what one vehicle knows, as nodes, conflicts and sectors.
+
+Relative positions are in the viewer's frame: metres forward and to the left, headings in degrees
+counter-clockwise from the viewer's. Lane roles, sectors and conflicts are named from the *ego's* seat
+whoever looks, for helpers judge what the ego should do; a helper knows the ego's position and speed from
+the request, not from its sensors.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from harness.perception.rays import blocked_by, sweep
+from harness.perception.sensors import Detection, detect
+from harness.road import SECTORS, Path, conflict_zone, crossings, paths
+from harness.scene import SIZES_M, VehicleState, WorldState
+
+OCCLUDED_BELOW = 0.5  # share of a sector's approach in sight below which the sector counts as occluded
+SECTOR_REACH_M = (8.0, 50.0)  # stretch of the approach lane, from the conflict point, that is looked at
+ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
+
+Graph = dict[str, Any]
+
+
+def scene_graph(state: WorldState, viewer_id: str) -> Graph:
+    """What the sensors of one vehicle know."""
+    viewer = state.vehicle(viewer_id)
+    detections = detect(state, viewer, sweep(state, viewer))
+    return _graph(state, viewer, detections, _sectors(state, viewer))
+
+
+def truth_graph(state: WorldState) -> Graph:
+    """The ego's graph with everything in view and no noise: what only `full-view` may read."""
+    exact = [
+        Detection(
+            v.id, ("truth",), v.kind, "left" if v.route == "left" else "off",
+            v.x_m, v.y_m, v.heading_rad, v.speed_mps, None,
+        )
+        for v in state.vehicles[1:]
+    ]  # fmt: skip
+    return _graph(state, state.ego, exact, [])
+
+
+def _graph(state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]) -> Graph:
+    ego = state.ego
+    ego_arc = paths()["own", "straight"].project(ego.x_m, ego.y_m)[0]
+    nodes, conflicts = [], []
+    for d in detections:
+        path = _path_of(d)
+        arc = path.project(d.x_m, d.y_m)[0] if path else None
+        nodes.append(_node(viewer, d, path.lane_role(arc) if path and arc is not None else "off-lane"))
+        if path and arc is not None and d.id != ego.id:
+            conflict = _conflict(viewer, d, path, arc, ego, ego_arc)
+            conflicts += [conflict] if conflict else []
+    zone = conflict_zone()
+    return {
+        "viewer": viewer.id,
+        "role": "ego" if viewer.part == "ego" else "helper",
+        "step": state.step,
+        "self": {
+            "speed_mps": round(viewer.speed_mps, 1),
+            "lane": paths()[viewer.approach, viewer.route].lane_role(
+                paths()[viewer.approach, viewer.route].project(viewer.x_m, viewer.y_m)[0]
+            ),
+            "zone_m": round(float(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])), 1),
+        },
+        "ego": {
+            "id": ego.id,
+            "speed_mps": round(ego.speed_mps, 1),
+            "target_speed_mps": state.target_speed_mps,
+            "zone_m": round(paths()["own", "straight"].project(*zone)[0] - ego_arc, 1),
+            **_relative(viewer, ego.x_m, ego.y_m),
+        },
+        "nodes": nodes,
+        "conflicts": conflicts,
+        "sectors": sectors,
+    }
+
+
+def _relative(viewer: VehicleState, x_m: float, y_m: float) -> dict[str, float]:
+    dx, dy = x_m - viewer.x_m, y_m - viewer.y_m
+    cos, sin = np.cos(viewer.heading_rad), np.sin(viewer.heading_rad)
+    return {"forward_m": round(float(dx * cos + dy * sin), 1), "left_m": round(float(dx * sin - dy * cos), 1)}
+
+
+def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
+    heading = None
+    if d.heading_rad is not None:
+        turned = np.degrees(viewer.heading_rad - d.heading_rad)
+        heading = round(float((turned + 180) % 360 - 180))
+    return {
+        "id": d.id,
+        "type": d.kind or "vehicle",
+        **_relative(viewer, d.x_m, d.y_m),
+        "heading_deg": heading,
+        "speed_mps": round(d.speed_mps, 1),
+        "range_rate_mps": None if d.range_rate_mps is None else round(d.range_rate_mps, 1),
+        "lane": lane,
+        "indicator": d.indicator,
+        "sensors": list(d.sensors),
+    }
+
+
+def _path_of(d: Detection) -> Path | None:
+    """The path an object is taken to follow: the nearest that fits its heading, straight on unless it shows left."""
+    best, least = None, ON_PATH_M
+    for (_, route), path in paths().items():
+        arc, lateral, heading = path.project(d.x_m, d.y_m)
+        turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
+        if d.heading_rad is not None and turned < np.cos(np.radians(40.0)):
+            continue
+        # On the shared approach lane both routes fit alike; a turn shows by the indicator, or once it is under way.
+        before = arc < path.junction_m[0]
+        unlikely = before and (route == "left") != (d.indicator == "left")
+        cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
+        if lateral < ON_PATH_M and (best is None or cost < least):
+            best, least = path, cost
+    return best
+
+
+def _conflict(
+    viewer: VehicleState, d: Detection, path: Path, arc: float, ego: VehicleState, ego_arc: float
+) -> Graph | None:
+    crossing = crossings().get((path.approach, path.route))
+    if crossing is None:
+        return None
+    length = SIZES_M[d.kind or "car"][0]
+    to_go, ego_to_go = crossing.other_arc_m - arc, crossing.ego_arc_m - ego_arc
+    if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
+        return None
+    return {
+        "with": d.id,
+        "sector": path.approach,
+        "point": _relative(viewer, crossing.x_m, crossing.y_m),
+        "ego": _arrival(ego_to_go, ego.speed_mps),
+        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": round(d.speed_mps, 1)},
+    }
+
+
+def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
+    """Arc length left (m, negative once past) and the time it takes at constant speed (s), None at a standstill."""
+    return {
+        "arc_m": round(to_go_m, 1),
+        "time_s": round(to_go_m / speed_mps, 1) if speed_mps > 0.5 else None,
+    }
+
+
+def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
+    """How much of each sector's approach lane is in sight, and what hides the rest."""
+    found = []
+    for sector in SECTORS:
+        path = paths()[sector, "straight"]
+        end = path.junction_m[0] + 11.0
+        points = np.array([path.at(end - back)[:2] for back in np.linspace(*SECTOR_REACH_M, 15)])
+        blockers = blocked_by(state, viewer, points)
+        seen = sum(b is None for b in blockers) / len(blockers)
+        hiding = sorted({b for b in blockers if b is not None})
+        found.append({"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding})
+    return found
