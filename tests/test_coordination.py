@@ -1,0 +1,236 @@
+"""Cooperative decisions played by hand: read them as the specification.
+
+One scene throughout. The ego is 20 m from the conflict zone and in doubt. Three helpers at 10, 20 and
+30 m from the ego, and 10, 20 and 5 m from the zone, answer in 1000 bits each. Everybody infers for
+145 ms. Actions are SLOWER, IDLE, FASTER.
+"""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from harness.coordination import Coordination, Luck, coordinate
+from harness.operating_point import POINTS, OperatingPoint
+
+DOUBT = (0.3, 0.4, 0.3)
+ALONE, V2X, SIXG = POINTS["single-local"], POINTS["v2x"], POINTS["6g"]
+
+
+def play(
+    point: OperatingPoint,
+    own=DOUBT,
+    helpers=((0.8, 0.1, 0.1), (0.6, 0.2, 0.2), (0.0, 0.0, 1.0)),
+    valid=(True, True, True),
+    distance_m=(20.0, 10.0, 20.0, 5.0),
+    range_m=(10.0, 20.0, 30.0),
+    infer_s=(0.145, 0.145, 0.145, 0.145),
+    link=((0.9, 0.9), (0.9, 0.9), (0.9, 0.9)),
+    jitter=(0.0, 0.5, 1.0),
+) -> Coordination:
+    luck = Luck(np.array(link), np.array(jitter))
+    return coordinate(
+        point,
+        np.array(own),
+        np.array(helpers),
+        np.array(valid),
+        np.array(distance_m),
+        np.array(range_m),
+        np.full(len(valid), 1000.0),
+        np.array(infer_s),
+        luck,
+    )
+
+
+def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
+    decision = play(ALONE)
+    assert not decision.triggered
+    assert decision.messages == 0
+    assert np.isnan(decision.loss)
+    assert decision.fused.tolist() == list(DOUBT)
+    assert decision.action == 1
+    assert decision.latency_s == 0.145
+    assert not decision.deadline_missed
+
+
+def test_over_v2x_the_third_reply_is_late_and_not_fused_but_waited_for():
+    """Slots of 25.1 ms: replies end at 170.1, 195.2 and 220.3 ms. Weights are 1/20 : 1/10 : 1/20."""
+    decision = play(V2X)
+    assert decision.triggered
+    assert decision.arrival_s == pytest.approx([0.1701, 0.1952, 0.2203])
+    assert decision.on_time.tolist() == [True, True, False]
+    assert decision.weights == pytest.approx([0.25, 0.5, 0.25, 0.0])
+    assert decision.fused == pytest.approx([0.625, 0.2, 0.175])
+    assert decision.action == 0
+    assert decision.latency_s == pytest.approx(0.2203)
+    assert decision.deadline_missed
+    assert (decision.messages, decision.lost, decision.late) == (3, 0, 1)
+
+
+def test_over_6g_all_three_are_fused_and_the_slowest_is_the_latency():
+    """5 ms, 5 us of serialisation and 0, 0.95, 1.9 ms of jitter. Weights are 1/20 : 1/10 : 1/20 : 1/5."""
+    decision = play(SIXG)
+    assert decision.arrival_s == pytest.approx([0.150005, 0.150955, 0.151905])
+    assert decision.on_time.tolist() == [True, True, True]
+    assert decision.weights == pytest.approx([0.125, 0.25, 0.125, 0.5])
+    assert decision.fused == pytest.approx([0.3125, 0.1, 0.5875])
+    assert decision.action == 2
+    assert decision.latency_s == pytest.approx(0.151905)
+    assert not decision.deadline_missed
+    assert (decision.messages, decision.lost, decision.late) == (3, 0, 0)
+
+
+@pytest.mark.parametrize("lost_link", [(0.01, 0.9), (0.9, 0.01)], ids=["request", "reply"])
+def test_a_helper_whose_request_or_reply_is_lost_keeps_its_slot_and_is_not_fused(lost_link):
+    decision = play(V2X, link=(lost_link, (0.9, 0.9), (0.9, 0.9)))
+    assert decision.arrival_s == pytest.approx([np.inf, 0.1952, 0.2203])
+    assert decision.weights == pytest.approx([0.5, 0.0, 0.5, 0.0])
+    assert decision.fused == pytest.approx([0.45, 0.3, 0.25])
+    assert decision.latency_s == pytest.approx(0.2203)
+    assert (decision.messages, decision.lost, decision.late) == (3, 1, 1)
+
+
+def test_an_ego_that_hears_nobody_falls_back_to_its_own_intent():
+    decision = play(replace(SIXG, loss=1.0))
+    assert decision.triggered
+    assert decision.lost == 3
+    assert decision.fused.tolist() == list(DOUBT)
+
+
+def test_without_helpers_the_ego_asks_nobody_and_acts_at_once():
+    none = {"helpers": np.zeros((0, 3)), "valid": np.zeros(0, bool), "range_m": (), "jitter": ()}
+    decision = play(V2X, distance_m=(20.0,), infer_s=(0.145,), link=np.zeros((0, 2)), **none)
+    assert decision.triggered
+    assert decision.messages == 0
+    assert decision.fused.tolist() == list(DOUBT)
+    assert decision.latency_s == 0.145
+
+
+def test_a_sure_ego_does_not_ask():
+    decision = play(SIXG, own=(0.9, 0.05, 0.05))
+    assert not decision.triggered
+    assert decision.messages == 0
+    assert decision.action == 0
+    assert decision.latency_s == 0.145
+
+
+def test_an_entropy_equal_to_tau_does_not_ask():
+    tau_nats = float(play(SIXG).entropy_nats)
+    assert not play(replace(SIXG, tau_nats=tau_nats)).triggered
+    assert play(replace(SIXG, tau_nats=tau_nats - 1e-12)).triggered
+
+
+def test_an_invalid_helper_sends_nothing_and_takes_no_slot():
+    """Its rows are unknown; the third helper moves up to the second slot and is now on time."""
+    unknown = np.nan
+    decision = play(
+        V2X,
+        helpers=((0.8, 0.1, 0.1), (unknown, unknown, unknown), (0.0, 0.0, 1.0)),
+        valid=(True, False, True),
+        distance_m=(20.0, 10.0, unknown, 5.0),
+        range_m=(10.0, unknown, 30.0),
+        infer_s=(0.145, 0.145, unknown, 0.145),
+    )
+    assert decision.asked.tolist() == [True, False, True]
+    assert decision.arrival_s == pytest.approx([0.1701, np.inf, 0.1952])
+    assert decision.weights == pytest.approx([1 / 7, 2 / 7, 0.0, 4 / 7])
+    assert decision.latency_s == pytest.approx(0.1952)
+
+
+def test_only_the_nearest_in_the_radius_are_asked():
+    assert play(replace(SIXG, max_helpers=2), range_m=(30.0, 10.0, 20.0)).asked.tolist() == [
+        False,
+        True,
+        True,
+    ]
+    assert play(replace(SIXG, radius_m=20.0)).asked.tolist() == [True, True, False]
+    assert play(replace(SIXG, max_helpers=0)).messages == 0
+
+
+def test_a_reply_leaves_only_when_the_helper_has_its_own_answer():
+    decision = play(SIXG, infer_s=(0.145, 0.100, 0.160, 0.250), jitter=(0.0, 0.0, 0.0))
+    assert decision.arrival_s == pytest.approx([0.150005, 0.165005, 0.255005])
+    assert decision.on_time.tolist() == [True, True, False]
+    assert decision.latency_s == pytest.approx(0.255005)
+
+
+def test_a_failed_ego_answer_becomes_the_fallback_and_says_so():
+    failed = (np.nan, np.nan, np.nan)
+    uniform, brake = play(SIXG, own=failed), play(replace(SIXG, fallback="brake"), own=failed)
+    assert uniform.own_failed
+    assert brake.own_failed
+    assert not play(SIXG).own_failed
+    assert uniform.own == pytest.approx([1 / 3, 1 / 3, 1 / 3])
+    assert uniform.triggered
+    assert brake.own.tolist() == [1.0, 0.0, 0.0]
+    assert not brake.triggered
+    assert brake.action == 0
+
+
+def test_a_tie_goes_to_the_earlier_action():
+    assert play(ALONE, own=(0.2, 0.4, 0.4)).action == 1
+
+
+def test_density_coupling_counts_valid_helpers_in_the_radius_whether_asked_or_not():
+    crowd = replace(SIXG, density_coupled=True)
+    assert play(crowd).loss == pytest.approx(0.066)
+    assert play(replace(crowd, max_helpers=1)).loss == pytest.approx(0.066)
+    assert play(crowd, valid=(True, False, True)).loss == pytest.approx(0.036)
+    assert play(replace(crowd, radius_m=15.0)).loss == pytest.approx(0.006)
+    heard = play(crowd, link=((0.067, 0.9), (0.065, 0.9), (0.9, 0.065))).delivered
+    assert heard.tolist() == [True, False, False]
+
+
+def test_a_points_own_loss_replaces_the_profiles():
+    draws = ((0.05, 0.9), (0.9, 0.9), (0.9, 0.15))
+    assert play(V2X, link=draws).delivered.tolist() == [False, True, True]
+    assert play(replace(V2X, loss=0.02), link=draws).delivered.tolist() == [True, True, True]
+    assert play(replace(V2X, loss=0.2), link=draws).delivered.tolist() == [False, True, False]
+
+
+def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
+    draws = ((0.9, 0.05), (0.9, 0.9), (0.05, 0.9))
+    decision = play(replace(V2X, roadside_edge=True), link=draws)
+    assert decision.delivered.tolist() == [True, True, False]
+    assert decision.arrival_s == pytest.approx([0.1952, 0.2454, np.inf])
+    assert decision.on_time.tolist() == [True, False, False]
+
+
+def test_block_fading_is_one_draw_for_all_steps_of_an_episode():
+    """Two episodes of six steps, the link draws without the step axis filled in: 18 messages each."""
+    rng = np.random.default_rng(0)
+    link = rng.random((2, 1, 3, 2))
+    own, helpers = np.full((2, 6, 3), 1 / 3), rng.dirichlet(np.ones(3), (2, 6, 3))
+    ones = np.ones((2, 6, 3))
+    decisions = coordinate(
+        replace(SIXG, loss=0.4),
+        own,
+        helpers,
+        ones > 0,
+        np.ones((2, 6, 4)),
+        ones,
+        ones,
+        np.full((2, 6, 4), 0.145),
+        Luck(link, rng.random((2, 6, 3))),
+    )
+    assert decisions.messages.sum(axis=1).tolist() == [18, 18]
+    assert np.array_equal(decisions.delivered, np.repeat(decisions.delivered[:, :1], 6, axis=1))
+
+
+def test_every_array_of_a_batch_has_the_batch_in_front():
+    rng = np.random.default_rng(1)
+    decisions = coordinate(
+        SIXG,
+        rng.dirichlet(np.ones(3), (5, 2)),
+        rng.dirichlet(np.ones(3), (5, 2, 4)),
+        rng.random((5, 2, 4)) < 0.5,
+        rng.random((5, 2, 5)),
+        rng.random((5, 2, 4)),
+        rng.random((5, 2, 4)),
+        rng.random((5, 2, 5)),
+        Luck(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
+    )
+    per_helper = {"asked", "delivered", "arrival_s", "on_time"}
+    inner = {"own": (3,), "fused": (3,), "weights": (5,)} | dict.fromkeys(per_helper, (4,))
+    for field in fields(decisions):
+        assert getattr(decisions, field.name).shape == (5, 2, *inner.get(field.name, ())), field.name

@@ -1,0 +1,80 @@
+"""What an operating point may hold, and what the user reads when it may not."""
+
+import math
+from dataclasses import asdict, replace
+
+import pytest
+
+from harness.errors import UserError
+from harness.operating_point import POINTS, OperatingPoint, named_point
+
+
+def test_the_paper_has_three_operating_points_that_differ_only_in_the_channel():
+    assert {name: point.profile for name, point in POINTS.items()} == {
+        "single-local": None,
+        "v2x": "v2x",
+        "6g": "6g",
+    }
+    assert len({replace(point, name="x", profile=None) for point in POINTS.values()}) == 1
+
+
+@pytest.mark.parametrize("point", POINTS.values(), ids=POINTS)
+def test_a_point_survives_its_own_dictionary(point):
+    assert OperatingPoint.from_dict(asdict(point)) == point
+
+
+def test_a_table_without_a_profile_disables_v2v():
+    assert OperatingPoint.from_dict({"name": "alone"}).profile is None
+
+
+def test_one_and_one_point_zero_are_the_same_setting():
+    assert repr(OperatingPoint("x", "6g", tau_nats=1)) == repr(OperatingPoint("x", "6g", tau_nats=1.0))
+
+
+def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
+    point = OperatingPoint("x", "6g", tau_nats=0, loss=0, max_helpers=0)
+    assert (point.tau_nats, point.loss, point.max_helpers) == (0.0, 0.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"tau_nat": 0.7}, "unknown operating point setting 'tau_nat'; did you mean 'tau_nats'?"),
+        ({"profile": "v2v"}, "unknown channel profile 'v2v'; did you mean 'v2x'? known: 6g, v2x"),
+        ({"profile": ["v2x"]}, "unknown channel profile"),
+        ({"fallback": "break"}, "unknown fallback 'break'; did you mean 'brake'?"),
+        ({"consensus": "log"}, "unknown consensus rule 'log'"),
+        ({"tau_nats": -0.1}, "tau_nats is -0.1; it must be a finite number of nats, 0 or more"),
+        ({"tau_nats": math.nan}, "tau_nats is nan"),
+        ({"tau_nats": math.inf}, "tau_nats is inf"),
+        ({"tau_nats": 10**400}, "tau_nats is 1000"),
+        ({"tau_nats": True}, "tau_nats is True"),
+        ({"tau_nats": "0.7"}, "tau_nats is '0.7'"),
+        ({"window_s": 0}, "window_s is 0; it must be seconds above 0"),
+        ({"radius_m": 0.0}, "radius_m is 0.0; it must be metres above 0"),
+        ({"min_distance_m": 0}, "min_distance_m is 0; it must be metres above 0"),
+        ({"loss": 1.01}, "loss is 1.01; it must be a probability from 0 to 1"),
+        ({"max_helpers": 2.0}, "max_helpers is 2.0; it must be a whole number, 0 or more"),
+        ({"max_helpers": True}, "max_helpers is True"),
+        ({"max_helpers": -1}, "max_helpers is -1"),
+        ({"roadside_edge": 1}, "roadside_edge is 1; it must be true or false"),
+        ({"loss": 0.1, "density_coupled": True}, "loss is 0.1; it must be left out where density_coupled"),
+        ({"name": " "}, "operating point name ' ': give it some text"),
+    ],
+)
+def test_a_setting_that_is_not_allowed_is_one_line_that_names_it(settings, says):
+    with pytest.raises(UserError) as error:
+        OperatingPoint.from_dict({"name": "mine", "profile": "6g", **settings})
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_point_needs_a_name():
+    with pytest.raises(UserError, match="without a name"):
+        OperatingPoint.from_dict({"profile": "6g"})
+
+
+def test_an_unknown_point_is_told_the_nearest():
+    assert named_point("6g") is POINTS["6g"]
+    with pytest.raises(UserError, match="did you mean 'v2x'"):
+        named_point("v2xx")
