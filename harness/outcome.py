@@ -7,9 +7,10 @@ import numpy as np
 from shapely import Polygon
 from shapely.ops import nearest_points
 
+from harness.scenarios.occluded_intersection import Parameters
 from harness.scene import VehicleState
 
-Result = Literal["running", "cleared", "collision", "time_out", "off_road"]
+Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]
 
 # Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
 PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
@@ -21,8 +22,9 @@ class Outcome:
     """What became of the ego.
 
     Attributes:
-        result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (did not clear the
-            intersection in time) or `off_road`; `running` while undecided.
+        result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
+            intersection), `late` (cleared it too long after the full-view driver) or `off_road`;
+            `running` while undecided.
         time_s: when it was decided; None while running.
         partner: id of the vehicle the ego collided with.
         striker: whose front hit: `ego`, `other`, `both` or `neither` (a side swipe).
@@ -48,6 +50,14 @@ class Outcome:
     def success(self) -> bool:
         """Cleared the intersection without a collision and without a forced failure."""
         return self.result == "cleared"
+
+    def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
+        """The same outcome, `late` where the ego cleared too long after the full-view driver's `reference`."""
+        if self.success and reference.success and self.time_s is not None and reference.time_s is not None:
+            # Frames are 20 ms apart: half of one keeps rounding out of the comparison.
+            if self.time_s - reference.time_s > parameters.delay_allowance_s + 0.01:
+                return replace(self, result="late")
+        return self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
         """The same episode, decided."""

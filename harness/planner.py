@@ -7,53 +7,38 @@ cannot see, which is what makes occlusion cost something.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.road import crossings, paths
+from harness.scenarios.occluded_intersection import Parameters
 from harness.scene import SIZES_M
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What the planner knows of the ego and of time.
-
-    Attributes:
-        target_speeds_mps: what the meta-actions step through.
-        braking_mps2: hardest braking.
-        acceleration_mps2: hardest acceleration.
-        response_s: time constant of the speed controller (highway-env's TAU_ACC).
-        decision_period_s: seconds between two decisions.
-        horizon: decisions that are played through.
-        look_ahead_s: how far into the future a conflict is looked for.
-        margin_m: added to every outline, for noise and for what the model of motion leaves out.
-    """
-
-    target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
-    braking_mps2: float = 8.0
-    acceleration_mps2: float = 3.0
-    response_s: float = 0.6
-    decision_period_s: float = 1.0
-    horizon: int = 4
-    look_ahead_s: float = 9.0
-    margin_m: float = 1.0
-
-
+HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
+LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
+MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
+RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC)
 STEP_S = 0.1
+# A car is covered by three discs on its long axis: a third of its length apart, reaching its corners.
+DISCS_M = np.array([-1.0, 0.0, 1.0]) * SIZES_M["car"][0] / 3
+DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
 
 
-def plan(graph: Mapping[str, Any], actions: tuple[str, ...], limits: Limits = Limits()) -> str:
+def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
     """The planner's meta-action for a scene graph."""
-    sequences = list(product(actions, repeat=limits.horizon))
-    travelled = rollouts(sequences, graph["ego"]["speed_mps"], graph["ego"]["target_speed_mps"], limits)
+    left = parameters.decisions - graph["step"]
+    sequences = list(product(actions, repeat=min(HORIZON, left)))
+    ego = graph["ego"]
+    travelled = rollouts(sequences, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
     gap = np.full(len(sequences), np.inf)
     for conflict in graph["conflicts"]:
-        gap = np.minimum(gap, least_gap(travelled, conflict, limits))
+        gap = np.minimum(gap, least_gap(travelled, conflict))
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
     to_go = graph["ego"]["zone_m"] + 15.0
     arrival = (travelled < to_go).sum(axis=1) * STEP_S - 1e-3 * travelled[:, -1]
@@ -65,14 +50,16 @@ def plan(graph: Mapping[str, Any], actions: tuple[str, ...], limits: Limits = Li
     return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
 
 
-def rollouts(sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, limits: Limits) -> Array:
-    """Distance travelled (m) by each sequence, shape (sequences, look_ahead_s / STEP_S).
+def rollouts(
+    sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+) -> Array:
+    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
-    present speed, IDLE keeps the target.
+    present speed, IDLE keeps the target. `left` is how many decisions there still are.
     """
-    levels = np.array(limits.target_speeds_mps)
-    steps, every = round(limits.look_ahead_s / STEP_S), round(limits.decision_period_s / STEP_S)
+    levels = np.array(parameters.target_speeds_mps)
+    steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
     shift = {"FASTER": 1, "SLOWER": -1, "IDLE": 0}
     moves = np.array([[shift[a] for a in s] for s in sequences])
     speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
@@ -80,27 +67,30 @@ def rollouts(sequences: list[tuple[str, ...]], speed_mps: float, target_mps: flo
     gone = np.zeros(len(sequences))
     spacing = levels[-1] / (len(levels) - 1)
     for k in range(steps):
-        if k % every == 0:
-            n = k // every
+        n = k // every
+        if k % every == 0 and n < left:
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
             level = np.clip(np.round(speed / spacing).astype(int) + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = np.clip((target - speed) / limits.response_s, -limits.braking_mps2, limits.acceleration_mps2)
+        change = np.clip((target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2)
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[:, k] = gone
     return travelled
 
 
-def least_gap(travelled: Array, conflict: Mapping[str, Any], limits: Limits) -> Array:
-    """Smallest gap (m) to one other vehicle, per sequence; at or below zero they meet.
-
-    Both are boxes that cross at right angles at the conflict point: the gap is the larger of the two
-    distances, along the ego's path and along the other's, by which they miss each other.
-    """
-    length, width = SIZES_M["car"]
-    reach = length / 2 + width / 2 + limits.margin_m
+def least_gap(travelled: Array, conflict: Mapping[str, Any]) -> Array:
+    """Smallest gap (m) to one other vehicle that keeps its path and speed, per sequence; below zero they meet."""
+    key = (conflict["sector"], conflict["route"])
+    mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
-    mine = np.abs(conflict["ego"]["arc_m"] - travelled) - reach
-    its = np.abs(conflict["other"]["arc_m"] - conflict["other"]["speed_mps"] * time_s) - reach
-    return np.asarray(np.maximum(mine, its).min(axis=1))
+    ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
+    other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
+    # The ego's path is a line of constant x, so its discs differ in y alone.
+    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])[..., None] + DISCS_M
+    heading = its.headings_rad[np.searchsorted(its.arc_m, other_arc).clip(0, len(its.arc_m) - 1)]
+    other_x = np.interp(other_arc, its.arc_m, its.points[:, 0])[:, None] + np.cos(heading)[:, None] * DISCS_M
+    other_y = np.interp(other_arc, its.arc_m, its.points[:, 1])[:, None] + np.sin(heading)[:, None] * DISCS_M
+    squared = (crossing.x_m - other_x[:, None, :]) ** 2 + (ego_y[..., None] - other_y[:, None, :]) ** 2
+    nearest = np.sqrt(squared.min(axis=(1, 2, 3)))
+    return np.asarray(nearest - 2 * DISC_RADIUS_M - MARGIN_M)

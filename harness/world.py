@@ -5,6 +5,7 @@ are stepped here rather than by `env.step`, so that an episode ends in the frame
 """
 
 import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from harness.road import APPROACHES, JUNCTION_M, Path, paths
 from harness.scenarios.occluded_intersection import NAME, Layout, Parameters, Spawn, layout
 from harness.scene import SIZES_M, VehicleState, WorldState
 
+Snapshot = Mapping[str, Any]
 NODES = {approach: n for n, approach in enumerate(APPROACHES)}
 
 
@@ -37,13 +39,14 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane."""
 
     braking_mps2 = 4.0
+    standoff_m = 2.0
 
     def speed_control(self, target_speed: float) -> float:
-        """Acceleration in m/s²: never faster than at the start, braking late and only as hard as needed."""
+        """Acceleration in m/s²: brakes once the room left calls for its braking; never speeds up."""
         for other in self.road.vehicles:
             if other.lane_index == self.lane_index and self.speed > other.speed:
                 ahead = float(np.dot(other.position - self.position, self.direction))
-                room = ahead - (self.LENGTH + other.LENGTH) / 2 - 2.0
+                room = ahead - (self.LENGTH + other.LENGTH) / 2 - self.standoff_m
                 if ahead > 0 and (self.speed - other.speed) ** 2 > 2 * self.braking_mps2 * room:
                     return -2 * self.braking_mps2
         return 0.0
@@ -109,11 +112,17 @@ class OccludedIntersectionEnv(IntersectionEnv):  # type: ignore[misc]
 
 def _spawned(road: Road, spawn: Spawn, p: Parameters) -> ControlledVehicle:
     path = paths()[spawn.approach, spawn.route]
-    route = _lanes(path)
     section = int(np.searchsorted(path.junction_m, spawn.arc_m, side="right"))
-    lane = road.network.get_lane(route[section])
+    lane = road.network.get_lane(_lanes(path)[section])
     arc_in_lane = spawn.arc_m - (0.0, *path.junction_m)[section]
-    position, heading = lane.position(arc_in_lane, 0.0), lane.heading_at(arc_in_lane)
+    return _vehicle(road, spawn, p, section, lane.position(arc_in_lane, 0.0), lane.heading_at(arc_in_lane))
+
+
+def _vehicle(
+    road: Road, spawn: Spawn, p: Parameters, section: int, position: Sequence[float], heading: float
+) -> ControlledVehicle:
+    """A vehicle on the given section of its route: approach, junction or exit."""
+    route = _lanes(paths()[spawn.approach, spawn.route])
     arguments = {"heading": heading, "speed": spawn.speed_mps, "target_lane_index": route[section], "route": route}
     vehicle: ControlledVehicle
     if spawn.part == "ego":
@@ -124,6 +133,11 @@ def _spawned(road: Road, spawn: Spawn, p: Parameters) -> ControlledVehicle:
     vehicle.spawn = spawn
     vehicle.on_state_update()
     return vehicle
+
+
+def _spawn(v: VehicleState) -> Spawn:
+    arc = paths()[v.approach, v.route].project(v.x_m, v.y_m)[0]
+    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps)
 
 
 def _lanes(path: Path) -> list[tuple[str, str, int]]:
@@ -169,6 +183,30 @@ class World:
     def branch(self) -> "World":
         """A copy that goes its own way."""
         return copy.deepcopy(self)
+
+    def snapshot(self) -> Snapshot:
+        """What `thaw` needs besides `state()` to go on exactly as this world would."""
+        vehicles = self.env.road.vehicles
+        sections = [v.route.index(v.target_lane_index) for v in vehicles]
+        return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
+
+    @classmethod
+    def thaw(cls, state: WorldState, snapshot: Snapshot) -> "World":
+        """The world that `state` and `snapshot` were taken from, before its episode was decided."""
+        env = OccludedIntersectionEnv(config={"episode_seed": state.episode_seed})
+        vehicles = []
+        for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
+            vehicle = _vehicle(env.road, _spawn(v), env.parameters, section, (v.x_m, v.y_m), v.heading_rad)
+            vehicle.crashed = v.crashed
+            vehicles.append(vehicle)
+        ego = vehicles[0]
+        ego.speed_index = snapshot["speed_index"]
+        ego.target_speed = ego.index_to_speed(ego.speed_index)
+        env.layout = replace(env.layout, buildings=state.buildings)
+        env.road.vehicles = vehicles
+        env.controlled_vehicles = vehicles[:1]
+        env.define_spaces()  # binds the action type to the ego
+        return cls(env, state.episode_seed, state.step, snapshot["frame"])
 
     def state(self) -> WorldState:
         """What is where, now."""

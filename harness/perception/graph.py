@@ -131,6 +131,7 @@ def _conflict(
     return {
         "with": d.id,
         "sector": path.approach,
+        "route": path.route,
         "point": _relative(viewer, crossing.x_m, crossing.y_m),
         "ego": _arrival(ego_to_go, ego.speed_mps),
         "other": {**_arrival(to_go, d.speed_mps), "speed_mps": round(d.speed_mps, 1)},

@@ -16,6 +16,7 @@ from harness.road import crossings, paths
 from harness.scene import Building, Kind, Part
 
 NAME = "occluded-intersection"
+ACTIONS = ("SLOWER", "IDLE", "FASTER")  # the environment's own names and order; a test holds them together
 BUILDING_END_M = 70.0  # outer walls, from the centre lines
 
 
@@ -32,7 +33,9 @@ class Parameters:
         decisions: decisions an episode.
         decision_period_s: seconds between two decisions.
         simulation_hz: frames a second.
-        time_limit_s: an ego that has not cleared the intersection by then has failed.
+        time_limit_s: an ego that has not cleared the intersection by then never will.
+        delay_allowance_s: how much later than the full-view driver an ego may clear the intersection. A
+            needless SLOWER costs about 0.65 s: one is forgiven, two are not.
         cleared_m: arc length behind the junction's exit at which the ego's centre has cleared it.
         danger_share: probability that an episode holds a danger.
         sector_shares: probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33).
@@ -57,13 +60,14 @@ class Parameters:
     decision_period_s: float = 1.0
     simulation_hz: int = 50
     time_limit_s: float = 10.0
+    delay_allowance_s: float = 1.0
     cleared_m: float = 2.5
-    danger_share: float = 0.6
+    danger_share: float = 0.58
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
-    danger_offset_s: tuple[float, float] = (-0.35, 0.35)
+    danger_offset_s: tuple[float, float] = (-0.4, 1.2)
     crossing_speed_mps: tuple[float, float] = (9.0, 13.0)
     turning_speed_mps: tuple[float, float] = (7.5, 8.5)
-    corner_m: tuple[float, float] = (7.0, 11.0)
+    corner_m: tuple[float, float] = (8.0, 18.0)
     truck_share: float = 0.5
     late_share: float = 0.4
     late_speed_mps: tuple[float, float] = (7.0, 9.0)
