@@ -1,0 +1,1 @@
+"""Frozen datasets: scenes taken out of the simulator, with what every action leads to."""

@@ -1,0 +1,128 @@
+"""`harness dataset build`: episodes into a folder, in any number of processes, and on after a kill.
+
+Each finished episode is a file of its own under `.building/`; when all are there they become one
+`scenes.jsonl`. The bytes depend on the scenario, the seed and the number of episodes alone.
+"""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from harness import __version__
+from harness.dataset.freeze import Behaviour, freeze
+from harness.dataset.schema import manifest_schema, record_schema, record_validator
+from harness.errors import UserError, printable
+from harness.files import canonical_json, sha256_bytes, write_whole
+from harness.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
+from harness.workers import spread
+
+WORK = ".building"
+
+
+def build(
+    out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Build a dataset in `out`.
+
+    Args:
+        out: folder to make; its name is the dataset's name.
+        episodes: how many; episode e has layout seed `seed + e`.
+        seed: first layout seed.
+        workers: processes.
+        progress: called with the number of episodes just finished.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        UserError: the folder holds a finished dataset, or one begun with other settings, or something else.
+    """
+    config = {
+        "scenario": NAME,
+        "actions": list(ACTIONS),
+        "parameters": asdict(Parameters()),
+        "behaviour": asdict(Behaviour()),
+        "episodes": episodes,
+        "seed": seed,
+        "versions": {"harness": __version__, **{name: version(name) for name in ("highway-env", "numpy", "shapely")}},
+    }
+    work = _begin(out, json.loads(canonical_json(config)))
+    done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
+    progress(len(done))
+    todo = sorted(set(range(episodes)) - set(done))
+    spread(partial(_freeze_to_file, work, seed), todo, workers, progress)
+
+    shards = [(work / _shard(e)).read_bytes() for e in range(episodes)]
+    files = {
+        "README.md": _readme(out.name, config).encode(),
+        "scenes.jsonl": b"".join(shards),
+        "scene.schema.json": _pretty(record_schema(ACTIONS)),
+        "manifest.schema.json": _pretty(manifest_schema()),
+    }
+    manifest = {
+        "format": "swarmdrive-dataset/1",
+        "name": out.name,
+        **config,
+        "decisions": sum(shard.count(b"\n") for shard in shards),
+        "files": {name: sha256_bytes(data) for name, data in files.items()},
+    }
+    for name, data in files.items():
+        write_whole(out / name, data)
+    write_whole(out / "manifest.json", _pretty(manifest))
+    shutil.rmtree(work)
+    return manifest
+
+
+def _begin(out: Path, config: dict[str, Any]) -> Path:
+    """The working folder, new or the one a killed build left. Refuses to touch anything else."""
+    shown = printable(out)
+    if (out / "manifest.json").exists():
+        raise UserError(f"--out {shown} already holds a finished dataset; choose another folder or delete it")
+    work = out / WORK
+    if (work / "config.json").is_file():
+        if json.loads((work / "config.json").read_text()) != config:
+            raise UserError(
+                f"--out {shown} holds a build begun with other settings; repeat those to continue it, or delete it"
+            )
+    elif out.is_dir() and any(p.name != WORK for p in out.iterdir()):
+        raise UserError(f"--out {shown} is a folder with other files in it; choose an empty or a new one")
+    elif out.exists() and not out.is_dir():
+        raise UserError(f"--out {shown} is a file; choose a folder")
+    write_whole(work / "config.json", canonical_json(config))
+    return work
+
+
+def _shard(episode: int) -> str:
+    return f"{episode:05d}.jsonl"
+
+
+def _freeze_to_file(work: Path, seed: int, episode: int) -> None:
+    lines = [canonical_json(record) + "\n" for record in freeze(seed + episode, episode, Behaviour())]
+    for line in lines:
+        for error in record_validator(ACTIONS).iter_errors(json.loads(line)):
+            raise AssertionError(f"episode {episode} breaks its own schema at {error.json_path}: {error.message}")
+    write_whole(work / _shard(episode), "".join(lines))
+
+
+def _pretty(value: Any) -> bytes:
+    return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def _readme(name: str, config: dict[str, Any]) -> str:
+    return f"""# {name}
+
+{config["episodes"]} episodes of `{config["scenario"]}`, seeds {config["seed"]} to \
+{config["seed"] + config["episodes"] - 1}, one record a decision point.
+Built by `harness dataset build {config["scenario"]} --episodes {config["episodes"]} --seed {config["seed"]}`.
+
+- `scenes.jsonl`: one JSON object a line; fields and units in `scene.schema.json`.
+- `manifest.json`: scenario parameters, behaviour, versions, and the sha256 of every file.
+
+Each record holds the whole state, every viewer's scene graph, and an outcome table: each meta-action taken,
+followed by the full-view driver until the episode ends. `harness dataset check` verifies all of it.
+"""

@@ -1,0 +1,92 @@
+"""Freezing an episode: one record a decision point, with an outcome table for look-up later.
+
+The behaviour that leads the ego through is declared and varied (`Behaviour`): it drives as `cruise` or
+`local-view`, now and then takes a random action, and is only stopped at the last moment. Where its action
+would end badly, the best safe action is taken instead and `full-view` drives on. So every episode comes as
+close to failure as that behaviour gets, and still has all its decision points.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from harness import luck
+from harness.drivers import PRIVILEGED
+from harness.live import decide, finish
+from harness.outcome import Outcome
+from harness.perception.graph import scene_graph
+from harness.road import JUNCTION_M, LANE_WIDTH_M, conflict_zone
+from harness.world import World
+
+Record = dict[str, Any]
+
+ROAD = {"kind": "four-way intersection", "lane_width_m": LANE_WIDTH_M, "junction_m": JUNCTION_M, "ego": "own/straight"}
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """Who drives the ego through a frozen episode.
+
+    Attributes:
+        cruise_share: probability that an episode is led by `cruise`, else by `local-view`.
+        random_share: probability that a decision is a random action instead.
+    """
+
+    cruise_share: float = 0.6
+    random_share: float = 0.1
+
+
+def freeze(seed: int, episode: int, behaviour: Behaviour) -> list[Record]:
+    """Every decision point of one episode."""
+    world = World.start(seed)
+    chance = luck.generator("behaviour", seed)
+    driver = "cruise" if chance.random() < behaviour.cruise_share else "local-view"
+    records = []
+    while not world.outcome.ended and world.step < world.env.parameters.decisions:
+        outcomes = {action: rollout(world, action) for action in world.actions}
+        action, reason = decide(driver, world), driver
+        if chance.random() < behaviour.random_share:
+            action, reason = world.actions[int(chance.integers(len(world.actions)))], "random"
+        safe = [a for a in world.actions if outcomes[a].success]
+        if safe and action not in safe:
+            action, reason = min(safe, key=lambda a: outcomes[a].time_s or np.inf), "guard"
+            driver = PRIVILEGED
+        records.append(_record(world, episode, outcomes, {"action": action, "reason": reason}))
+        world.act(action)
+    return records
+
+
+def rollout(world: World, action: str) -> Outcome:
+    """What becomes of the ego if it takes an action now and the full-view driver takes the rest.
+
+    `least_gap_m` and `other_crashes` count from now on.
+    """
+    branch = world.branch()
+    branch.outcome = Outcome()
+    branch.act(action)
+    return finish(branch, PRIVILEGED)
+
+
+def _record(world: World, episode: int, outcomes: dict[str, Outcome], behaviour: dict[str, str]) -> Record:
+    state = world.state()
+    zone = conflict_zone()
+    viewers = (state.ego, *state.helpers)
+    return {
+        "scene": f"{episode:05d}-{state.step}",
+        "episode": episode,
+        "episode_seed": world.seed,
+        "step": state.step,
+        "road": ROAD,
+        "danger": {"sector": world.env.layout.danger, "vehicle": world.env.layout.danger_id},
+        "behaviour": behaviour,
+        "state": state.to_dict(),
+        "graphs": {v.id: scene_graph(state, v.id) for v in viewers},
+        "distance_m": {v.id: round(float(np.hypot(v.x_m - zone[0], v.y_m - zone[1])), 3) for v in viewers},
+        "outcomes": {action: _row(outcome) for action, outcome in outcomes.items()},
+        "snapshot": world.snapshot(),
+    }
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    return asdict(replace(outcome, least_gap_m=round(outcome.least_gap_m, 3)))
