@@ -69,3 +69,7 @@ class Backend(Protocol):
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in the same order. A failed request is a completion with an error."""
         ...
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the answers, as JSON: engine, versions, weights, settings. It goes in the manifest."""
+        ...

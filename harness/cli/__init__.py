@@ -7,6 +7,7 @@ import sys
 
 import typer
 
+from harness.cli import model
 from harness.errors import UserError
 
 app = typer.Typer(
@@ -17,6 +18,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.add_typer(model.app, name="model")
 
 
 def main() -> None:

@@ -1,0 +1,51 @@
+"""A checkpoint's chat template and tokenizer: messages in, the prompt that its model reads out."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from harness.cards import Thinking
+from harness.errors import UserError, printable
+
+
+class Chat:
+    """A tokenizer that has a chat template."""
+
+    def __init__(self, name: str, tokenizer: Any) -> None:
+        self.name = name
+        self.tokenizer = tokenizer
+        self.template = str(tokenizer.get_chat_template())
+        self._switch = "enable_thinking" in self.template
+
+    @property
+    def thinking(self) -> Thinking:
+        """What the template can do; `always` if its prompt opens a thought that nothing can switch off."""
+        if self._switch:
+            return "switch"
+        prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
+        return "always" if prompt.rstrip().endswith("<think>") else "none"
+
+    def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
+        """The prompt as the model reads it. Raises UserError where the template refuses the messages."""
+        from jinja2 import TemplateError
+
+        switch = {"enable_thinking": thinking} if self._switch else {}
+        try:
+            text: str = self.tokenizer.apply_chat_template(
+                [dict(message) for message in messages], tokenize=False, add_generation_prompt=True, **switch
+            )
+        except TemplateError as error:
+            raise UserError(
+                f"model {self.name!r}: its chat template refuses the messages "
+                f"({printable(error)}); use a prompt with roles that it knows"
+            ) from None
+        return text
+
+    def encode(self, prompt: str) -> list[int]:
+        """Token ids of a rendered prompt; the template has written BOS already, where there is one."""
+        ids: list[int] = self.tokenizer(prompt, add_special_tokens=False)["input_ids"]
+        return ids
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Text of an answer without its special tokens; `<think>` is none in Qwen3's tokenizer, and stays."""
+        text: str = self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False)
+        return text

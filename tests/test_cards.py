@@ -1,0 +1,169 @@
+"""Model cards: what a user may write after --model, and what a card file may say."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from harness import cards
+from harness.errors import UserError
+
+MINIMAL = """\
+engine = "driver"
+description = "d"
+[latency]
+source = "card"
+inference_s = 0
+basis = "declared: none"
+"""
+
+
+def write_card(folder: Path, text: str) -> None:
+    (folder / "models").mkdir(exist_ok=True)
+    (folder / "models" / "mine.toml").write_text(text)
+
+
+@pytest.fixture
+def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A shelf of cards of our own."""
+    monkeypatch.setattr(cards, "folder", lambda kind: tmp_path / kind)
+    return tmp_path
+
+
+def test_every_shipped_card_loads_under_its_file_name() -> None:
+    assert cards.names() == ["brake", "cruise", "full-view", "local-view", "proxy", "qwen3-4b"]
+    assert [cards.load(name).name for name in cards.names()] == cards.names()
+
+
+def test_only_full_view_sees_the_truth() -> None:
+    assert [name for name in cards.names() if cards.load(name).privileged] == ["full-view"]
+
+
+def test_the_proxy_cites_the_papers_latency_and_the_language_model_declares_none() -> None:
+    assert cards.load("proxy").latency == cards.Latency(
+        "card", 0.145, "cited: SwarmDrive paper, single local 145.0 ms"
+    )
+    qwen = cards.load("qwen3-4b")
+    assert (qwen.weights, qwen.dtype, qwen.thinking, qwen.context_tokens, qwen.licence) == (
+        "Qwen/Qwen3-4B",
+        "bfloat16",
+        "switch",
+        32768,
+        "Apache-2.0",
+    )
+    assert (qwen.latency.source, qwen.latency.inference_s) == ("measured", None)
+
+
+def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
+    write_card(shelf, MINIMAL)
+    assert cards.names() == ["mine"]
+    card = cards.resolve("mine")
+    assert (card.name, card.engine, card.weights, card.thinking) == ("mine", "driver", None, "none")
+    assert card.latency.inference_s == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("engine =", "motor ="), ["mine.toml", "motor", "engine"]),
+        (('basis = "declared: none"', 'basis = "b"\nspeed = 3'), ["[latency]", "speed", "inference_s"]),
+        (('"driver"', '"drivr"'), ["engine", "drivr", "did you mean 'driver'"]),
+        (('source = "card"', 'source = "guess"'), ["source", "guess", "measured"]),
+        (('description = "d"', "description = 3"), ["description", "3", "str"]),
+        (('description = "d"', ""), ["description", "add it"]),
+        (('description = "d"', 'description = "d"\ncontext_tokens = true'), ["context_tokens", "int"]),
+        (('description = "d"', 'description = "d"\nmax_new_tokens = 0'), ["max_new_tokens = 0", "1 or more"]),
+        (('description = "d"', 'description = "d"\nweights = "a/b"'), ["weights", "transformers"]),
+        (('"driver"', '"transformers"'), ["weights", "transformers"]),
+        (('"driver"', '"proxy"\nprivileged = true'), ["privileged", "driver"]),
+        (("inference_s = 0", ""), ["inference_s", "card"]),
+        (('source = "card"', 'source = "measured"'), ["inference_s", "card"]),
+        (("inference_s = 0", "inference_s = -1.0"), ["inference_s = -1.0", "0 or more"]),
+        (("inference_s = 0", "inference_s = nan"), ["inference_s = nan", "0 or more"]),
+        (("inference_s = 0", "inference_s = true"), ["inference_s", "float"]),
+        (("[latency]", "[latency"), ["mine.toml", "no TOML"]),
+    ],
+)
+def test_a_mistake_in_a_card_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    broken = MINIMAL.replace(*change)
+    assert broken != MINIMAL
+    write_card(shelf, broken)
+    with pytest.raises(UserError) as caught:
+        cards.load("mine")
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in ["mine.toml", *said]:
+        assert part in message
+
+
+def test_a_directory_with_a_config_is_a_transformers_model_named_after_it(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "my-model"
+    checkpoint.mkdir()
+    (checkpoint / "config.json").write_text("{}")
+    card = cards.resolve(str(checkpoint))
+    assert (card.name, card.engine, card.weights) == ("my-model", "transformers", str(checkpoint.resolve()))
+    assert (card.latency.source, card.thinking, card.dtype) == ("measured", "none", "auto")
+
+
+def test_a_directorys_thinking_switch_is_read_from_its_chat_template(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "tokenizer_config.json").write_text(json.dumps({"chat_template": "{{ enable_thinking }}"}))
+    assert cards.resolve(str(tmp_path)).thinking == "switch"
+
+
+def test_a_text_with_a_slash_that_is_no_directory_is_a_hub_id() -> None:
+    card = cards.resolve("someone/some-model-1.5B")
+    assert (card.name, card.engine, card.weights) == (
+        "someone/some-model-1.5B",
+        "transformers",
+        "someone/some-model-1.5B",
+    )
+
+
+def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
+    run = tmp_path / "run-7"
+    run.mkdir()
+    card = cards.resolve(f"replay:{run}")
+    assert (card.name, card.engine, card.weights) == ("replay:run-7", "replay", str(run.resolve()))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "cruise", "replay:RUN_DIR"]),
+        ("./no/such/dir", ["'./no/such/dir'", "no directory", "hub id"]),
+        ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),
+        ("replay:", ["'replay:'", "no such run directory"]),
+        ("../models/proxy", ["'../models/proxy'", "no directory"]),
+    ],
+)
+def test_a_model_that_is_nothing_says_what_would_be_one(text: str, said: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        cards.resolve(text)
+    for part in said:
+        assert part in str(caught.value)
+
+
+def test_a_directory_without_a_config_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"holds no config\.json; give the directory of a transformers"):
+        cards.resolve(str(tmp_path))
+
+
+@given(st.text(max_size=60))
+@example("~nobody-of-that-name/x")
+@example("x" * 5000)
+@example("a/" + "b" * 5000)
+@example("\0/\x1b[31m")
+@example("replay:\0")
+def test_whatever_is_typed_is_a_hub_id_or_one_printable_line(text: str) -> None:
+    try:
+        card = cards.resolve(text)
+    except UserError as error:
+        message = str(error)
+        assert message.isprintable(), message
+    else:
+        assert (card.name, card.engine) == (text, "transformers")

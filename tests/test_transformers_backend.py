@@ -1,0 +1,360 @@
+"""The transformers backend, played on a real tiny Qwen3 with random weights."""
+
+import shutil
+import socket
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("transformers", reason="needs the transformers extra")
+
+import tiny_qwen3
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness.backends import checkpoint, checkup
+from harness.backends.base import Completion, Request
+from harness.backends.registry import missing, open_backend
+from harness.backends.transformers_backend import TransformersBackend
+from harness.cards import Card, Latency, load, resolve
+from harness.errors import UserError
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny-qwen3")
+
+
+@pytest.fixture(scope="module")
+def backend(tiny: Path) -> TransformersBackend:
+    return open_tiny(tiny)
+
+
+def open_tiny(folder: Path, batch_size: int = 8, **options: str) -> TransformersBackend:
+    opened = open_backend(resolve(str(folder)), batch_size=batch_size, device="cpu", **options)
+    assert isinstance(opened, TransformersBackend)
+    return opened
+
+
+def ask(i: int, *, max_tokens: int = 24, thinking: bool = False, text: str = "") -> Request:
+    """Scene i: the prompts differ in length, and the answers in where they stop."""
+    messages = (
+        {"role": "system", "content": "You drive."},
+        {"role": "user", "content": text or f"Scene {i * 'x'}: truck {i * 7} m"},
+    )
+    return Request(f"s{i}/ego", "ego", messages, ("SLOWER", "IDLE", "FASTER"), max_tokens, thinking)
+
+
+REQUESTS = [ask(i) for i in (9, 0, 5, 15, 3, 11, 1, 12, 7)]
+
+
+def said(completions: list[Completion]) -> list[tuple[object, ...]]:
+    return [
+        (c.request_id, c.text, c.prompt_tokens, c.completion_tokens, c.finish_reason) for c in completions
+    ]
+
+
+# -- answers ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 8])
+def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Path, batch_size: int) -> None:
+    one = open_tiny(tiny, batch_size=1)
+    alone = [one.complete([request])[0] for request in REQUESTS]
+    together = open_tiny(tiny, batch_size=batch_size).complete(REQUESTS)
+    assert [c.request_id for c in together] == [r.id for r in REQUESTS]
+    assert said(together) == said(alone)
+    assert len({c.text for c in alone}) > 5, "answers that are all alike would show no order"
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.builds(ask, st.integers(0, 15), max_tokens=st.integers(1, 12)), max_size=6))
+def test_company_never_changes_an_answer(backend: TransformersBackend, requests: list[Request]) -> None:
+    alone = [backend.complete([request])[0] for request in requests]
+    assert said(backend.complete(requests)) == said(alone)
+
+
+def test_an_answer_ends_with_its_stop_token_or_is_cut_off(backend: TransformersBackend) -> None:
+    answers = backend.complete(REQUESTS)
+    assert {c.finish_reason for c in answers} == {"stop", "length"}
+    for c in answers:
+        assert c.completion_tokens is not None
+        if c.finish_reason == "length":
+            assert c.completion_tokens == 24
+        # The stop token counts, and is no part of the text.
+        assert tiny_qwen3.IM_END not in c.text
+
+
+def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(backend: TransformersBackend) -> None:
+    [whole] = backend.complete([ask(0)])
+    assert whole.finish_reason == "stop"
+    assert whole.completion_tokens is not None
+    [exact, cut] = backend.complete(
+        [ask(0, max_tokens=whole.completion_tokens), ask(0, max_tokens=whole.completion_tokens - 1)]
+    )
+    assert (exact.text, exact.finish_reason) == (whole.text, "stop")
+    # All of the text was there; only the stop token was not.
+    assert (cut.text, cut.finish_reason) == (whole.text, "length")
+
+
+def test_tokens_in_are_the_rendered_prompts(backend: TransformersBackend) -> None:
+    [answer] = backend.complete([ask(4)])
+    prompt = backend.chat.render(ask(4).messages, thinking=False)
+    assert answer.prompt_tokens == len(backend.chat.encode(prompt))
+    assert backend.chat.tokenizer.decode(backend.chat.encode(prompt)) == prompt
+
+
+def test_think_tags_stay_in_the_text_and_special_tokens_do_not(backend: TransformersBackend) -> None:
+    assert any("<think>" in c.text for c in backend.complete(REQUESTS))
+    ids = backend.chat.encode("<think>slow</think>IDLE<|im_end|>")
+    assert backend.chat.decode(ids) == "<think>slow</think>IDLE"
+
+
+def test_the_thinking_switch_alters_the_prompt(backend: TransformersBackend) -> None:
+    assert backend.chat.thinking == "switch"
+    on = backend.chat.render(ask(0).messages, thinking=True)
+    off = backend.chat.render(ask(0).messages, thinking=False)
+    assert on.endswith("<|im_start|>assistant\n")
+    assert off == on + "<think>\n\n</think>\n\n"
+    [thought, plain] = backend.complete([ask(0, thinking=True), ask(0)])
+    assert thought.prompt_tokens != plain.prompt_tokens
+    assert thought.text != plain.text
+
+
+def test_a_template_without_the_switch_is_rendered_as_it_is(tmp_path: Path) -> None:
+    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages[0].content }}>")
+    opened = open_tiny(bare)
+    assert opened.chat.thinking == "none"
+    assert opened.chat.render(ask(0).messages, thinking=True) == "You drive.>"
+    always = tiny_qwen3.build(tmp_path / "always", template="{{ messages[0].content }}<think>\n")
+    assert open_tiny(always).chat.thinking == "always"
+
+
+def test_seconds_belong_to_an_answer_that_was_asked_alone(tiny: Path) -> None:
+    answers = open_tiny(tiny, batch_size=2).complete([ask(0), ask(1), ask(2)])
+    assert sorted(c.batch_size for c in answers) == [1, 2, 2]
+    for c in answers:
+        if c.batch_size == 1:
+            assert c.seconds is not None
+            assert c.seconds > 0
+        else:
+            assert c.seconds is None
+
+
+def test_no_requests_no_completions(backend: TransformersBackend) -> None:
+    assert backend.complete([]) == []
+
+
+# -- failures that are data ---------------------------------------------------------------------------
+
+
+def test_a_prompt_that_leaves_no_room_is_an_error_and_its_neighbours_are_answered(
+    backend: TransformersBackend,
+) -> None:
+    long = ask(1, text="truck " * 600)
+    first, over, last = backend.complete([ask(0), long, ask(2)])
+    assert (over.request_id, over.text, over.finish_reason) == ("s1/ego", "", "error")
+    assert over.prompt_tokens is not None
+    assert over.error == (
+        f"context overflow: {over.prompt_tokens + 24} tokens > 512 "
+        f"({over.prompt_tokens} in the prompt, 24 for the answer)"
+    )
+    assert said([first, last]) == said(backend.complete([ask(0), ask(2)]))
+
+
+def test_a_context_is_full_at_its_last_token_and_the_cards_bound_comes_first(tiny: Path) -> None:
+    tokens = open_tiny(tiny).complete([ask(0)])[0].prompt_tokens
+    assert tokens is not None
+    card = replace(resolve(str(tiny)), context_tokens=tokens + 24)
+    fits, over = open_backend(card, device="cpu").complete([ask(0), ask(0, max_tokens=25)])
+    assert fits.error is None
+    assert over.finish_reason == "error"
+    assert f"{tokens + 25} tokens > {tokens + 24}" in str(over.error)
+
+
+def test_a_request_that_breaks_the_engine_takes_nobody_with_it(tiny: Path) -> None:
+    """A token past the last embedding row fails the batch; asked again alone, only its owner fails."""
+    opened = open_tiny(tiny)
+    opened.chat.tokenizer.add_tokens(["<boom>"])
+    before, broken, after = opened.complete([ask(0), ask(1, text="<boom>"), ask(2)])
+    assert (broken.text, broken.finish_reason, broken.seconds) == ("", "error", None)
+    assert "IndexError" in str(broken.error)
+    assert said([before, after]) == said(opened.complete([ask(0), ask(2)]))
+    assert (before.batch_size, after.batch_size) == (1, 1)
+
+
+def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
+    def press(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    opened = open_tiny(tiny)
+    opened.model.register_forward_pre_hook(press)
+    with pytest.raises(KeyboardInterrupt):
+        opened.complete([ask(0)])
+
+
+# -- what a user can get wrong ------------------------------------------------------------------------
+
+
+def remove(pattern: str) -> Callable[[Path], None]:
+    def act(folder: Path) -> None:
+        for path in folder.glob(pattern):
+            path.unlink()
+
+    return act
+
+
+def truncate(folder: Path) -> None:
+    weights = folder / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:20_000])
+
+
+def lose_a_layer(folder: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    weights = load_file(folder / "model.safetensors")
+    del weights["model.layers.1.mlp.up_proj.weight"]
+    save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
+
+
+def grow_the_vocabulary(folder: Path) -> None:
+    from transformers import AutoTokenizer
+
+    tokenizer = AutoTokenizer.from_pretrained(folder)
+    tokenizer.add_tokens(["<boom>"])
+    tokenizer.save_pretrained(folder)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (remove("config.json"), ["has no config.json"]),
+        (remove("*.safetensors"), ["has no weights", "*.safetensors"]),
+        (remove("tokenizer*"), ["has no tokenizer", "tokenizer.json"]),
+        (truncate, ["does not load", "incomplete metadata"]),
+        (lose_a_layer, ["lacks 1 of its weights", "layers.1.mlp.up_proj"]),
+        (grow_the_vocabulary, ["its tokenizer has", "one checkpoint"]),
+        (remove("chat_template.jinja"), ["has no chat template", "instruct version"]),
+        (lambda folder: (folder / "config.json").write_text("{"), ["does not load", "not a valid JSON"]),
+    ],
+)
+def test_a_spoilt_checkpoint_is_one_line_with_what_and_where(
+    tiny: Path, tmp_path: Path, spoil: Callable[[Path], object], what: list[str]
+) -> None:
+    card = resolve(str(tiny))
+    folder = tmp_path / "spoilt"
+    shutil.copytree(tiny, folder)
+    spoil(folder)
+    with pytest.raises(UserError) as caught:
+        open_backend(replace(card, name="spoilt", weights=str(folder)), device="cpu")
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in ["'spoilt'", str(folder), *what]:
+        assert part in message
+
+
+def test_weights_that_are_nowhere_say_where_they_were_looked_for_and_how_to_get_them() -> None:
+    from huggingface_hub import constants
+
+    card = replace(resolve("nobody/no-such-model"), revision="v9")
+    with pytest.raises(UserError) as caught:
+        open_backend(card)
+    for part in ("'nobody/no-such-model'", "'v9'", constants.HF_HUB_CACHE, "hf download", "--revision v9"):
+        assert part in str(caught.value)
+    assert missing(card) == "weights"
+
+
+def test_a_directory_that_has_gone_is_said_so(tmp_path: Path) -> None:
+    card = Card("gone", "transformers", "d", Latency("measured", None, "b"), weights=str(tmp_path / "gone"))
+    with pytest.raises(UserError, match=r"no directory .*gone'.*give another directory"):
+        open_backend(card)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"device": "tpu"}, "device 'tpu'; this machine has: cpu"),
+        ({"dtype": "float8"}, "dtype 'float8'; allowed: float32, bfloat16, auto"),
+        ({"batch_size": 0}, "batch size 0; allowed: 1 or more"),
+    ],
+)
+def test_an_option_that_cannot_be_names_what_can(tiny: Path, options: dict[str, str], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        open_backend(resolve(str(tiny)), **options)  # type: ignore[arg-type]
+
+
+def test_a_template_that_refuses_the_messages_is_the_users_to_know(tmp_path: Path) -> None:
+    template = "{{ raise_exception('System role not supported') }}"
+    with pytest.raises(UserError, match=r"refuses the messages \(System role not supported\)"):
+        open_tiny(tiny_qwen3.build(tmp_path / "gruff", template=template)).complete([ask(0)])
+
+
+# -- identity, place, quiet ---------------------------------------------------------------------------
+
+
+def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them(
+    tiny: Path, tmp_path: Path
+) -> None:
+    here = open_tiny(tiny).identity()
+    shutil.copytree(tiny, tmp_path / "copy")
+    (tmp_path / "copy" / "README.md").write_text("a copy")
+    there = open_tiny(tmp_path / "copy").identity()
+    assert here["files_sha256"] == there["files_sha256"]
+    assert (here["engine"], here["dtype"], here["device"]) == ("transformers", "float32", "cpu")
+    assert here["revision"] is None
+
+    jinja = tmp_path / "copy" / "chat_template.jinja"
+    jinja.write_text(jinja.read_text() + "{# changed #}")
+    changed = open_tiny(tmp_path / "copy").identity()
+    assert changed["files_sha256"] != here["files_sha256"]
+    assert changed["chat_template_sha256"] != here["chat_template_sha256"]
+    assert open_tiny(tiny, dtype="bfloat16").identity()["dtype"] == "bfloat16"
+
+
+def test_a_hub_checkpoint_is_found_in_the_cache_and_known_by_its_commit(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    repository = tmp_path / "models--tiny--qwen3"
+    shutil.copytree(tiny, repository / "snapshots" / COMMIT)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(COMMIT)
+    card = resolve("tiny/qwen3")
+    assert missing(card) is None
+    assert checkpoint.find(card) == repository / "snapshots" / COMMIT
+    opened = open_backend(card, device="cpu")
+    assert opened.identity()["revision"] == COMMIT
+    assert opened.identity()["files_sha256"] is None
+    assert said(opened.complete(REQUESTS)) == said(open_tiny(tiny).complete(REQUESTS))
+
+
+def test_nothing_goes_over_the_network_and_nothing_is_said_on_stderr(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def shut(*_: object) -> None:
+        raise AssertionError("a socket was opened")
+
+    monkeypatch.setattr(socket.socket, "connect", shut)
+    monkeypatch.setattr(socket, "getaddrinfo", shut)
+    assert open_tiny(tiny).complete([ask(0)])[0].finish_reason == "stop"
+    with pytest.raises(UserError, match="hf download"):
+        open_backend(load("qwen3-4b"))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_checkup_shows_the_prompt_its_tokens_and_one_answer_asked_alone(
+    backend: TransformersBackend,
+) -> None:
+    seen = checkup.check(backend, thinking=False)
+    assert seen.prompt == backend.chat.render(checkup.MESSAGES, thinking=False)
+    assert (seen.thinking, seen.bos_tokens) == ("switch", 0)
+    assert seen.prompt_tokens == seen.completion.prompt_tokens
+    assert seen.completion.seconds is not None
+    assert seen.identity == backend.identity()
