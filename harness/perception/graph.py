@@ -80,7 +80,8 @@ def _graph(state: WorldState, viewer: VehicleState, detections: list[Detection],
 def _relative(viewer: VehicleState, x_m: float, y_m: float) -> dict[str, float]:
     dx, dy = x_m - viewer.x_m, y_m - viewer.y_m
     cos, sin = np.cos(viewer.heading_rad), np.sin(viewer.heading_rad)
-    return {"forward_m": round(float(dx * cos + dy * sin), 1), "left_m": round(float(dx * sin - dy * cos), 1)}
+    forward, left = float(dx * cos + dy * sin), float(dx * sin - dy * cos)
+    return {"forward_m": round(forward, 1) + 0.0, "left_m": round(left, 1) + 0.0}  # + 0.0: no minus zero
 
 
 def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:

@@ -1,0 +1,61 @@
+"""Counting tokens as a model counts them: with its own tokenizer."""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from harness.errors import UserError, printable
+
+# Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
+QWEN2_SPLIT = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+
+
+@lru_cache(maxsize=4)
+def tokenizer(source: Path) -> Any:
+    """A `tokenizers.Tokenizer` from a GGUF file with a Qwen2 vocabulary, a tokenizer.json, or a folder with one.
+
+    Raises:
+        UserError: there is no tokenizer there, or not one of those.
+    """
+    from tokenizers import Tokenizer
+
+    file = source / "tokenizer.json" if source.is_dir() else source
+    if not file.is_file():
+        raise UserError(f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file")
+    try:
+        return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_file(str(file))
+    except UserError:
+        raise
+    except Exception as error:  # tokenizers and gguf raise bare Exceptions on a broken file
+        raise UserError(f"{printable(file)} is no readable tokenizer: {printable(error)}") from None
+
+
+def _from_gguf(file: Path) -> Any:
+    from gguf import GGUFReader
+    from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers
+
+    reader = GGUFReader(file)
+
+    def texts(key: str) -> list[str]:
+        field = reader.fields[key]
+        return [bytes(field.parts[i]).decode("utf-8") for i in field.data]
+
+    kind, = texts("tokenizer.ggml.pre")
+    if kind != "qwen2":
+        raise UserError(f"{printable(file)} has the pre-tokeniser {printable(kind)}; only qwen2 can be read")
+    vocabulary = texts("tokenizer.ggml.tokens")
+    merges = [tuple(pair.split(" ")) for pair in texts("tokenizer.ggml.merges")]
+    types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
+             for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
+    built = Tokenizer(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
+    built.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Split(Regex(QWEN2_SPLIT), "isolated"),
+            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
+        ]
+    )
+    built.decoder = decoders.ByteLevel()
+    built.add_special_tokens([AddedToken(t, special=True) for t, k in zip(vocabulary, types, strict=True) if k == 3])
+    return built
