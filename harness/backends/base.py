@@ -21,6 +21,7 @@ class Request:
         messages: chat messages, `{"role": "system" | "user", "content": text}`.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
+        answer: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
         thinking: whether the model was asked to think first (where its template can).
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
@@ -32,6 +33,7 @@ class Request:
     messages: tuple[Mapping[str, str], ...]
     actions: tuple[str, ...]
     max_tokens: int
+    answer: str = "distribution"
     thinking: bool = False
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None

@@ -1,0 +1,38 @@
+"""Reference drivers behind the backend protocol, so that they run like any model."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from harness import __version__
+from harness.backends.base import Completion, Request
+from harness.cards import Card
+from harness.drivers import DRIVERS, choose
+from harness.errors import unknown
+from harness.files import canonical_json
+
+
+def open(card: Card, **_: Any) -> "DriverBackend":
+    """The driver that a card names. Raises UserError if there is none."""
+    if card.name not in DRIVERS:
+        raise unknown("driver", card.name, DRIVERS)
+    return DriverBackend(card.name)
+
+
+class DriverBackend:
+    """Answers with all mass on the driver's action, so it never asks for help."""
+
+    def __init__(self, driver: str) -> None:
+        self.driver = driver
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in order."""
+        return [self._answer(request, len(requests)) for request in requests]
+
+    def _answer(self, request: Request, batch_size: int) -> Completion:
+        action = choose(self.driver, request.view or {}, request.truth, request.actions)
+        text = canonical_json({"action_distribution": {a: float(a == action) for a in request.actions}})
+        return Completion(request.id, text, None, None, "stop", None, batch_size)
+
+    def identity(self) -> dict[str, Any]:
+        """The driver and the version of its rules."""
+        return {"engine": "driver", "driver": self.driver, "harness": __version__}

@@ -1,0 +1,95 @@
+"""The proxy: a deterministic stand-in for a language model that reads its own viewer's scene graph.
+
+It needs no model and shows the whole path. It plans on what its viewer sees, as `local-view` does, and is the
+less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not fitted: what it scores says
+something about the harness and nothing about any language model.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from harness.backends.base import Completion, Request
+from harness.cards import Card
+from harness.files import canonical_json
+from harness.planner import plan
+
+VERSION = "proxy/1"
+
+SURE_SLOWER = 0.90  # probability of SLOWER where the viewer sees a conflict that calls for it
+LEAST_DOUBT, MOST_DOUBT = 0.05, 0.38  # probability of SLOWER with every sector in sight, and with one hidden
+OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor the planned one
+
+
+def open(card: Card, **_: Any) -> "Proxy":
+    """The proxy."""
+    return Proxy()
+
+
+class Proxy:
+    """Answers like a well-behaved small language model, in the form its prompt asks for."""
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in order."""
+        return [Completion(r.id, answer(r), None, None, "stop", None, len(requests)) for r in requests]
+
+    def identity(self) -> dict[str, Any]:
+        """Its version."""
+        return {"engine": "proxy", "proxy_model_version": VERSION, "calibration_label": "none: chosen by hand"}
+
+
+def answer(request: Request) -> str:
+    """The text of one answer."""
+    if request.view is None:
+        raise ValueError(f"request {request.id} has no view; the proxy reads nothing else")
+    intent = distribution(request.view, request.actions)
+    if request.role == "ego":
+        body: dict[str, Any] = {"action_distribution": intent}
+    else:
+        body = _message(request.view, intent, request.answer)
+    if request.answer == "recommendation":
+        return f"{_reason(request.view)} {canonical_json(body)}"  # such a prompt asks for its reasons first
+    return canonical_json(body)
+
+
+def distribution(view: Mapping[str, Any], actions: tuple[str, ...]) -> dict[str, float]:
+    """Intent of a viewer: what the planner would do on its graph, hedged by what it cannot see."""
+    planned = plan(view, actions)
+    if planned == "SLOWER":
+        braking = SURE_SLOWER
+    else:
+        hidden = max((1.0 - s["seen_share"] for s in view["sectors"]), default=0.0)
+        braking = LEAST_DOUBT + (MOST_DOUBT - LEAST_DOUBT) * hidden
+    rest = 1.0 - braking
+    others = [a for a in actions if a not in ("SLOWER", planned)]
+    shares = {a: min(OTHER, rest) / len(others) for a in others}
+    if planned == "SLOWER":
+        shares = {a: rest / len(others) for a in others}
+    else:
+        shares[planned] = rest - sum(shares.values())
+    return _rounded({a: shares.get(a, braking) for a in actions})
+
+
+def _rounded(intent: dict[str, float]) -> dict[str, float]:
+    """Two decimals that sum to 1: the last hundredths go where rounding took most."""
+    floor = {a: int(p * 100 + 1e-9) for a, p in intent.items()}
+    short = 100 - sum(floor.values())
+    for a in sorted(intent, key=lambda a: floor[a] - intent[a] * 100)[:short]:
+        floor[a] += 1
+    return {a: n / 100 for a, n in floor.items()}
+
+
+def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> dict[str, Any]:
+    best = max(intent, key=intent.__getitem__)
+    risk = "high" if best == "SLOWER" else "medium" if intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2 else "low"
+    message: dict[str, Any] = {"evidence": _reason(view), "risk": risk}
+    if form == "recommendation":
+        return {**message, "recommended_maneuver": best, "confidence": intent[best]}
+    return {**message, "action_distribution": intent}
+
+
+def _reason(view: Mapping[str, Any]) -> str:
+    if view["conflicts"]:
+        first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
+        return f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m before the ego's path."
+    hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
+    return f"Nothing on the ego's path; hidden: {', '.join(hidden) or 'none'}."
