@@ -14,6 +14,7 @@ from harness.answer_schema import ROLES
 from harness.parsing import reasoning
 from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate, candidates, whole
+from harness.parsing.mend import unreadable
 from harness.parsing.status import Failure, Repair, Status
 
 __all__ = ["Parsed", "Repair", "Status", "parse"]
@@ -75,7 +76,8 @@ def parse(
         text: the completion, untouched.
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
-        thinking: whether the model was asked to think first.
+        thinking: whether the text has to hold a closed thought: the model was asked to think, and the engine
+            did not take the thought out of the text itself.
         finish_reason: the engine's; `length` means cut off by the token limit.
         error: the engine's message if it failed.
 
@@ -149,6 +151,8 @@ def _choose(found: list[Candidate], role: str, actions: tuple[str, ...]) -> Answ
             failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
+        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in found):
+            raise unreadable()  # what is wrong in a guessed object need not be wrong in the text
         raise (serious or failures)[-1]
     last = answers[-1]
     same = all(abs(p - q) <= _SAME for one in answers for p, q in zip(one.intent, last.intent, strict=True))

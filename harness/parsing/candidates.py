@@ -82,8 +82,9 @@ def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> lis
         mended, rest = mend.mended(text[found.broken :], FIELDS[role] + actions, cut)
         extra = escapes | _around(text[: found.broken] + rest) | {Repair.JSON_REPAIR}
         inside = list(_answers(mended, role, actions))
-        if inside:
-            return [Candidate(members, nested | extra) for members, nested in inside]
+        if not inside:
+            raise mend.unreadable()
+        return [Candidate(members, nested | extra) for members, nested in inside]
     raise _nothing(text, bool(found.readings), actions)
 
 

@@ -17,6 +17,11 @@ _AMBIGUOUS = re.compile(
 _NUMBER = re.compile(r"(?<![\w.])-?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 
+def unreadable() -> Failure:
+    """The failure of a text that json_repair cannot mend, or mends into something that is no answer."""
+    return Failure(Status.SYNTAX, "a JSON object was begun but cannot be read without guessing")
+
+
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """The broken object that `text` begins with, and the text after it.
 
@@ -33,19 +38,18 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """
     import json_repair
 
-    failure = Failure(Status.SYNTAX, "a JSON object was begun but cannot be read without guessing")
     source = text[: text.rfind("}") + 1]
     once = all(len(re.findall(rf"\b{re.escape(name)}\W?\s*:", source)) <= 1 for name in names)
     if cut or not source or len(source) > _MAX_CHARS or _AMBIGUOUS.search(source) or not once:
-        raise failure
+        raise unreadable()
     try:
         value = DECODER.decode(json.dumps(json_repair.loads(source, skip_json_loads=True)))
         if _numbers(value) != [float(number) for number in _NUMBER.findall(source)]:
-            raise failure
+            raise unreadable()
     except Failure:
         raise
     except Exception:  # whatever a third-party reader does with hostile text is a syntax error of the text
-        raise failure from None
+        raise unreadable() from None
     return value, text[len(source) :]
 
 

@@ -63,9 +63,8 @@ def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found if len(found) == len(pairs) else Repeated(found)
 
 
-DECODER = json.JSONDecoder(
-    object_pairs_hook=members, parse_int=float
-)  # no digit limit, no overflow: 1e400 is inf
+# An integer read as float has no limit of digits, and one too large is infinite instead of an error.
+DECODER = json.JSONDecoder(object_pairs_hook=members, parse_int=float)
 
 
 def read(text: str, at: int) -> Reading:
@@ -74,7 +73,7 @@ def read(text: str, at: int) -> Reading:
 
 
 class _Reader:
-    """Recursive descent over `_TOKEN`, one token of look-ahead."""
+    """Recursive descent with one token of look-ahead."""
 
     def __init__(self, text: str, at: int) -> None:
         self.text = text
@@ -94,7 +93,7 @@ class _Reader:
         return self.last
 
     def _fail(self, token: Token) -> NoReturn:
-        ends = token.kind == "end" or not self.text[token.end :].strip()
+        ends = not self.text[token.end :].strip() and token.text not in ("}", "]")
         if ends or (token.kind == "other" and token.text in "\"'“‘"):
             raise Unfinished
         raise Broken(self.meant)

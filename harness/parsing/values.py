@@ -125,7 +125,7 @@ def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[fl
     """Numbers as fractions: percent only if all say so, or if together they make 100."""
     values = [value for value, _ in numbers]
     signed = [percent for value, percent in numbers if value]
-    if (any(signed) and all(signed)) or (abs(math.fsum(values) - 100) <= 1 and max(values) > 1):
+    if (any(signed) and all(signed)) or (abs(sum(values) - 100) <= 1 and max(values) > 1):
         repairs.add(Repair.PERCENT)
         return [value / 100 for value in values]
     if any(percent for _, percent in numbers):
