@@ -1,0 +1,53 @@
+"""What an answer looks like, as a JSON Schema made from the action names.
+
+The schema is published (to prompts, servers that constrain, readers of a dataset). A sum of one cannot be
+said in JSON Schema; `harness.parse` checks it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from harness import errors
+
+ROLES = ("ego", "helper")
+RISKS = ("low", "medium", "high")
+EVIDENCE_CHARS = 200
+
+
+def answer_schema(role: str, actions: Sequence[str], scenario: str | None = None) -> dict[str, Any]:
+    """JSON Schema, draft 2020-12, of one role's answer.
+
+    A helper answers in one of two forms: a recommended maneuver with a confidence (prompt v1) or a
+    distribution (prompt v2).
+
+    Args:
+        role: `ego` or `helper`.
+        actions: meta-action names, in the environment's order.
+        scenario: named in the title only.
+
+    Raises:
+        UserError: unknown role.
+    """
+    probability = {"type": "number", "minimum": 0, "maximum": 1}
+    distribution = {"action_distribution": _closed(dict.fromkeys(actions, probability))}
+    report = {
+        "evidence": {"type": "string", "maxLength": EVIDENCE_CHARS},
+        "risk": {"enum": list(RISKS)},
+    }
+    recommendation = {"recommended_maneuver": {"enum": list(actions)}, "confidence": probability}
+    title = f"{role} answer" + (f", {scenario}" if scenario else "")
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
+    if role == "ego":
+        return head | _closed(distribution)
+    if role == "helper":
+        return head | {"oneOf": [_closed(report | recommendation), _closed(report | distribution)]}
+    raise errors.unknown("role", role, ROLES)
+
+
+def _closed(properties: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }

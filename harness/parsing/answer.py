@@ -1,0 +1,129 @@
+"""What an answer-shaped object says in each role: an intent, and a helper's message."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from harness.answer_schema import EVIDENCE_CHARS, RISKS
+from harness.errors import printable
+from harness.parsing import values
+from harness.parsing.status import Failure, Repair, Status
+
+FIELDS = {
+    "ego": ("action_distribution",),
+    "helper": ("evidence", "risk", "recommended_maneuver", "confidence", "action_distribution"),
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An intent, the sum as stated, a helper's message, and what was mended to read them."""
+
+    intent: values.Intent
+    mass: float | None
+    message: dict[str, Any] | None
+    repairs: frozenset[Repair]
+
+    def mended(self, repair: Repair) -> "Answer":
+        """The same answer with one more repair."""
+        return replace(self, repairs=self.repairs | {repair})
+
+
+def read(members: dict[str, Any], found_with: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
+    """What an answer-shaped object means. Raises `Failure` with one of the value statuses."""
+    if values.is_schema(members):
+        raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
+    repairs = set(found_with)
+    fields, rest = values.sort_fields(members, FIELDS[role], repairs)
+    loose = any(values.match(key, actions) for key in rest)
+    if loose and ("action_distribution" in fields or "recommended_maneuver" in fields):
+        raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
+    if loose:
+        repairs.add(Repair.UNWRAPPED)
+        fields["action_distribution"] = rest
+    elif rest:
+        repairs.add(Repair.EXTRA_FIELD)
+
+    if role == "helper":
+        return _helper(fields, actions, repairs)
+    intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs)
+    return Answer(intent, mass, None, frozenset(repairs))
+
+
+def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]) -> Answer:
+    mass: float | None = None
+    if "action_distribution" in fields:
+        intent, mass = values.distribution(fields["action_distribution"], actions, repairs)
+        confidence = max(intent)
+        maneuver = actions[intent.index(confidence)]
+        if "recommended_maneuver" in fields or "confidence" in fields:
+            repairs.add(Repair.BOTH_FORMS)
+            maneuver = _maneuver(fields.get("recommended_maneuver", maneuver), actions, repairs)
+            if intent[actions.index(maneuver)] < confidence:
+                text = "the recommended maneuver is not the distribution's most probable action"
+                raise Failure(Status.CONFLICTING_ANSWERS, text)
+    else:
+        for name in ("recommended_maneuver", "confidence"):
+            if name not in fields:
+                raise Failure(Status.MISSING_ACTION, f"no {name} and no distribution")
+        maneuver = _maneuver(fields["recommended_maneuver"], actions, repairs)
+        confidence = _confidence(fields["confidence"], repairs)
+        intent = recommended(maneuver, confidence, actions)
+    message = {
+        "evidence": _evidence(fields.get("evidence"), repairs),
+        "risk": _risk(fields.get("risk"), repairs),
+        "recommended_maneuver": maneuver,
+        "confidence": confidence,
+    }
+    return Answer(intent, mass, message, frozenset(repairs))
+
+
+def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
+    """Confidence on the maneuver; what is left is spread evenly over the other actions."""
+    if len(actions) == 1:
+        return (1.0,)
+    others = (1 - confidence) / (len(actions) - 1)
+    return tuple(confidence if action == maneuver else others for action in actions)
+
+
+def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> str:
+    if not isinstance(value, str):
+        raise Failure(Status.UNKNOWN_ACTION, "the recommended maneuver is no action's name")
+    if "|" in value or values.is_placeholder(value):
+        raise Failure(Status.SCHEMA_ECHO, "the schema's choice of actions came back instead of one action")
+    name = values.match(value, actions)
+    if name is None:
+        raise Failure(Status.UNKNOWN_ACTION, f"{printable(value, 40)!r} is no action of the scenario")
+    if name != value:
+        repairs.add(Repair.KEY_CASE)
+    return name
+
+
+def _confidence(value: object, repairs: set[Repair]) -> float:
+    stated, percent = values.number("confidence", value, repairs)
+    if percent:
+        repairs.add(Repair.PERCENT)
+        stated /= 100
+    values.check_range("confidence", stated)
+    return abs(stated)
+
+
+def _evidence(value: object, repairs: set[Repair]) -> str | None:
+    if not isinstance(value, str):
+        repairs.add(Repair.MISSING_EVIDENCE)
+        return None
+    if len(value) > EVIDENCE_CHARS:
+        repairs.add(Repair.EVIDENCE_CUT)
+    # A lone surrogate is legal JSON ("\ud83d") and cannot be written to any file.
+    return value[:EVIDENCE_CHARS].encode("utf-8", "replace").decode()
+
+
+def _risk(value: object, repairs: set[Repair]) -> str | None:
+    if isinstance(value, str) and "|" in value:
+        raise Failure(Status.SCHEMA_ECHO, "the schema's choice of risks came back instead of one risk")
+    level = values.match(value, RISKS) if isinstance(value, str) else None
+    if level is None:
+        repairs.add(Repair.MISSING_RISK)
+    elif level != value:
+        repairs.add(Repair.KEY_CASE)
+    return level

@@ -1,0 +1,199 @@
+"""A reader for almost-JSON that names every liberty it takes and never guesses a value.
+
+It reads what small models write by habit: Python dicts, typographic quotes, bare keys, comments, trailing
+commas, percent signs, missing closing brackets. An expression (`1/3`) is kept as text, so that no later
+rule can take it for a number. Numbers and words that touch the end of the text count as cut off.
+"""
+
+import json
+import re
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+from harness.parsing.status import Repair
+from harness.parsing.tokens import Token, next_token
+
+MAX_DEPTH = 32
+
+_NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?%?")
+_JSON_NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?")
+_WORDS = {
+    "true": True,
+    "false": False,
+    "null": None,
+    "none": None,
+    "nan": float("nan"),
+    "inf": float("inf"),
+    "infinity": float("inf"),
+    "-inf": float("-inf"),
+    "-infinity": float("-inf"),
+}
+_ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f", "\n": ""}
+
+
+class Repeated(dict[str, Any]):
+    """An object that had a key twice; it holds the last value."""
+
+
+class Broken(Exception):
+    """The text at this brace cannot be read. `meant` tells broken JSON from a brace in prose."""
+
+    def __init__(self, meant: bool) -> None:
+        super().__init__()
+        self.meant = meant
+
+
+class Unfinished(Exception):
+    """The text ends inside the value."""
+
+
+@dataclass
+class Reading:
+    """A value, where it ends in the text, the liberties taken, and whether the text's end closed it."""
+
+    value: Any = None
+    end: int = 0
+    repairs: set[Repair] = field(default_factory=set)
+    closed_by_end: bool = False
+
+
+def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """`object_pairs_hook` that does not lose sight of a repeated key."""
+    found = dict(pairs)
+    return found if len(found) == len(pairs) else Repeated(found)
+
+
+# An integer read as float has no limit of digits, and one too large is infinite instead of an error.
+DECODER = json.JSONDecoder(object_pairs_hook=members, parse_int=float)
+
+
+def read(text: str, at: int) -> Reading:
+    """The object that opens at `at`. Raises `Broken` or `Unfinished`."""
+    return _Reader(text, at).run()
+
+
+class _Reader:
+    """Recursive descent with one token of look-ahead."""
+
+    def __init__(self, text: str, at: int) -> None:
+        self.text = text
+        self.out = Reading()
+        self.meant = False
+        self.last = Token("end", "", at)
+        self.token = next_token(self.text, at)
+
+    def run(self) -> Reading:
+        self.out.value = self._value(0)
+        self.out.end = self.last.end
+        return self.out
+
+    def _take(self) -> Token:
+        self.out.repairs |= self.token.repairs
+        self.last, self.token = self.token, next_token(self.text, self.token.end)
+        return self.last
+
+    def _fail(self, token: Token) -> NoReturn:
+        ends = not self.text[token.end :].strip() and token.text not in ("}", "]")
+        if ends or (token.kind == "other" and token.text in "\"'“‘"):
+            raise Unfinished
+        raise Broken(self.meant)
+
+    def _value(self, depth: int) -> Any:
+        if depth > MAX_DEPTH:
+            raise Broken(self.meant)
+        token = self._take()
+        if token.text == "{" and token.kind == "mark":
+            return self._object(depth)
+        if token.text == "[" and token.kind == "mark":
+            return self._array(depth)
+        if token.kind == "string":
+            return self._string(token.text)
+        if token.kind == "number":
+            return self._number(token)
+        if token.kind == "expression":
+            return token.text
+        if token.kind == "word":
+            if token.text.lower() in _WORDS:
+                return _WORDS[token.text.lower()]
+            self.out.repairs.add(Repair.QUOTES)
+            return token.text
+        self._fail(token)
+
+    def _object(self, depth: int) -> dict[str, Any]:
+        pairs: list[tuple[str, Any]] = []
+        while not self._closed("}", bool(pairs)):
+            token = self._take()
+            if token.kind == "string":
+                self.meant = True
+                key = self._string(token.text)
+            elif token.kind == "word":
+                self.out.repairs.add(Repair.BARE_KEYS)
+                key = token.text
+            else:
+                self._fail(token)
+            if self._take().text != ":":
+                self._fail(self.last)
+            self.meant = True
+            pairs.append((key, self._value(depth + 1)))
+            if self._ends_after_value("}"):
+                break
+        return members(pairs)
+
+    def _array(self, depth: int) -> list[Any]:
+        items: list[Any] = []
+        while not self._closed("]", bool(items)):
+            items.append(self._value(depth + 1))
+            if self._ends_after_value("]"):
+                break
+        return items
+
+    def _closed(self, closer: str, after_comma: bool) -> bool:
+        """Whether the container ends here, where a member or item may begin."""
+        if self.token.kind != "mark" or self.token.text != closer:
+            return False
+        if after_comma and self.last.text == ",":
+            self.out.repairs.add(Repair.TRAILING_COMMA)
+        self._take()
+        return True
+
+    def _ends_after_value(self, closer: str) -> bool:
+        """Whether the container ends after a value; takes the comma or closer that stands there."""
+        token = self.token
+        if token.kind == "mark" and token.text in (",", closer):
+            return self._take().text == closer
+        if token.kind == "string" and closer == "}":
+            self.out.repairs.add(Repair.MISSING_COMMA)
+            return False
+        last = self.last.kind
+        if token.kind == "end" and last in ("string", "mark"):  # nothing of a quote or bracket can be missing
+            self.out.closed_by_end = True
+        elif token.kind != "fence" and not (last == "mark" and token.kind in ("word", "other")):
+            self._fail(token)
+        self.out.repairs.add(Repair.MISSING_CLOSERS)
+        return True
+
+    def _string(self, quoted: str) -> str:
+        if quoted[0] == '"':
+            try:
+                return str(json.loads(quoted))
+            except ValueError:
+                self.out.repairs.add(Repair.ESCAPES)
+        else:
+            self.out.repairs.add(Repair.QUOTES)
+        return re.sub(r"\\(u[0-9a-fA-F]{4}|.)", _unescaped, quoted[1:-1], flags=re.DOTALL)
+
+    def _number(self, token: Token) -> float | str:
+        """A number, or a percentage as text. A number without its last digits is never completed."""
+        text = "".join(token.text.split())
+        if not _NUMBER.fullmatch(text):
+            self._fail(token)
+        if text.endswith("%"):
+            return text
+        if not _JSON_NUMBER.fullmatch(text):
+            self.out.repairs.add(Repair.NUMBER_FORMAT)
+        return float(text)
+
+
+def _unescaped(match: re.Match[str]) -> str:
+    escape = match.group(1)
+    return chr(int(escape[1:], 16)) if len(escape) == 5 else _ESCAPES.get(escape, escape)

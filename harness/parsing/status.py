@@ -1,0 +1,98 @@
+"""What can be said about a completion: one status, and the repairs it took."""
+
+from enum import StrEnum
+from typing import Self
+
+
+class _Documented(StrEnum):
+    """An enum whose members say what they mean."""
+
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> Self:
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.meaning = meaning
+        return member
+
+
+class Status(_Documented):
+    """The one outcome of a completion. All but the first two are failures and give no intent."""
+
+    STRICT = "strict", "The raw text is JSON that fits the schema and sums to 1 within 0.001."
+    RECOVERED = "recovered", "One unambiguous answer stands in the text, and the repairs name what was wrong."
+    EMPTY = "empty", "There is nothing but white space, special tokens or a closed thought."
+    NO_JSON = "no_json", "There is no JSON object, and not exactly one action is named."
+    LABEL_ONLY = "label_only", "One action is named and nothing says how probable it is."
+    TRUNCATED_JSON = "truncated_json", "The text ends inside a JSON value."
+    TRUNCATED_REASONING = (
+        "truncated_reasoning",
+        "The thought was never closed, so nothing in it is an answer.",
+    )
+    SYNTAX = "syntax", "A JSON object was meant, but it cannot be read without guessing."
+    SCHEMA_ECHO = "schema_echo", "The schema or the template's placeholders came back, not numbers."
+    DUPLICATE_KEY = "duplicate_key", "An object has the same key twice."
+    MISSING_ACTION = "missing_action", "An action, the maneuver or its confidence is not given."
+    UNKNOWN_ACTION = "unknown_action", "Something that is no action of the scenario is chosen or has mass."
+    NON_NUMERIC = "non_numeric", "A probability is no number: a word, an expression, true, null, a list."
+    NON_FINITE = "non_finite", "A probability is NaN, infinite, or overflows (1e400)."
+    OUT_OF_RANGE = "out_of_range", "A probability lies outside 0..1 and the whole does not read as percent."
+    BAD_SUM = "bad_sum", "The probabilities differ from a sum of 1 by more than rounding (0.025)."
+    CONFLICTING_ANSWERS = "conflicting_answers", "Several answers stand in the text and they differ."
+    ENGINE_ERROR = "engine_error", "The engine failed; there is no completion to judge."
+
+
+class Repair(_Documented):
+    """What had to be overlooked or mended to read an answer."""
+
+    THINK_BLOCK = (
+        "think_block",
+        "A thought was cut off where none belongs: thinking was off, or it did not come first.",
+    )
+    SPECIAL_TOKENS = "special_tokens", "Template tokens such as <|im_end|> were removed."
+    INVISIBLE_CHARACTERS = "invisible_characters", "BOM, zero-width characters or exotic spaces were removed."
+    CODE_FENCE = "code_fence", "The answer stood in a markdown code fence."
+    PROSE_AROUND = "prose_around", "Text stood before or after the answer."
+    STRAY_PUNCTUATION = "stray_punctuation", "Loose brackets, quotes or commas stood around the answer."
+    NESTED = "nested", "The answer stood inside another object, such as a tool call."
+    UNWRAPPED = "unwrapped", "The actions stood without the action_distribution around them."
+    REPEATED_ANSWER = "repeated_answer", "The same answer was given more than once."
+    TRAILING_COMMA = "trailing_comma", "A comma stood before a closing bracket."
+    MISSING_COMMA = "missing_comma", "A comma between two members was missing."
+    QUOTES = "quotes", "A string had other quotes than JSON's, or none."
+    BARE_KEYS = "bare_keys", "A key had no quotes."
+    COMMENTS = "comments", "Comments stood inside the JSON."
+    MISSING_CLOSERS = "missing_closers", "Closing brackets were missing after a finished value."
+    ESCAPES = "escapes", "Escapes that JSON does not know, or raw line breaks, stood in the text."
+    NUMBER_FORMAT = "number_format", "A number was not written as in JSON: .5, +0.5, 00.5."
+    FULL_WIDTH = "full_width", "Full-width digits or punctuation stood for ASCII ones."
+    JSON_REPAIR = (
+        "json_repair",
+        "json_repair mended the syntax; numbers and sum were checked against the text.",
+    )
+    KEY_CASE = "key_case", "A name was spelt with other letter case, spaces or underscores."
+    STRING_NUMBER = "string_number", "A number stood in quotes."
+    PERCENT = "percent", "The probabilities were given in percent."
+    EXTRA_ZERO_KEY = "extra_zero_key", "A key that is no action of the scenario had probability zero."
+    EXTRA_FIELD = "extra_field", "A field that the schema does not have was dropped."
+    RENORMALISED = "renormalised", "The sum was off 1 by rounding (0.001 to 0.025) and was divided out."
+    BOTH_FORMS = "both_forms", "A helper gave a distribution and a maneuver that agrees with it."
+    MISSING_EVIDENCE = "missing_evidence", "A helper gave no evidence text."
+    EVIDENCE_CUT = "evidence_cut", "A helper's evidence was cut at 200 characters."
+    MISSING_RISK = "missing_risk", "A helper gave no risk of low, medium or high."
+
+
+class Failure(Exception):
+    """A completion that gives no intent. Data, not a bug: `parse` turns it into a `Parsed`.
+
+    Attributes:
+        status: why.
+        detail: one sentence for people, safe to print.
+        mass: sum of the probabilities where that is what is wrong.
+    """
+
+    def __init__(self, status: Status, detail: str, mass: float | None = None) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.detail = detail
+        self.mass = mass

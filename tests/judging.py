@@ -1,0 +1,53 @@
+"""What several tests of the parser draw from and judge by."""
+
+import json
+import math
+from typing import Any
+
+import jsonschema
+from corpus import ACTIONS
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+from harness.answer_schema import answer_schema
+from harness.parse import Parsed, parse
+
+# Whether a shared machine is slow today is no property of the parser.
+unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+ROLES = st.sampled_from(["ego", "helper"])
+
+VALIDATORS = {
+    role: jsonschema.Draft202012Validator(answer_schema(role, ACTIONS)) for role in ("ego", "helper")
+}
+
+
+@st.composite
+def hundredths(draw: st.DrawFn, actions: tuple[str, ...] = ACTIONS) -> dict[str, float]:
+    """A distribution in steps of 0.01 that sums to 1."""
+    cuts = sorted(draw(st.lists(st.integers(0, 100), min_size=len(actions) - 1, max_size=len(actions) - 1)))
+    parts = [b - a for a, b in zip([0, *cuts], [*cuts, 100], strict=True)]
+    return {action: part / 100 for action, part in zip(actions, parts, strict=True)}
+
+
+def ego(text: str, **asked: Any) -> Parsed:
+    return parse(text, role="ego", actions=ACTIONS, **asked)
+
+
+def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("duplicate key")
+    return dict(pairs)
+
+
+def judged_strict(text: str, role: str) -> bool:
+    """A judge that shares no code with the parser: the standard library's JSON, jsonschema, and a sum."""
+    try:
+        value = json.loads(text, object_pairs_hook=_no_key_twice)
+    except (ValueError, RecursionError):
+        return False
+    if not VALIDATORS[role].is_valid(value):
+        return False
+    if "action_distribution" not in value:
+        return math.isfinite(value["confidence"])
+    return abs(math.fsum(value["action_distribution"].values()) - 1) <= 0.001 + 1e-9

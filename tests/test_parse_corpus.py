@@ -1,0 +1,51 @@
+"""Every completion of the corpus gets the status in its name, and just the repairs that are written down."""
+
+import pytest
+from corpus import ACTIONS, CASES, Case
+
+from harness.parse import Repair, Status, parse
+
+MESSAGE = ("evidence", "risk", "recommended_maneuver", "confidence")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_completion_gives_what_its_name_says(case: Case) -> None:
+    parsed = parse(case.text, actions=ACTIONS, **case.asked)
+    assert parsed.status is case.status, parsed
+    expected = case.expected
+    assert list(parsed.repairs) == expected.get("repairs", [])
+    if parsed.verdict == "failed":
+        assert parsed.intent is None
+        assert parsed.message is None
+    else:
+        assert sum(parsed.intent) == pytest.approx(1, abs=1e-12)
+        assert set(parsed.message or ()) == (set(MESSAGE) if case.asked["role"] == "helper" else set())
+    if "intent" in expected:
+        assert parsed.intent == pytest.approx(expected["intent"], abs=1e-9)
+    if "mass" in expected:
+        assert parsed.mass == pytest.approx(expected["mass"], abs=1e-9)
+    if "message" in expected:
+        assert parsed.message == dict.fromkeys(MESSAGE) | expected["message"]
+    if "reasoning" in expected:
+        assert parsed.reasoning == expected["reasoning"]
+
+
+def test_the_prefix_of_a_file_tells_whether_it_gives_an_intent() -> None:
+    for case in CASES:
+        gives = case.status in (Status.STRICT, Status.RECOVERED)
+        assert case.name[0] in ("y" if gives else "n", "i"), case.name
+
+
+def test_every_choice_of_the_parser_says_why() -> None:
+    for case in CASES:
+        assert ("why" in case.expected) == case.name.startswith("i_"), case.name
+
+
+def test_every_recovered_completion_has_its_repairs_written_down() -> None:
+    for case in CASES:
+        assert ("repairs" in case.expected) == (case.status is Status.RECOVERED), case.name
+
+
+def test_the_corpus_shows_every_status_and_every_repair() -> None:
+    assert {case.status for case in CASES} == set(Status)
+    assert {repair for case in CASES for repair in case.expected.get("repairs", ())} == set(Repair)

@@ -1,0 +1,83 @@
+"""Strict is what the published schema and the sum say, and nothing else."""
+
+import json
+import math
+from typing import Any
+
+import pytest
+from corpus import ACTIONS, CASES
+from hypothesis import given
+from hypothesis import strategies as st
+from judging import ROLES, hundredths, judged_strict, unhurried
+
+from harness.parse import Status, parse
+
+NAMES = st.lists(
+    st.from_regex(r"[A-Z]{2,6}(_[A-Z]{2,6})?", fullmatch=True), min_size=2, max_size=6, unique=True
+)
+NUMBERS = st.one_of(
+    st.sampled_from([0, 1, 0.5, 0.25, 0.2, 0.3, -0.0, -0.1, 1.1, 100, 70, 20, 10]),
+    st.sampled_from([True, False, None, "0.5", "50%", [], {}, math.nan, math.inf]),
+    st.floats(),
+)
+OBJECTS = st.one_of(
+    hundredths(),
+    st.dictionaries(st.sampled_from([*ACTIONS, "slower", "STOP"]), NUMBERS, max_size=5),
+    st.none(),
+    st.text(max_size=5),
+)
+ANSWERS = st.fixed_dictionaries(
+    {},
+    optional={
+        "action_distribution": OBJECTS,
+        "evidence": st.one_of(st.text(min_size=195, max_size=205), st.text(), st.none(), st.integers()),
+        "risk": st.sampled_from(["low", "medium", "high", "High", "none", None, 1, []]),
+        "recommended_maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
+        "confidence": NUMBERS,
+        "note": NUMBERS,
+    },
+)
+
+
+@unhurried
+@given(ANSWERS, ROLES)
+def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value: Any, role: str) -> None:
+    text = json.dumps(value)
+    strict = parse(text, role=role, actions=ACTIONS).status is Status.STRICT
+    assert strict == judged_strict(text, role)
+
+
+@unhurried
+@given(
+    st.fixed_dictionaries(
+        {"evidence": st.text(max_size=205), "risk": st.sampled_from(["low", "high", "High"])},
+        optional={
+            "action_distribution": hundredths(),
+            "recommended_maneuver": st.sampled_from([*ACTIONS, "idle"]),
+            "confidence": st.one_of(st.floats(0, 1), NUMBERS),
+        },
+    )
+)
+def test_strict_is_what_the_published_schema_says_of_near_valid_helper_messages(value: Any) -> None:
+    text = json.dumps(value)
+    strict = parse(text, role="helper", actions=ACTIONS).status is Status.STRICT
+    assert strict == judged_strict(text, "helper")
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if not c.asked.get("thinking")], ids=lambda c: c.name)
+def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case: Any) -> None:
+    if case.status is Status.ENGINE_ERROR:
+        return  # not judged by its text
+    text = case.text.removeprefix("<think>\n\n</think>")
+    assert (case.status is Status.STRICT) == judged_strict(text, case.asked["role"])
+
+
+@unhurried
+@given(NAMES.flatmap(lambda names: hundredths(tuple(names))), st.booleans())
+def test_a_valid_distribution_is_strict_and_comes_back_unchanged(
+    distribution: dict[str, float], indented: bool
+) -> None:
+    text = json.dumps({"action_distribution": distribution}, indent=2 if indented else None)
+    parsed = parse(text, role="ego", actions=tuple(distribution))
+    assert parsed.status is Status.STRICT
+    assert parsed.intent == pytest.approx(tuple(distribution.values()), abs=1e-12)
