@@ -88,7 +88,9 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
 def fault(ego: VehicleState, other: VehicleState) -> str:
     """Who should have given way: the one behind in a rear-end collision, else the one with less priority."""
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
-        ahead = (other.x_m - ego.x_m) * np.cos(ego.heading_rad) + (other.y_m - ego.y_m) * np.sin(ego.heading_rad)
+        ahead = (other.x_m - ego.x_m) * np.cos(ego.heading_rad) + (other.y_m - ego.y_m) * np.sin(
+            ego.heading_rad
+        )
         return "ego" if ahead > 0 else "other"
     mine, its = PRIORITY[ego.approach][ego.route], PRIORITY[other.approach][other.route]
     return "ego" if mine < its else "other"

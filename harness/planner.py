@@ -72,7 +72,9 @@ def rollouts(
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
             level = np.clip(np.round(speed / spacing).astype(int) + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = np.clip((target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2)
+        change = np.clip(
+            (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2
+        )
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[:, k] = gone

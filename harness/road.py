@@ -56,9 +56,9 @@ class Path:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
         gap = np.hypot(self.points[:, 0] - x_m, self.points[:, 1] - y_m)
         i = int(gap.argmin())
-        along = (x_m - self.points[i, 0]) * np.cos(self.headings_rad[i]) + (
-            y_m - self.points[i, 1]
-        ) * np.sin(self.headings_rad[i])
+        along = (x_m - self.points[i, 0]) * np.cos(self.headings_rad[i]) + (y_m - self.points[i, 1]) * np.sin(
+            self.headings_rad[i]
+        )
         lateral = float(np.sqrt(max(gap[i] ** 2 - along**2, 0.0)))
         return float(self.arc_m[i] + along), lateral, float(self.headings_rad[i])
 
@@ -66,7 +66,11 @@ class Path:
         """Position (m, m) and heading (rad) at an arc length."""
         x = float(np.interp(arc_m, self.arc_m, self.points[:, 0]))
         y = float(np.interp(arc_m, self.arc_m, self.points[:, 1]))
-        return x, y, float(self.headings_rad[int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))])
+        return (
+            x,
+            y,
+            float(self.headings_rad[int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))]),
+        )
 
     def lane_role(self, arc_m: float) -> str:
         """`approach-…` before the junction, `junction`, then `exit-…`, named from the ego's seat."""

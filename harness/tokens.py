@@ -7,9 +7,7 @@ from typing import Any
 from harness.errors import UserError, printable
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
-QWEN2_SPLIT = (
-    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
-)
+QWEN2_SPLIT = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 
 
 @lru_cache(maxsize=4)
@@ -23,7 +21,9 @@ def tokenizer(source: Path) -> Any:
 
     file = source / "tokenizer.json" if source.is_dir() else source
     if not file.is_file():
-        raise UserError(f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file")
+        raise UserError(
+            f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file"
+        )
     try:
         return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_file(str(file))
     except UserError:
@@ -42,7 +42,7 @@ def _from_gguf(file: Path) -> Any:
         field = reader.fields[key]
         return [bytes(field.parts[i]).decode("utf-8") for i in field.data]
 
-    kind, = texts("tokenizer.ggml.pre")
+    (kind,) = texts("tokenizer.ggml.pre")
     if kind != "qwen2":
         raise UserError(f"{printable(file)} has the pre-tokeniser {printable(kind)}; only qwen2 can be read")
     vocabulary = texts("tokenizer.ggml.tokens")
@@ -57,5 +57,7 @@ def _from_gguf(file: Path) -> Any:
         ]
     )
     built.decoder = decoders.ByteLevel()
-    built.add_special_tokens([AddedToken(t, special=True) for t, k in zip(vocabulary, types, strict=True) if k == 3])
+    built.add_special_tokens(
+        [AddedToken(t, special=True) for t, k in zip(vocabulary, types, strict=True) if k == 3]
+    )
     return built

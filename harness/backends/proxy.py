@@ -34,7 +34,11 @@ class Proxy:
 
     def identity(self) -> dict[str, Any]:
         """Its version."""
-        return {"engine": "proxy", "proxy_model_version": VERSION, "calibration_label": "none: chosen by hand"}
+        return {
+            "engine": "proxy",
+            "proxy_model_version": VERSION,
+            "calibration_label": "none: chosen by hand",
+        }
 
 
 def answer(request: Request) -> str:
@@ -80,7 +84,13 @@ def _rounded(intent: dict[str, float]) -> dict[str, float]:
 
 def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> dict[str, Any]:
     best = max(intent, key=intent.__getitem__)
-    risk = "high" if best == "SLOWER" else "medium" if intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2 else "low"
+    risk = (
+        "high"
+        if best == "SLOWER"
+        else "medium"
+        if intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
+        else "low"
+    )
     message: dict[str, Any] = {"evidence": _reason(view), "risk": risk}
     if form == "recommendation":
         return {**message, "recommended_maneuver": best, "confidence": intent[best]}
@@ -90,6 +100,8 @@ def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> di
 def _reason(view: Mapping[str, Any]) -> str:
     if view["conflicts"]:
         first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
-        return f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m before the ego's path."
+        return (
+            f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m before the ego's path."
+        )
     hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
     return f"Nothing on the ego's path; hidden: {', '.join(hidden) or 'none'}."

@@ -49,7 +49,10 @@ def build(
         "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
-        "versions": {"harness": __version__, **{name: version(name) for name in ("highway-env", "numpy", "shapely")}},
+        "versions": {
+            "harness": __version__,
+            **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
+        },
     }
     work = _begin(out, json.loads(canonical_json(config)))
     done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
@@ -105,7 +108,9 @@ def _freeze_to_file(work: Path, seed: int, episode: int) -> None:
     lines = [canonical_json(record) + "\n" for record in freeze(seed + episode, episode, Behaviour())]
     for line in lines:
         for error in record_validator(ACTIONS).iter_errors(json.loads(line)):
-            raise AssertionError(f"episode {episode} breaks its own schema at {error.json_path}: {error.message}")
+            raise AssertionError(
+                f"episode {episode} breaks its own schema at {error.json_path}: {error.message}"
+            )
     write_whole(work / _shard(episode), "".join(lines))
 
 

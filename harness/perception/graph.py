@@ -41,7 +41,9 @@ def truth_graph(state: WorldState) -> Graph:
     return _graph(state, state.ego, exact, [])
 
 
-def _graph(state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]) -> Graph:
+def _graph(
+    state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]
+) -> Graph:
     ego = state.ego
     ego_arc = paths()["own", "straight"].project(ego.x_m, ego.y_m)[0]
     nodes, conflicts = [], []
@@ -157,5 +159,7 @@ def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
         blockers = blocked_by(state, viewer, points)
         seen = sum(b is None for b in blockers) / len(blockers)
         hiding = sorted({b for b in blockers if b is not None})
-        found.append({"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding})
+        found.append(
+            {"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding}
+        )
     return found

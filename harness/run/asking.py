@@ -1,0 +1,113 @@
+"""Asking: every viewer of every scene once, kept as they come, so that a killed run continues."""
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.backends.base import Backend, Completion, Request, Role
+from harness.dataset.load import Scene
+from harness.errors import UserError, printable
+from harness.files import canonical_json, digest
+from harness.perception.graph import truth_graph
+from harness.run.spec import Spec
+
+Answer = dict[str, Any]
+CHUNK = 64  # requests that are asked for, and kept, at a time, at least
+
+
+def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
+    """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
+    for scene in scenes:
+        truth = truth_graph(scene.state) if spec.card.privileged else None
+        for viewer in scene.viewers if spec.card.engine != "driver" else scene.viewers[:1]:
+            graph = scene.record["graphs"][viewer]
+            role: Role = graph["role"]
+            yield Request(
+                id=f"{scene.id}/{viewer}",
+                role=role,
+                messages=spec.prompt.render(graph, spec.dataset.actions),
+                actions=spec.dataset.actions,
+                max_tokens=spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role],
+                answer=spec.prompt.helper_answer,
+                thinking=spec.thinking,
+                view=graph,
+                truth=truth,
+            )
+
+
+def ask_all(spec: Spec, backend: Backend, kept: Path, progress: Callable[[int], None]) -> dict[str, Answer]:
+    """Ask what is still owed and keep each answer in a file at once.
+
+    Args:
+        spec: the evaluation.
+        backend: who answers.
+        kept: JSON Lines file of answers so far; may be torn at its end by a kill.
+        progress: called with the number of answers just had.
+
+    Returns:
+        Answers by request id.
+    """
+    answers = read_kept(kept)
+    progress(len(answers))
+    chunk: list[Request] = []
+    most = max(CHUNK, spec.batch_size)
+    with kept.open("a", encoding="utf-8") as file:
+        for request in requests(spec, spec.dataset.scenes):
+            if request.id in answers:
+                continue
+            chunk.append(request)
+            if len(chunk) == most:
+                _ask(backend, chunk, file, answers, progress)
+                chunk = []
+        if chunk:
+            _ask(backend, chunk, file, answers, progress)
+    return answers
+
+
+def _ask(
+    backend: Backend,
+    chunk: list[Request],
+    file: Any,
+    answers: dict[str, Answer],
+    progress: Callable[[int], None],
+) -> None:
+    for request, completion in zip(chunk, backend.complete(chunk), strict=True):
+        answers[request.id] = answer = _answer(request, completion)
+        file.write(canonical_json([request.id, answer]) + "\n")
+    file.flush()
+    os.fsync(file.fileno())
+    progress(len(chunk))
+
+
+def _answer(request: Request, completion: Completion) -> Answer:
+    # A lone surrogate cannot be written to a file; nothing else of the text is touched.
+    text = completion.text.encode("utf-8", "replace").decode("utf-8")
+    return {
+        "raw": text,
+        "finish_reason": completion.finish_reason,
+        "error": completion.error,
+        "prompt_tokens": completion.prompt_tokens,
+        "completion_tokens": completion.completion_tokens,
+        "seconds": completion.seconds,
+        "batch_size": completion.batch_size,
+        "prompt_sha256": digest(request.messages),
+    }
+
+
+def read_kept(kept: Path) -> dict[str, Answer]:
+    """Answers kept so far. A torn last line is dropped and asked again."""
+    if not kept.is_file():
+        return {}
+    data = kept.read_bytes()
+    whole = data[: data.rfind(b"\n") + 1]
+    if len(whole) < len(data):
+        with kept.open("r+b") as file:
+            file.truncate(len(whole))
+    try:
+        return dict(json.loads(line) for line in whole.splitlines())
+    except (ValueError, TypeError) as error:
+        raise UserError(
+            f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
+        ) from None

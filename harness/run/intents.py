@@ -1,0 +1,83 @@
+"""From answers to arrays: intents of every viewer of every scene, and what a message costs on air."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.arrays import Bools, Floats, Ints
+from harness.dataset.load import Scene
+from harness.files import canonical_json
+from harness.parse import Parsed, parse
+from harness.run.asking import Answer
+from harness.run.spec import Spec
+
+
+@dataclass(frozen=True)
+class Intents:
+    """What every viewer of every scene intends; n scenes, H helpers, A actions.
+
+    Attributes:
+        answers: raw answers, n lists of 1+H; None where nobody was asked.
+        parsed: what each says, in the same places.
+        own: the ego's intent, (n, A); NaN where its answer failed.
+        helpers: helpers' intents, (n, H, A); NaN where there is none.
+        valid: the helper answered and its answer parsed, (n, H).
+        distance_m: distance to the centroid of the conflict zone, (n, 1+H).
+        range_m: distance to the ego, (n, H).
+        payload_bits: size of the helper's message, (n, H).
+    """
+
+    answers: list[list[Answer | None]]
+    parsed: list[list[Parsed | None]]
+    own: Floats
+    helpers: Floats
+    valid: Bools
+    distance_m: Floats
+    range_m: Floats
+    payload_bits: Ints
+
+
+def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
+    """Parse every answer. A failed one is NaN and keeps its status."""
+    scenes, actions = spec.dataset.scenes, spec.dataset.actions
+    width = max(len(scene.viewers) for scene in scenes)
+    answers = [_padded([by_id.get(f"{s.id}/{v}") for v in s.viewers], width) for s in scenes]
+    parsed = [
+        [a and parse(
+            a["raw"], role="ego" if j == 0 else "helper", actions=actions, thinking=spec.thinking,
+            finish_reason=a["finish_reason"], error=a["error"],
+        ) for j, a in enumerate(row)] for row in answers
+    ]  # fmt: skip
+    p = np.full((len(scenes), width, len(actions)), np.nan)
+    distance, reach = np.full((len(scenes), width), np.nan), np.full((len(scenes), width - 1), np.nan)
+    bits = np.zeros((len(scenes), width - 1), dtype=np.int64)
+    for i, scene in enumerate(scenes):
+        ego = scene.state.ego
+        for j, viewer in enumerate(scene.viewers):
+            distance[i, j] = scene.record["distance_m"][viewer]
+            said = parsed[i][j]
+            if said and said.intent is not None:
+                p[i, j] = said.intent
+            if j:
+                v = scene.state.vehicle(viewer)
+                reach[i, j - 1] = np.hypot(v.x_m - ego.x_m, v.y_m - ego.y_m)
+                bits[i, j - 1] = payload_bits(scene, viewer, said) if said else 0
+    valid = ~np.isnan(p[:, 1:]).any(axis=-1)
+    return Intents(answers, parsed, p[:, 0], p[:, 1:], valid, distance, reach, bits)
+
+
+def payload_bits(scene: Scene, viewer: str, said: Parsed) -> int:
+    """Size of the message a helper sends: its id, position, intent, evidence and risk, as compact JSON."""
+    v = scene.state.vehicle(viewer)
+    message = {
+        "from": viewer,
+        "xy_m": [round(v.x_m, 1), round(v.y_m, 1)],
+        "intent": said.intent and [round(x, 2) for x in said.intent],
+        "says": said.message,
+    }
+    return 8 * len(canonical_json(message).encode())
+
+
+def _padded(row: list[Answer | None], width: int) -> list[Answer | None]:
+    return row + [None] * (width - len(row))

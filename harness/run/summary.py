@@ -1,0 +1,118 @@
+"""Summary of a run: every metric with n, an interval, and what the interval is over.
+
+Two intervals, because they answer different questions. `seed means` (Student's t across seeds, the paper's
+error bars): how much the channel's luck moves the figure, given these very episodes. `episodes` (Wilson for
+yes/no outcomes that no seed changes, else Student's t across episodes, each averaged over seeds and steps):
+how far the figure would move with other episodes of the scenario. Both are conditional on the one set of
+answers the model gave.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from harness.arrays import Floats
+from harness.metrics import Estimate, episode_interval, rate_interval, seed_interval
+from harness.run.intents import Intents
+from harness.run.scoring import Scored, Table, statuses
+from harness.run.spec import Spec
+
+COLUMNS = (
+    "model", "prompt", "condition", "metric", "value", "ci_low", "ci_high", "n", "n_excluded", "interval",
+)  # fmt: skip
+ALL = "all"  # stands for the condition where a figure does not depend on it
+BASELINE = "single-local"
+YES_OR_NO = ("success_rate", "unsafe_rate", "late_rate")  # what an episode has or has not
+
+
+def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> pd.DataFrame:
+    """The long table of `summary.csv`."""
+    rows = [
+        {
+            "model": spec.card.name, "prompt": spec.prompt.version, "condition": condition, "metric": metric,
+            "value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n, "n_excluded": e.n_excluded,
+            "interval": interval,
+        }
+        for condition, metric, e, interval in _estimates(spec, laid, known, runs)
+    ]  # fmt: skip
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _estimates(
+    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]
+) -> Iterator[tuple[str, str, Estimate, str]]:
+    by_condition: dict[str, dict[str, Floats]] = {}
+    for point in spec.points:
+        mine = [r for r in runs if r.point == point]
+        metrics = {
+            name: np.stack([_metrics(laid, r)[name] for r in mine]) for name in _metrics(laid, mine[0])
+        }
+        by_condition[point.name] = metrics
+        for name, values in metrics.items():  # (seeds, episodes)
+            yield point.name, name, seed_interval(_mean(values, axis=1)), "seed means"
+            yield point.name, name, _over_episodes(name, values), "episodes"
+        total = np.array([float(r.coordination.messages.sum()) for r in mine])
+        yield point.name, "message_count", seed_interval(total), "seed means"
+    if BASELINE in by_condition:
+        for name, metrics in by_condition.items():
+            if name != BASELINE:
+                gain = metrics["success_rate"] - by_condition[BASELINE]["success_rate"]
+                yield name, f"success_gain_over_{BASELINE}", seed_interval(gain.mean(axis=1)), "seed means"
+                yield name, f"success_gain_over_{BASELINE}", episode_interval(gain.mean(axis=0)), "episodes"
+    for role, verdicts in statuses(known).items():
+        for verdict in ("strict", "recovered", "failed"):
+            if verdicts:
+                hits = np.array([float(v == verdict) for v in verdicts])
+                yield ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers"
+    for role, column in (("ego", slice(0, 1)), ("helper", slice(1, None))):
+        for what in ("prompt_tokens", "completion_tokens"):
+            counts = [a[what] for row in known.answers for a in row[column] if a and a[what] is not None]
+            if counts:
+                yield ALL, f"{what}_{role}", episode_interval(np.array(counts, dtype=float)), "answers"
+
+
+def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
+    """Each metric by episode, (E,): a share or a mean over its decisions."""
+    c = r.coordination
+
+    def mean(values: Any) -> Floats:
+        return _mean(laid.by_episode(np.asarray(values, dtype=float)), axis=1)
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        observed = np.where(c.messages > 0, c.lost / c.messages, np.nan)
+    return {
+        "success_rate": r.verdict.success.astype(float),
+        "unsafe_rate": r.verdict.unsafe.astype(float),
+        "late_rate": r.verdict.late.astype(float),
+        "latency_proxy_ms": mean(c.latency_s * 1000),
+        "deadline_miss_rate": mean(c.deadline_missed),
+        "trigger_rate": mean(c.triggered),
+        "messages_per_episode": mean(c.messages) * (laid.index >= 0).sum(axis=1),
+        "effective_loss": mean(np.where(c.triggered, c.loss, np.nan)),
+        "observed_reply_loss": mean(observed),
+        "entropy_nats": mean(c.entropy_nats),
+        "normalised_entropy": mean(c.normalised_entropy),
+        "brier": mean(r.brier),
+        "negative_log_likelihood": mean(r.nll),
+        "fallback_rate": mean(c.own_failed),
+    }
+
+
+def _over_episodes(name: str, values: Floats) -> Estimate:
+    """Interval over episodes of a metric's values (seeds, episodes)."""
+    each = _mean(values, axis=0)
+    settled = each[~np.isnan(each)]
+    # Student's t would give 0 of 20 episodes an interval of no width.
+    if name in YES_OR_NO and np.isin(settled, (0.0, 1.0)).all():
+        return rate_interval(each)
+    return episode_interval(each)
+
+
+def _mean(values: Floats, axis: int) -> Floats:
+    """Mean of what is not NaN; NaN where nothing is."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
