@@ -72,7 +72,9 @@ def rollouts(
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
             level = np.clip(np.round(speed / spacing).astype(int) + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = np.clip((target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2)
+        change = np.clip(
+            (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2
+        )
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[:, k] = gone
@@ -80,7 +82,7 @@ def rollouts(
 
 
 def least_gap(travelled: Array, conflict: Mapping[str, Any]) -> Array:
-    """Smallest gap (m) to one other vehicle that keeps its path and speed, per sequence; below zero they meet."""
+    """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
     key = (conflict["sector"], conflict["route"])
     mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S

@@ -56,7 +56,9 @@ class VehicleState:
         return rectangle(self.x_m, self.y_m, self.heading_rad, self.length_m, self.width_m)
 
 
-def rectangle(x_m: float, y_m: float, heading_rad: float, length_m: float, width_m: float) -> NDArray[np.float64]:
+def rectangle(
+    x_m: float, y_m: float, heading_rad: float, length_m: float, width_m: float
+) -> NDArray[np.float64]:
     """(4, 2) m corners of a rectangle: front left first, then clockwise as seen from above."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     along = np.array([length_m, length_m, -length_m, -length_m]) / 2

@@ -6,12 +6,11 @@ are stepped here rather than by `env.step`, so that an episode ends in the frame
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from highway_env import utils
-from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
@@ -73,6 +72,7 @@ class OccludedIntersectionEnv(IntersectionEnv):  # type: ignore[misc]
 
     parameters = Parameters()
     layout: Layout
+    road: Road
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
@@ -123,7 +123,12 @@ def _vehicle(
 ) -> ControlledVehicle:
     """A vehicle on the given section of its route: approach, junction or exit."""
     route = _lanes(paths()[spawn.approach, spawn.route])
-    arguments = {"heading": heading, "speed": spawn.speed_mps, "target_lane_index": route[section], "route": route}
+    arguments = {
+        "heading": heading,
+        "speed": spawn.speed_mps,
+        "target_lane_index": route[section],
+        "route": route,
+    }
     vehicle: ControlledVehicle
     if spawn.part == "ego":
         vehicle = Ego(road, position, target_speeds=p.target_speeds_mps, **arguments)
@@ -162,7 +167,7 @@ class World:
     seed: int
     step: int = 0
     frame: int = 0
-    outcome: Outcome = Outcome()
+    outcome: Outcome = field(default_factory=Outcome)
 
     @classmethod
     def start(cls, seed: int) -> "World":
@@ -240,7 +245,10 @@ class World:
         crashed = [v for v in others if v.crashed and id(v) not in standing]
         if ego.crashed:
             mine = _state(ego)
-            partner = min((_state(v) for v in crashed or others), key=lambda v: float(outline(mine).distance(outline(v))))
+            partner = min(
+                (_state(v) for v in crashed or others),
+                key=lambda v: float(outline(mine).distance(outline(v))),
+            )
             how = {"partner": partner.id, "striker": striker(mine, partner), "fault": fault(mine, partner)}
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:

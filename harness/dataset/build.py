@@ -49,7 +49,10 @@ def build(
         "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
-        "versions": {"harness": __version__, **{name: version(name) for name in ("highway-env", "numpy", "shapely")}},
+        "versions": {
+            "harness": __version__,
+            **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
+        },
     }
     work = _begin(out, json.loads(canonical_json(config)))
     done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
@@ -87,7 +90,7 @@ def _begin(out: Path, config: dict[str, Any]) -> Path:
     if (work / "config.json").is_file():
         if json.loads((work / "config.json").read_text()) != config:
             raise UserError(
-                f"--out {shown} holds a build begun with other settings; repeat those to continue it, or delete it"
+                f"--out {shown} holds a build begun with other settings; repeat those to go on, or delete it"
             )
     elif out.is_dir() and any(p.name != WORK for p in out.iterdir()):
         raise UserError(f"--out {shown} is a folder with other files in it; choose an empty or a new one")
@@ -105,7 +108,9 @@ def _freeze_to_file(work: Path, seed: int, episode: int) -> None:
     lines = [canonical_json(record) + "\n" for record in freeze(seed + episode, episode, Behaviour())]
     for line in lines:
         for error in record_validator(ACTIONS).iter_errors(json.loads(line)):
-            raise AssertionError(f"episode {episode} breaks its own schema at {error.json_path}: {error.message}")
+            raise AssertionError(
+                f"episode {episode} breaks its own schema at {error.json_path}: {error.message}"
+            )
     write_whole(work / _shard(episode), "".join(lines))
 
 

@@ -21,7 +21,12 @@ from harness.world import World
 
 Record = dict[str, Any]
 
-ROAD = {"kind": "four-way intersection", "lane_width_m": LANE_WIDTH_M, "junction_m": JUNCTION_M, "ego": "own/straight"}
+ROAD = {
+    "kind": "four-way intersection",
+    "lane_width_m": LANE_WIDTH_M,
+    "junction_m": JUNCTION_M,
+    "ego": "own/straight",
+}
 
 
 @dataclass(frozen=True)

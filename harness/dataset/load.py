@@ -87,7 +87,9 @@ class Dataset:
         """
         tables = [[s.record["outcomes"][a] for a in self.actions] for s in self.scenes]
         safe = np.array([[o["result"] == "cleared" for o in row] for row in tables])
-        time_s = np.array([[o["time_s"] if o["result"] == "cleared" else np.inf for o in row] for row in tables])
+        time_s = np.array(
+            [[o["time_s"] if o["result"] == "cleared" else np.inf for o in row] for row in tables]
+        )
         with np.errstate(invalid="ignore"):
             delay_s = np.where(safe, time_s - time_s.min(axis=1, keepdims=True), np.nan)
         return safe, delay_s
@@ -113,7 +115,9 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     for name, expected in manifest["files"].items():
         file = path / name
         if not file.is_file():
-            raise UserError(f"dataset file {printable(file)} is missing; restore it or build the dataset again")
+            raise UserError(
+                f"dataset file {printable(file)} is missing; restore it or build the dataset again"
+            )
         if sha256_file(file) != expected:
             raise UserError(
                 f"dataset file {printable(file)} has changed (sha256 differs from manifest.json); "
@@ -147,12 +151,14 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
         manifest = json.loads(data)
     except FileNotFoundError:
         raise UserError(
-            f"{printable(path)} is no dataset: it has no manifest.json; build one with `harness dataset build`"
+            f"{printable(path)} is no dataset (no manifest.json); build one with `harness dataset build`"
         ) from None
     except (OSError, ValueError) as error:
-        raise UserError(f"{printable(file)} cannot be read ({printable(error)}); build the dataset again") from None
-    for error in Draft202012Validator(manifest_schema()).iter_errors(manifest):
-        raise UserError(f"{printable(file)} at {error.json_path}: {printable(error.message)}")
+        raise UserError(
+            f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
+        ) from None
+    for broken in Draft202012Validator(manifest_schema()).iter_errors(manifest):
+        raise UserError(f"{printable(file)} at {broken.json_path}: {printable(broken.message)}")
     return manifest, sha256_bytes(data)
 
 
@@ -192,5 +198,7 @@ def _check_scenes(file: Path, manifest: dict[str, Any]) -> list[str]:
                     problems.append(f"{where}: scene {record['scene']} appears twice")
                 seen.add(record["scene"])
         if number != manifest["decisions"]:
-            problems.append(f"{file.name}: {number} decision points, the manifest says {manifest['decisions']}")
+            problems.append(
+                f"{file.name}: {number} decision points, the manifest says {manifest['decisions']}"
+            )
     return problems

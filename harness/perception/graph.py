@@ -41,7 +41,9 @@ def truth_graph(state: WorldState) -> Graph:
     return _graph(state, state.ego, exact, [])
 
 
-def _graph(state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]) -> Graph:
+def _graph(
+    state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]
+) -> Graph:
     ego = state.ego
     ego_arc = paths()["own", "straight"].project(ego.x_m, ego.y_m)[0]
     nodes, conflicts = [], []
@@ -102,14 +104,14 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
 
 
 def _path_of(d: Detection) -> Path | None:
-    """The path an object is taken to follow: the nearest that fits its heading, straight on unless it shows left."""
+    """The path an object is taken to follow: the nearest that fits its heading; left if it shows left."""
     best, least = None, ON_PATH_M
     for (_, route), path in paths().items():
         arc, lateral, heading = path.project(d.x_m, d.y_m)
         turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
         if d.heading_rad is not None and turned < np.cos(np.radians(40.0)):
             continue
-        # On the shared approach lane both routes fit alike; a turn shows by the indicator, or once it is under way.
+        # On the shared approach lane both routes fit alike: a turn shows by the indicator, or under way.
         before = arc < path.junction_m[0]
         unlikely = before and (route == "left") != (d.indicator == "left")
         cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
@@ -139,7 +141,7 @@ def _conflict(
 
 
 def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
-    """Arc length left (m, negative once past) and the time it takes at constant speed (s), None at a standstill."""
+    """Arc length left (m, negative once past), and the seconds it takes (None at a standstill)."""
     return {
         "arc_m": round(to_go_m, 1),
         "time_s": round(to_go_m / speed_mps, 1) if speed_mps > 0.5 else None,
@@ -156,5 +158,7 @@ def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
         blockers = blocked_by(state, viewer, points)
         seen = sum(b is None for b in blockers) / len(blockers)
         hiding = sorted({b for b in blockers if b is not None})
-        found.append({"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding})
+        found.append(
+            {"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding}
+        )
     return found

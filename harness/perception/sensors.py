@@ -74,7 +74,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
         return None  # a bearing alone is no position
     z = luck.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
 
-    # Radar ranges along the bearing; across it the LiDAR is better, and where both see, it gives the position.
+    # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
     if seen["lidar"]:
         x, y = v.x_m + 0.1 * z[0], v.y_m + 0.1 * z[1]
     else:
