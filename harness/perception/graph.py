@@ -6,6 +6,7 @@ whoever looks, for helpers judge what the ego should do; a helper knows the ego'
 the request, not from its sensors.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,10 @@ def scene_graph(state: WorldState, viewer_id: str) -> Graph:
     """What the sensors of one vehicle know."""
     viewer = state.vehicle(viewer_id)
     detections = detect(state, viewer, sweep(state, viewer))
-    return _graph(state, viewer, detections, _sectors(state, viewer))
+    # What no sensor reports must not show by what it hides.
+    reported = {viewer.id, *(d.id for d in detections)}
+    known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
+    return _graph(state, viewer, detections, _sectors(known, viewer))
 
 
 def truth_graph(state: WorldState) -> Graph:
@@ -149,7 +153,7 @@ def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
 
 
 def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
-    """How much of each sector's approach lane is in sight, and what hides the rest."""
+    """How much of each sector's approach lane is in sight past what the viewer knows of, and what hides the rest."""
     found = []
     for sector in SECTORS:
         path = paths()[sector, "straight"]
