@@ -64,17 +64,17 @@ def _graph(
         "role": "ego" if viewer.part == "ego" else "helper",
         "step": state.step,
         "self": {
-            "speed_mps": round(viewer.speed_mps, 1),
+            "speed_mps": _tenths(viewer.speed_mps),
             "lane": paths()[viewer.approach, viewer.route].lane_role(
                 paths()[viewer.approach, viewer.route].project(viewer.x_m, viewer.y_m)[0]
             ),
-            "zone_m": round(float(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])), 1),
+            "zone_m": _tenths(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])),
         },
         "ego": {
             "id": ego.id,
-            "speed_mps": round(ego.speed_mps, 1),
+            "speed_mps": _tenths(ego.speed_mps),
             "target_speed_mps": state.target_speed_mps,
-            "zone_m": round(paths()["own", "straight"].project(*zone)[0] - ego_arc, 1),
+            "zone_m": _tenths(paths()["own", "straight"].project(*zone)[0] - ego_arc),
             **_relative(viewer, ego.x_m, ego.y_m),
         },
         "nodes": nodes,
@@ -86,7 +86,12 @@ def _graph(
 def _relative(viewer: VehicleState, x_m: float, y_m: float) -> dict[str, float]:
     dx, dy = x_m - viewer.x_m, y_m - viewer.y_m
     cos, sin = np.cos(viewer.heading_rad), np.sin(viewer.heading_rad)
-    return {"forward_m": round(float(dx * cos + dy * sin), 1), "left_m": round(float(dx * sin - dy * cos), 1)}
+    return {"forward_m": _tenths(dx * cos + dy * sin), "left_m": _tenths(dx * sin - dy * cos)}
+
+
+def _tenths(value: float) -> float:
+    """The value to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
+    return round(float(value), 1) + 0.0
 
 
 def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
@@ -99,8 +104,8 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
         "type": d.kind or "vehicle",
         **_relative(viewer, d.x_m, d.y_m),
         "heading_deg": heading,
-        "speed_mps": round(d.speed_mps, 1),
-        "range_rate_mps": None if d.range_rate_mps is None else round(d.range_rate_mps, 1),
+        "speed_mps": _tenths(d.speed_mps),
+        "range_rate_mps": None if d.range_rate_mps is None else _tenths(d.range_rate_mps),
         "lane": lane,
         "indicator": d.indicator,
         "sensors": list(d.sensors),
@@ -140,15 +145,15 @@ def _conflict(
         "route": path.route,
         "point": _relative(viewer, crossing.x_m, crossing.y_m),
         "ego": _arrival(ego_to_go, ego.speed_mps),
-        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": round(d.speed_mps, 1)},
+        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": _tenths(d.speed_mps)},
     }
 
 
 def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
     """Arc length left (m, negative once past), and the seconds it takes (None at a standstill)."""
     return {
-        "arc_m": round(to_go_m, 1),
-        "time_s": round(to_go_m / speed_mps, 1) if speed_mps > 0.5 else None,
+        "arc_m": _tenths(to_go_m),
+        "time_s": _tenths(to_go_m / speed_mps) if speed_mps > 0.5 else None,
     }
 
 
