@@ -37,9 +37,8 @@ def drive(driver: str, seed: int) -> Outcome:
 def drive_all(seed: int) -> dict[str, Outcome]:
     """One episode by every driver; who clears it too long after the full-view driver is `late`."""
     outcomes = {driver: drive(driver, seed) for driver in DRIVERS}
-    return {
-        driver: outcome.judged(outcomes[PRIVILEGED], Parameters()) for driver, outcome in outcomes.items()
-    }
+    reference = outcomes[PRIVILEGED]
+    return {driver: outcome.judged(reference, Parameters()) for driver, outcome in outcomes.items()}
 
 
 def check(episodes: int, seed: int, workers: int, progress: Callable[[int], None]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Outcome:
         time_s: when it was decided; None while running.
         partner: id of the vehicle the ego collided with.
         striker: whose front hit: `ego`, `other`, `both` or `neither` (a side swipe).
-        fault: who should have given way, by right of way (or who drove into the other's back): `ego` or `other`.
+        fault: who should have given way by right of way, or drove into the other's back: `ego` or `other`.
         least_gap_m: smallest distance so far between the ego's outline and any other vehicle's.
         other_crashes: vehicles that crashed without the ego.
     """
@@ -52,12 +52,12 @@ class Outcome:
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
-        """The same outcome, `late` where the ego cleared too long after the full-view driver's `reference`."""
-        if self.success and reference.success and self.time_s is not None and reference.time_s is not None:
-            # Frames are 20 ms apart: half of one keeps rounding out of the comparison.
-            if self.time_s - reference.time_s > parameters.delay_allowance_s + 0.01:
-                return replace(self, result="late")
-        return self
+        """The same outcome, `late` where the ego cleared too long after the full-view `reference`."""
+        if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
+            return self
+        # Frames are 20 ms apart: half of one keeps rounding out of the comparison.
+        late = self.time_s - reference.time_s > parameters.delay_allowance_s + 0.01
+        return replace(self, result="late") if late else self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
         """The same episode, decided."""
@@ -88,9 +88,8 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
 def fault(ego: VehicleState, other: VehicleState) -> str:
     """Who should have given way: the one behind in a rear-end collision, else the one with less priority."""
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
-        ahead = (other.x_m - ego.x_m) * np.cos(ego.heading_rad) + (other.y_m - ego.y_m) * np.sin(
-            ego.heading_rad
-        )
+        dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
+        ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)
         return "ego" if ahead > 0 else "other"
     mine, its = PRIORITY[ego.approach][ego.route], PRIORITY[other.approach][other.route]
     return "ego" if mine < its else "other"

@@ -82,7 +82,7 @@ def rollouts(
 
 
 def least_gap(travelled: Array, conflict: Mapping[str, Any]) -> Array:
-    """Smallest gap (m) to one other vehicle that keeps its path and speed, per sequence; below zero they meet."""
+    """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
     key = (conflict["sector"], conflict["route"])
     mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S

@@ -56,21 +56,18 @@ class Path:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
         gap = np.hypot(self.points[:, 0] - x_m, self.points[:, 1] - y_m)
         i = int(gap.argmin())
-        along = (x_m - self.points[i, 0]) * np.cos(self.headings_rad[i]) + (y_m - self.points[i, 1]) * np.sin(
-            self.headings_rad[i]
-        )
+        heading = float(self.headings_rad[i])
+        dx, dy = x_m - self.points[i, 0], y_m - self.points[i, 1]
+        along = dx * np.cos(heading) + dy * np.sin(heading)
         lateral = float(np.sqrt(max(gap[i] ** 2 - along**2, 0.0)))
-        return float(self.arc_m[i] + along), lateral, float(self.headings_rad[i])
+        return float(self.arc_m[i] + along), lateral, heading
 
     def at(self, arc_m: float) -> tuple[float, float, float]:
         """Position (m, m) and heading (rad) at an arc length."""
         x = float(np.interp(arc_m, self.arc_m, self.points[:, 0]))
         y = float(np.interp(arc_m, self.arc_m, self.points[:, 1]))
-        return (
-            x,
-            y,
-            float(self.headings_rad[int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))]),
-        )
+        nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
+        return x, y, float(self.headings_rad[nearest])
 
     def lane_role(self, arc_m: float) -> str:
         """`approach-…` before the junction, `junction`, then `exit-…`, named from the ego's seat."""
@@ -141,6 +138,6 @@ def crossings() -> dict[tuple[str, str], Crossing]:
 
 @lru_cache(maxsize=1)
 def conflict_zone() -> tuple[float, float]:
-    """Centroid (m, m) of the conflict points of the three sectors' dangers: what d_j of Eq. 2 is measured to."""
+    """Centroid (m, m) of the conflict points of the three dangers: what d_j of Eq. 2 is measured to."""
     points = [crossings()[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
     return float(np.mean([p.x_m for p in points])), float(np.mean([p.y_m for p in points]))

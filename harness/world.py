@@ -6,7 +6,7 @@ are stepped here rather than by `env.step`, so that an episode ends in the frame
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,7 @@ class OccludedIntersectionEnv(IntersectionEnv):  # type: ignore[misc]
 
     parameters = Parameters()
     layout: Layout
+    road: Road
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
@@ -166,7 +167,7 @@ class World:
     seed: int
     step: int = 0
     frame: int = 0
-    outcome: Outcome = Outcome()
+    outcome: Outcome = field(default_factory=Outcome)
 
     @classmethod
     def start(cls, seed: int) -> "World":

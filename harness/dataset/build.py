@@ -90,7 +90,7 @@ def _begin(out: Path, config: dict[str, Any]) -> Path:
     if (work / "config.json").is_file():
         if json.loads((work / "config.json").read_text()) != config:
             raise UserError(
-                f"--out {shown} holds a build begun with other settings; repeat those to continue it, or delete it"
+                f"--out {shown} holds a build begun with other settings; repeat those to go on, or delete it"
             )
     elif out.is_dir() and any(p.name != WORK for p in out.iterdir()):
         raise UserError(f"--out {shown} is a folder with other files in it; choose an empty or a new one")

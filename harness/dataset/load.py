@@ -151,14 +151,14 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
         manifest = json.loads(data)
     except FileNotFoundError:
         raise UserError(
-            f"{printable(path)} is no dataset: it has no manifest.json; build one with `harness dataset build`"
+            f"{printable(path)} is no dataset (no manifest.json); build one with `harness dataset build`"
         ) from None
     except (OSError, ValueError) as error:
         raise UserError(
             f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
         ) from None
-    for error in Draft202012Validator(manifest_schema()).iter_errors(manifest):
-        raise UserError(f"{printable(file)} at {error.json_path}: {printable(error.message)}")
+    for broken in Draft202012Validator(manifest_schema()).iter_errors(manifest):
+        raise UserError(f"{printable(file)} at {broken.json_path}: {printable(broken.message)}")
     return manifest, sha256_bytes(data)
 
 

@@ -46,13 +46,15 @@ _GRAPH = _object(
     step={"type": "integer", "minimum": 0},
     self=_object(speed_mps=NUMBER, lane={"type": "string"}, zone_m=NUMBER),
     ego=_object(
-        id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER, left_m=NUMBER
+        id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER,
+        left_m=NUMBER,
     ),
     nodes=_list(
         _object(
             id=VEHICLE_ID, type=_enum("vehicle", *SIZES_M), forward_m=NUMBER, left_m=NUMBER,
-            heading_deg=NUMBER_OR_NULL, speed_mps=NUMBER, range_rate_mps=NUMBER_OR_NULL, lane={"type": "string"},
-            indicator=_enum("left", "off", None), sensors=_list(_enum("camera", "lidar", "radar")),
+            heading_deg=NUMBER_OR_NULL, speed_mps=NUMBER, range_rate_mps=NUMBER_OR_NULL,
+            lane={"type": "string"}, indicator=_enum("left", "off", None),
+            sensors=_list(_enum("camera", "lidar", "radar")),
         )
     ),
     conflicts=_list(
@@ -63,7 +65,8 @@ _GRAPH = _object(
     ),
     sectors=_list(
         _object(
-            sector=_enum(*SECTORS), seen_share=NUMBER, occluded={"type": "boolean"}, by=_list({"type": "string"})
+            sector=_enum(*SECTORS), seen_share=NUMBER, occluded={"type": "boolean"},
+            by=_list({"type": "string"}),
         )
     ),
 )  # fmt: skip
@@ -89,15 +92,17 @@ def record_schema(actions: tuple[str, ...]) -> Schema:
             episode={"type": "integer", "minimum": 0},
             episode_seed={"type": "integer"},
             step={"type": "integer", "minimum": 0},
-            road=_object(kind={"type": "string"}, lane_width_m=NUMBER, junction_m=NUMBER, ego={"type": "string"}),
+            road=_object(
+                kind={"type": "string"}, lane_width_m=NUMBER, junction_m=NUMBER, ego={"type": "string"}
+            ),
             danger=_object(sector=_enum(*SECTORS, None), vehicle={"anyOf": [VEHICLE_ID, {"type": "null"}]}),
             behaviour=_object(
                 action=_enum(*actions), reason=_enum("cruise", "local-view", "full-view", "random", "guard")
             ),
             state=_object(
-                scenario={"type": "string"}, episode_seed={"type": "integer"}, step={"type": "integer", "minimum": 0},
-                time_s=NUMBER, target_speed_mps=NUMBER, vehicles={**_list(_VEHICLE), "minItems": 1},
-                buildings=_list(_BUILDING),
+                scenario={"type": "string"}, episode_seed={"type": "integer"},
+                step={"type": "integer", "minimum": 0}, time_s=NUMBER, target_speed_mps=NUMBER,
+                vehicles={**_list(_VEHICLE), "minItems": 1}, buildings=_list(_BUILDING),
             ),
             graphs={**by_viewer, "additionalProperties": _GRAPH},
             distance_m={**by_viewer, "additionalProperties": NUMBER},

@@ -6,6 +6,7 @@ whoever looks, for helpers judge what the ego should do; a helper knows the ego'
 the request, not from its sensors.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,10 @@ def scene_graph(state: WorldState, viewer_id: str) -> Graph:
     """What the sensors of one vehicle know."""
     viewer = state.vehicle(viewer_id)
     detections = detect(state, viewer, sweep(state, viewer))
-    return _graph(state, viewer, detections, _sectors(state, viewer))
+    # What no sensor reports must not show by what it hides.
+    reported = {viewer.id, *(d.id for d in detections)}
+    known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
+    return _graph(state, viewer, detections, _sectors(known, viewer))
 
 
 def truth_graph(state: WorldState) -> Graph:
@@ -60,17 +64,17 @@ def _graph(
         "role": "ego" if viewer.part == "ego" else "helper",
         "step": state.step,
         "self": {
-            "speed_mps": round(viewer.speed_mps, 1),
+            "speed_mps": _tenths(viewer.speed_mps),
             "lane": paths()[viewer.approach, viewer.route].lane_role(
                 paths()[viewer.approach, viewer.route].project(viewer.x_m, viewer.y_m)[0]
             ),
-            "zone_m": round(float(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])), 1),
+            "zone_m": _tenths(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])),
         },
         "ego": {
             "id": ego.id,
-            "speed_mps": round(ego.speed_mps, 1),
+            "speed_mps": _tenths(ego.speed_mps),
             "target_speed_mps": state.target_speed_mps,
-            "zone_m": round(paths()["own", "straight"].project(*zone)[0] - ego_arc, 1),
+            "zone_m": _tenths(paths()["own", "straight"].project(*zone)[0] - ego_arc),
             **_relative(viewer, ego.x_m, ego.y_m),
         },
         "nodes": nodes,
@@ -82,8 +86,12 @@ def _graph(
 def _relative(viewer: VehicleState, x_m: float, y_m: float) -> dict[str, float]:
     dx, dy = x_m - viewer.x_m, y_m - viewer.y_m
     cos, sin = np.cos(viewer.heading_rad), np.sin(viewer.heading_rad)
-    forward, left = float(dx * cos + dy * sin), float(dx * sin - dy * cos)
-    return {"forward_m": round(forward, 1) + 0.0, "left_m": round(left, 1) + 0.0}  # + 0.0: no minus zero
+    return {"forward_m": _tenths(dx * cos + dy * sin), "left_m": _tenths(dx * sin - dy * cos)}
+
+
+def _tenths(value: float) -> float:
+    """The value to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
+    return round(float(value), 1) + 0.0
 
 
 def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
@@ -96,8 +104,8 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
         "type": d.kind or "vehicle",
         **_relative(viewer, d.x_m, d.y_m),
         "heading_deg": heading,
-        "speed_mps": round(d.speed_mps, 1),
-        "range_rate_mps": None if d.range_rate_mps is None else round(d.range_rate_mps, 1),
+        "speed_mps": _tenths(d.speed_mps),
+        "range_rate_mps": None if d.range_rate_mps is None else _tenths(d.range_rate_mps),
         "lane": lane,
         "indicator": d.indicator,
         "sensors": list(d.sensors),
@@ -105,14 +113,14 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
 
 
 def _path_of(d: Detection) -> Path | None:
-    """The path an object is taken to follow: the nearest that fits its heading, straight on unless it shows left."""
+    """The path an object is taken to follow: the nearest that fits its heading; left if it shows left."""
     best, least = None, ON_PATH_M
     for (_, route), path in paths().items():
         arc, lateral, heading = path.project(d.x_m, d.y_m)
         turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
         if d.heading_rad is not None and turned < np.cos(np.radians(40.0)):
             continue
-        # On the shared approach lane both routes fit alike; a turn shows by the indicator, or once it is under way.
+        # On the shared approach lane both routes fit alike: a turn shows by the indicator, or under way.
         before = arc < path.junction_m[0]
         unlikely = before and (route == "left") != (d.indicator == "left")
         cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
@@ -137,20 +145,20 @@ def _conflict(
         "route": path.route,
         "point": _relative(viewer, crossing.x_m, crossing.y_m),
         "ego": _arrival(ego_to_go, ego.speed_mps),
-        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": round(d.speed_mps, 1)},
+        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": _tenths(d.speed_mps)},
     }
 
 
 def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
-    """Arc length left (m, negative once past) and the time it takes at constant speed (s), None at a standstill."""
+    """Arc length left (m, negative once past), and the seconds it takes (None at a standstill)."""
     return {
-        "arc_m": round(to_go_m, 1),
-        "time_s": round(to_go_m / speed_mps, 1) if speed_mps > 0.5 else None,
+        "arc_m": _tenths(to_go_m),
+        "time_s": _tenths(to_go_m / speed_mps) if speed_mps > 0.5 else None,
     }
 
 
 def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
-    """How much of each sector's approach lane is in sight, and what hides the rest."""
+    """How much of each sector's approach lane is in sight past what the viewer knows of, and what hides the rest."""
     found = []
     for sector in SECTORS:
         path = paths()[sector, "straight"]

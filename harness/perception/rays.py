@@ -31,7 +31,7 @@ def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Array]
     """Ids and corners (n, 4, 2) of everything that stops a ray, the viewer itself left out."""
     solid = [v for v in state.vehicles if v.id != viewer.id]
     ids = [v.id for v in solid] + [b.id for b in state.buildings]
-    return ids, np.array([s.corners() for s in (*solid, *state.buildings)])
+    return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
 
 
 def first_hits(origin: Array, targets: Array, corners: Array) -> tuple[Array, NDArray[np.intp]]:

@@ -1,9 +1,10 @@
 """Three sensors on every vehicle, their reach and their noise.
 
-LiDAR: all round, 80 m; position to 0.1 m, heading to 2°, speed from tracking to 0.8 m/s.
-Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, range rate to 0.15 m/s,
-bearing to 1°.
-Camera: 60° to either side of the front and of the rear, 60 m; class, bearing to 0.5°, turn indicator.
+LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8 m/s.
+Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°, range rate
+to 0.15 m/s, and tracking with it gives speed to 0.2 m/s.
+Camera: 60° to either side of the front and of the rear, 60 m; class and turn indicator. It never adds to a
+position, because the LiDAR sees all that it sees and places it better.
 Noise is Gaussian with those standard deviations (declared for this harness, typical of automotive
 data sheets, no particular product), keyed by episode, step, viewer and object.
 """
@@ -70,11 +71,11 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
         "radar": in_field and distance <= RADAR_RANGE_M,
     }
     sensors = tuple(name for name, yes in seen.items() if yes)
-    if not sensors or sensors == ("camera",):
-        return None  # a bearing alone is no position
+    if not sensors:
+        return None
     z = luck.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
 
-    # Radar ranges along the bearing; across it the LiDAR is better, and where both see, it gives the position.
+    # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
     if seen["lidar"]:
         x, y = v.x_m + 0.1 * z[0], v.y_m + 0.1 * z[1]
     else:

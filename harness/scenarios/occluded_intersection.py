@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness import luck
-from harness.road import crossings, paths
+from harness.road import SECTORS, crossings, paths
 from harness.scene import Building, Kind, Part
 
 NAME = "occluded-intersection"
@@ -118,16 +118,15 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     danger = None
     if draw("danger") < p.danger_share:
-        danger = ("left", "right", "oncoming")[
-            int(np.searchsorted(np.cumsum(p.sector_shares)[:2], draw("sector")))
-        ]
+        drawn = int(np.searchsorted(np.cumsum(p.sector_shares)[:2], draw("sector")))
+        danger = SECTORS[drawn]
 
     start = between("ego_start", p.ego_start_m)
     ego_arc = crossings()["right", "straight"].ego_arc_m - 1.46 - start
     offset = between("danger_offset", p.danger_offset_s)
 
     def timed(approach: str, route: str, speed: float, late: float) -> float:
-        """Arc length from which a vehicle meets a cruising ego's time at the conflict point, `late` s after."""
+        """Arc length from which a vehicle is at the conflict point `late` s after a cruising ego."""
         at = crossings()[approach, route]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
@@ -151,9 +150,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
-        arc = paths()[approach, "straight"].junction_m[1] + between(
-            f"helper_start_{exit_name}", p.helper_start_m
-        )
+        arc = paths()[approach, "straight"].junction_m[1]
+        arc += between(f"helper_start_{exit_name}", p.helper_start_m)
         if exit_name == "ahead":
             arc += 4.0  # stays clear of the ego that follows it out of the junction
         speed = between(f"helper_speed_{exit_name}", p.helper_speed_mps)
@@ -161,9 +159,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
     numbers = luck.generator(NAME, seed, "ids").permutation(3)
-    ids = {
-        name: f"v{5 + int(number)}" for name, number in zip(("danger", "truck", "late"), numbers, strict=True)
-    }
+    roles = ("danger", "truck", "late")
+    ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
     for name in sorted(others, key=ids.__getitem__):
         kind, approach, route, arc, speed = others[name]
         spawns.append(Spawn(ids[name], kind, "other", approach, route, arc, speed))
