@@ -22,6 +22,6 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
     """`UserError` for a name that does not exist, with the nearest one and the list."""
     names = sorted(known)
     near = get_close_matches(name, names, n=1)
-    meant = f"; did you mean {near[0]!r}?" if near else ""
+    meant = f"; did you mean {near[0]!r}?" if near else ";"
     listed = ", ".join(names) or "(none)"
     return UserError(f"unknown {kind} {printable(name)!r}{meant} known: {listed}{hint}")

@@ -126,8 +126,8 @@ def load(version: str, where: Path | None = None) -> Prompt:
     released = _released(base)
     if version in released and released[version] != sha256:
         raise UserError(
-            f"prompt {version} was released and its text has changed; restore it, or copy it to a new version "
-            f"(its digest is pinned in {printable(base / 'released.toml')})"
+            f"prompt {version} was released and its text has changed; restore it, or copy it to a new "
+            f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     return Prompt(
         version=version,

@@ -1,18 +1,23 @@
 """Counting tokens as a model counts them: with its own tokenizer."""
 
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from harness.cards import Card
 from harness.errors import UserError, printable
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
-QWEN2_SPLIT = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+QWEN2_SPLIT = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}"
+    r"| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
 
 
 @lru_cache(maxsize=4)
 def tokenizer(source: Path) -> Any:
-    """A `tokenizers.Tokenizer` from a GGUF file with a Qwen2 vocabulary, a tokenizer.json, or a folder with one.
+    """A `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
 
     Raises:
         UserError: there is no tokenizer there, or not one of those.
@@ -46,7 +51,7 @@ def _from_gguf(file: Path) -> Any:
     if kind != "qwen2":
         raise UserError(f"{printable(file)} has the pre-tokeniser {printable(kind)}; only qwen2 can be read")
     vocabulary = texts("tokenizer.ggml.tokens")
-    merges = [tuple(pair.split(" ")) for pair in texts("tokenizer.ggml.merges")]
+    merges = [(left, right) for left, right in (p.split(" ") for p in texts("tokenizer.ggml.merges"))]
     types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
              for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
     built = Tokenizer(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
@@ -61,3 +66,18 @@ def _from_gguf(file: Path) -> Any:
         [AddedToken(t, special=True) for t, k in zip(vocabulary, types, strict=True) if k == 3]
     )
     return built
+
+
+def counter(
+    source: Path | None, card: Card | None = None
+) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
+    """A function that counts the tokens of chat messages' contents, the chat template's own left out.
+
+    Takes the tokenizer given, else the one that lies with the model's weights; None where there is neither.
+    """
+    if source is None and card and card.weights and (Path(card.weights) / "tokenizer.json").is_file():
+        source = Path(card.weights)
+    if source is None:
+        return None
+    loaded = tokenizer(source)
+    return lambda messages: sum(len(loaded.encode(m["content"]).ids) for m in messages)

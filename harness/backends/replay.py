@@ -47,11 +47,13 @@ class Replay:
         answer = self.stored.get(request.id)
         if answer is None:
             raise UserError(
-                f"{printable(self.run)} holds no answer for {request.id}; replay a run of the same dataset and limit"
+                f"{printable(self.run)} holds no answer for {request.id}; "
+                "replay a run of the same dataset and limit"
             )
         if answer["prompt_sha256"] != digest(request.messages):
             raise UserError(
-                f"{printable(self.run)} was asked {request.id} with another prompt; replay it with that run's --prompt"
+                f"{printable(self.run)} was asked {request.id} with another prompt; "
+                "replay it with that run's --prompt"
             )
         return Completion(
             request.id, answer["raw"], answer["prompt_tokens"], answer["completion_tokens"],

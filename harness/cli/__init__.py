@@ -4,11 +4,12 @@ Heavy packages load inside the commands, so that `harness --help` answers at onc
 """
 
 import sys
+from typing import Any
 
 import typer
 
-from harness.cli import model
-from harness.errors import UserError
+from harness.cli import evaluate, model, parse, prompt
+from harness.errors import UserError, printable
 
 app = typer.Typer(
     name="harness",
@@ -18,21 +19,32 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.command("eval")(evaluate.evaluate)
+app.add_typer(prompt.app, name="prompt")
 app.add_typer(model.app, name="model")
+app.command("parse")(parse.command)
 
-
-@app.callback()
-def _commands() -> None:
-    """Keep `harness <command>` the form of a call even while there is one command."""
+# typer carries a click of its own and exports of its errors only this one's children.
+_UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
     """Entry point: bad input is one line on stderr and exit code 2."""
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
     except UserError as error:
-        print(f"harness: {error}", file=sys.stderr)
-        sys.exit(2)
+        _fail(str(error))
+    except typer.Abort:
+        _fail("interrupted", 130)
+    except _UsageError as error:
+        message, context = error.format_message(), error.ctx
+        if message.startswith("Usage:"):  # a group without a command shows its help
+            print(message)
+            sys.exit(2)
+        path = context.command_path if context else "harness"
+        _fail(f"{printable(message, 300)} (see {path} --help)")
 
 
-from harness.cli import parse  # noqa: E402, F401  (registers its command)
+def _fail(message: str, code: int = 2) -> None:
+    print(f"harness: {message}", file=sys.stderr)
+    sys.exit(code)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from harness import errors
-from harness.cli import app
 
 if TYPE_CHECKING:
     from harness.parse import Parsed
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
 _FINISH_REASONS = ("stop", "length", "error")
 
 
-@app.command("parse")
 def command(
     file: Annotated[str, typer.Argument(help="File with one raw completion; - reads standard input.")],
     scenario: Annotated[str, typer.Option(help="Scenario that names the actions.")] = "occluded-intersection",

@@ -17,6 +17,11 @@ Answer = dict[str, Any]
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
+def request_count(spec: Spec) -> int:
+    """How many requests an evaluation makes."""
+    return sum(1 if spec.card.engine == "driver" else len(scene.viewers) for scene in spec.dataset.scenes)
+
+
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
     for scene in scenes:

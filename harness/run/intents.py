@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import Bools, Floats, Ints
+from harness.arrays import Bools, Floats
 from harness.dataset.load import Scene
 from harness.files import canonical_json
 from harness.parse import Parsed, parse
@@ -35,7 +35,7 @@ class Intents:
     valid: Bools
     distance_m: Floats
     range_m: Floats
-    payload_bits: Ints
+    payload_bits: Floats
 
 
 def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
@@ -44,14 +44,12 @@ def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
     width = max(len(scene.viewers) for scene in scenes)
     answers = [_padded([by_id.get(f"{s.id}/{v}") for v in s.viewers], width) for s in scenes]
     parsed = [
-        [a and parse(
-            a["raw"], role="ego" if j == 0 else "helper", actions=actions, thinking=spec.thinking,
-            finish_reason=a["finish_reason"], error=a["error"],
-        ) for j, a in enumerate(row)] for row in answers
-    ]  # fmt: skip
+        [_parsed(spec, a, "ego" if j == 0 else "helper") if a else None for j, a in enumerate(row)]
+        for row in answers
+    ]
     p = np.full((len(scenes), width, len(actions)), np.nan)
     distance, reach = np.full((len(scenes), width), np.nan), np.full((len(scenes), width - 1), np.nan)
-    bits = np.zeros((len(scenes), width - 1), dtype=np.int64)
+    bits = np.zeros((len(scenes), width - 1))
     for i, scene in enumerate(scenes):
         ego = scene.state.ego
         for j, viewer in enumerate(scene.viewers):
@@ -65,6 +63,17 @@ def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
                 bits[i, j - 1] = payload_bits(scene, viewer, said) if said else 0
     valid = ~np.isnan(p[:, 1:]).any(axis=-1)
     return Intents(answers, parsed, p[:, 0], p[:, 1:], valid, distance, reach, bits)
+
+
+def _parsed(spec: Spec, answer: Answer, role: str) -> Parsed:
+    return parse(
+        answer["raw"],
+        role=role,
+        actions=spec.dataset.actions,
+        thinking=spec.thinking,
+        finish_reason=answer["finish_reason"],
+        error=answer["error"],
+    )
 
 
 def payload_bits(scene: Scene, viewer: str, said: Parsed) -> int:

@@ -17,7 +17,7 @@ from harness.run.spec import Spec
 
 def rows(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> Iterator[str]:
     """Lines of `rows.jsonl`: a decision point, its answers, and what each condition and seed made of it."""
-    tables = [_decisions(run, spec.dataset.scenes) for run in runs]
+    tables = [_decisions(run, spec.dataset.scenes, spec.dataset.actions) for run in runs]
     for i, scene in enumerate(spec.dataset.scenes):
         yield canonical_json({
             "scene": scene.id,
@@ -50,7 +50,7 @@ def _answer(answer: Answer, parsed: Parsed, role: str) -> dict[str, Any]:
     }
 
 
-def _decisions(run: Scored, scenes: Sequence[Scene]) -> list[dict[str, Any]]:
+def _decisions(run: Scored, scenes: Sequence[Scene], actions: tuple[str, ...]) -> list[dict[str, Any]]:
     """One condition and seed, a mapping a decision."""
     c = run.coordination
     # Lists first: taking numbers out of arrays one by one is most of what a row would cost.
@@ -70,9 +70,10 @@ def _decisions(run: Scored, scenes: Sequence[Scene]) -> list[dict[str, Any]]:
             for j, viewer in enumerate(scene.viewers[1:]) if asked[i][j]
         ]  # fmt: skip
         made.append({
-            "condition": run.point.name, "seed": run.seed, "entropy_nats": entropy[i], "triggered": triggered[i],
-            "messages": messages, "own_weight": weights[i][0], "own_failed": failed[i], "fused": fused[i],
-            "action": action[i], "latency_ms": _number(latency_ms[i]), "deadline_missed": missed[i],
+            "condition": run.point.name, "seed": run.seed, "entropy_nats": entropy[i],
+            "triggered": triggered[i], "messages": messages, "own_weight": weights[i][0],
+            "own_failed": failed[i], "fused": fused[i], "action": actions[action[i]],
+            "latency_ms": _number(latency_ms[i]), "deadline_missed": missed[i],
             "safe": safe[i], "delay_s": _number(delay_s[i]),
         })  # fmt: skip
     return made
@@ -91,10 +92,13 @@ def episodes(spec: Spec, laid: Table, runs: Sequence[Scored]) -> pd.DataFrame:
             return np.nansum(laid_out, axis=1) if sums else np.nanmean(laid_out, axis=1)
 
         frames.append(pd.DataFrame({
-            "model": spec.card.name, "prompt": spec.prompt.version, "condition": run.point.name, "seed": run.seed,
+            "model": spec.card.name, "prompt": spec.prompt.version,
+            "condition": run.point.name, "seed": run.seed,
             "episode": laid.episodes, "danger": [r["danger"]["sector"] or "none" for r in first],
-            "success": verdict.success, "failure": _failures(spec, laid, run), "delay_s": verdict.delay_s.round(3),
-            "messages": per_episode(c.messages, sums=True).astype(int), "trigger_rate": per_episode(c.triggered),
+            "success": verdict.success, "failure": _failures(spec, laid, run),
+            "delay_s": verdict.delay_s.round(3),
+            "messages": per_episode(c.messages, sums=True).astype(int),
+            "trigger_rate": per_episode(c.triggered),
             "latency_ms": per_episode(c.latency_s * 1000).round(3),
             "deadline_misses": per_episode(c.deadline_missed, sums=True).astype(int),
         }))  # fmt: skip

@@ -123,5 +123,5 @@ def draw(laid: Table, seed: int, shape: tuple[int, ...]) -> Luck:
 
 def statuses(known: Intents) -> Mapping[str, list[str]]:
     """Parse verdicts by role, one an answer."""
-    ego = [row[0].verdict for row in known.parsed if row[0]]
+    ego: list[str] = [row[0].verdict for row in known.parsed if row[0]]
     return {"ego": ego, "helper": [p.verdict for row in known.parsed for p in row[1:] if p]}

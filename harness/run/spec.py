@@ -59,7 +59,7 @@ class Spec:
         """What a resumed run must have in common with the one it continues."""
         return {
             "model": asdict(self.card),
-            "prompt": {"version": self.prompt.version, "sha256": self.prompt.sha256, "released": self.prompt.released},
+            "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
             "dataset": {
                 "name": self.dataset.name, "sha256": self.dataset.sha256, "scenes": len(self.dataset.scenes),
                 "episodes": len({s.record["episode"] for s in self.dataset.scenes}),

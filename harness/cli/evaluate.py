@@ -1,0 +1,197 @@
+"""`harness eval`: a model with a prompt on a dataset."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from harness.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.run.evaluate import Evaluated
+    from harness.run.spec import Spec
+
+MOST_SEEDS = 1000
+
+
+def evaluate(
+    model: str = typer.Option(
+        "proxy", help="Model card, checkpoint directory, hub id, or replay:RUN. `harness model list`."
+    ),
+    prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
+    dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
+    condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
+    seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
+    limit: int | None = typer.Option(None, help="Only the dataset's first so many episodes."),
+    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
+    batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
+    device: str | None = typer.Option(None, help="cpu or cuda."),
+    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
+    out: Path | None = typer.Option(
+        None, help="The run's folder. Default: reports/<model>-<prompt>-<dataset>."
+    ),
+    resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
+    dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
+    tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
+    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
+) -> None:
+    """Evaluate a model with a prompt on frozen scenes, and write a report."""
+    from harness import cards, prompts
+    from harness.dataset import load
+    from harness.operating_point import POINTS, named_point
+    from harness.run.spec import Spec
+
+    if limit is not None and limit < 1:
+        raise UserError(f"--limit {limit}: give 1 or more episodes")
+    spec = Spec(
+        card=cards.resolve(model),
+        prompt=prompts.load(prompt),
+        dataset=load.load(load.find(dataset), limit),
+        points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+        seeds=parse_seeds(seeds),
+        limit=limit,
+        thinking=thinking,
+        batch_size=batch_size,
+        device=device,
+        dtype=dtype,
+    )
+    if dry_run:
+        _dry_run(spec, tokenizer, as_json)
+        return
+    _run(spec, out or default_out(spec, resume), resume, as_json)
+
+
+def _run(spec: "Spec", out: Path, resume: bool, as_json: bool) -> None:
+    from harness.cli.progress import bar
+    from harness.report.page import write_report
+    from harness.run.asking import request_count
+    from harness.run.evaluate import evaluate as evaluate_run
+
+    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
+        done = evaluate_run(spec, out, resume, progress)
+    page = write_report(out)
+    if as_json:
+        typer.echo(json.dumps(as_mapping(done), indent=1))
+        return
+    _table(done)
+    typer.echo(f"wrote {page}")
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds from `0:5` (0 to 4) or `3,7,9`."""
+    start, colon, stop = text.partition(":")
+    try:
+        seeds = tuple(range(int(start), int(stop))) if colon else tuple(int(s) for s in text.split(","))
+    except ValueError:
+        seeds = ()
+    if not 0 < len(seeds) <= MOST_SEEDS:
+        raise UserError(f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9")
+    return seeds
+
+
+def default_out(spec: "Spec", resume: bool) -> Path:
+    """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
+    safe = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.card.name).strip(".-") or "model"
+    base = Path("reports") / f"{safe}-{spec.prompt.version}-{spec.dataset.name}"
+    found, number = base, 1
+    last = base
+    while found.exists():
+        last, number = found, number + 1
+        found = base.with_name(f"{base.name}-{number}")
+    return last if resume else found
+
+
+def as_mapping(done: "Evaluated") -> dict[str, Any]:
+    """A finished run for machines: its folder and the rows of its summary."""
+    rows = done.summary.to_dict(orient="records")
+    return {
+        "run": str(done.out),
+        "manifest": done.manifest,
+        "summary": [{k: None if _unknown(v) else v for k, v in row.items()} for row in rows],
+    }
+
+
+def _unknown(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _table(done: "Evaluated") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=80, markup=False, highlight=False)
+    rows = done.summary[done.summary.interval != "seed means"]
+    figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
+    table = Table(box=None, width=80, pad_edge=False)
+    table.add_column("condition", no_wrap=True)
+    for heading in ("success % [95 % CI]", "gain, points", "latency ms", "trigger %", "msgs/ep"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for point in done.manifest["conditions"]:
+        name = point["name"]
+
+        def cell(metric: str, scale: float = 1.0, interval: bool = False, name: str = name) -> str:
+            r = figures.get((name, metric))
+            if r is None or _unknown(r.value):
+                return "-"
+            shown = f"{r.value * scale:.1f}"
+            return f"{shown} [{r.ci_low * scale:.1f}, {r.ci_high * scale:.1f}]" if interval else shown
+
+        table.add_row(
+            name,
+            cell("success_rate", 100, True),
+            cell("success_gain_over_single-local", 100, True),
+            cell("latency_proxy_ms"),
+            cell("trigger_rate", 100),
+            cell("messages_per_episode"),
+        )
+    m = done.manifest
+    console.print(
+        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['dataset']['name']}"
+    )
+    console.print(table)
+    n = m["dataset"]["episodes"]
+    console.print(
+        f"n = {n} episodes, {len(m['seeds'])} channel seeds; intervals over episodes; gain over single-local"
+    )
+    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
+    parts = []
+    for role in ("ego", "helper"):
+        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
+        if shares[0] is not None:
+            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
+            parts.append(f"{role} {values} (n = {shares[0].n})")
+    console.print(f"answers strict / recovered / failed %: {'; '.join(parts)}")
+
+
+def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:
+    from harness.run.asking import requests
+    from harness.tokens import counter
+
+    count = counter(tokenizer, spec.card)
+    sizes: dict[str, list[int]] = {}
+    asked = 0
+    for request in requests(spec, spec.dataset.scenes):
+        asked += 1
+        if count:
+            sizes.setdefault(request.role, []).append(count(request.messages))
+    stats = {
+        role: {"n": len(n), "least": min(n), "mean": round(sum(n) / len(n), 1), "most": max(n)}
+        for role, n in sizes.items()
+    }
+    if as_json:
+        typer.echo(
+            json.dumps({**spec.settings(), "requests": asked, "prompt_tokens": stats or None}, indent=1)
+        )
+        return
+    scenes = len(spec.dataset.scenes)
+    typer.echo(f"{asked} requests for {scenes} scenes; would score {len(spec.points)} conditions × "
+               f"{len(spec.seeds)} seeds; no model was called")  # fmt: skip
+    for role, s in stats.items():
+        typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
+    if not stats:
+        typer.echo(
+            "prompt tokens: not counted, no tokenizer at hand; give --tokenizer (tokenizer.json or GGUF)"
+        )
