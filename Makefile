@@ -1,0 +1,37 @@
+# Everything installs into .venv, with the versions of requirements.lock.
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+
+.PHONY: eval test check bench clean
+
+eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
+	$(BIN)/harness eval --model proxy --prompt v2
+
+test: check ## every check and every test
+	$(BIN)/python -m pytest -n 2
+
+check: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: .venv/dev ## the benchmarks; see benchmarks/README.md
+	$(BIN)/python benchmarks/startup.py
+	$(BIN)/python benchmarks/own_time.py
+	$(BIN)/python benchmarks/coordinate.py
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/base: .venv/bin/python pyproject.toml requirements.lock
+	$(INSTALL) --editable .
+	touch $@
+
+.venv/dev: .venv/bin/python pyproject.toml requirements.lock
+	$(INSTALL) --editable '.[transformers,dev]'
+	touch $@ .venv/base
+
+clean:
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
