@@ -1,0 +1,1 @@
+"""From the world to what one vehicle knows of it: rays, sensors, scene graph."""
