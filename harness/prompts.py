@@ -35,7 +35,8 @@ class Prompt:
         released: whether it is pinned; a draft may still change.
         description: one line.
         helper_answer: what a helper is asked for: `distribution`, or `recommendation` with a confidence.
-        max_objects: how many objects are listed; those in conflict first, then the nearest.
+        max_objects: how many objects are listed, one fewer where messages are; those in conflict first, then
+            the nearest.
         token_budget: least and most tokens a rendered prompt may have.
         max_answer_tokens: most tokens an answer may have, by role.
         changed: what is new in it.
@@ -71,7 +72,7 @@ class Prompt:
             messages: what helpers have sent, for the ego: `sender`, `evidence`, `risk`, `intent`,
                 `recommended_maneuver`, `confidence`.
         """
-        objects = shown(graph, self.max_objects)
+        objects = shown(graph, self.max_objects - bool(messages))
         context = {
             "graph": graph,
             "actions": actions,
