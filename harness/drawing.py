@@ -13,13 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
-from numpy.typing import NDArray
 
 from harness.dataset.load import Scene
 from harness.errors import printable, unknown
+from harness.ground import ground, north_up
 from harness.labels import Labels
-from harness.pictures import BLUE, GREEN, GREY, INK, PURPLE, VERMILLION, Format, save, styled
-from harness.road import JUNCTION_M, LANE_WIDTH_M
+from harness.pictures import BLUE, GREY, INK, PURPLE, VERMILLION, Format, save, styled
+from harness.road import LANE_WIDTH_M
 from harness.scene import VehicleState
 
 VIEW_M = 80.0  # from the centre of the junction to the edge of the picture
@@ -27,7 +27,6 @@ SIDE_IN = 5.8  # of the square that shows it
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 TEXT_PT = 6.5
 
-ROAD, WALL, PAPER = "#C9CCD1", "#EAE4D6", "#F7F7F4"
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": BLUE, "edgecolor": INK, "linewidth": 1.0},
     "helper": {"facecolor": "#8FD9BF", "edgecolor": "#00563F", "hatch": "//////", "linewidth": 0.8},
@@ -35,8 +34,6 @@ LOOKS: dict[str, dict[str, Any]] = {
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }
 NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other": "other vehicle"}
-
-Array = NDArray[np.float64]
 
 
 @styled
@@ -61,11 +58,11 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN + 1.12))
     height = figure.get_figheight()
     axes = figure.add_axes((0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height))
-    axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[], facecolor=PAPER)
+    axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[])
     labels = Labels(axes, PT_PER_M, TEXT_PT, VIEW_M)
     for road in ([LANE_WIDTH_M, VIEW_M], [VIEW_M, LANE_WIDTH_M]):
         labels.discourage(np.array([road, road]) * [[-1.0], [1.0]])
-    _ground(axes, scene)
+    ground(axes, scene.state.buildings, VIEW_M, TEXT_PT)
     _sight_lines(axes, scene, viewer, seen)
     for vehicle in scene.state.vehicles:
         _vehicle(axes, labels, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
@@ -73,43 +70,6 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     labels.place()
     _words(figure, scene, viewer, seen)
     save(figure, out, format)
-
-
-def _north_up(points: Array) -> Array:
-    return points * [1.0, -1.0]
-
-
-def _ground(axes: Axes, scene: Scene) -> None:
-    half, far = LANE_WIDTH_M, VIEW_M + 5.0
-    for building in scene.state.buildings:
-        corners = _north_up(building.corners())
-        axes.add_patch(Polygon(corners, facecolor=WALL, edgecolor="#A79F8A", linewidth=0.8))
-        x, y = np.sign(corners.mean(axis=0)) * (VIEW_M - 13.0)
-        axes.text(x, y, printable(building.id), color="#877E68", size=TEXT_PT, ha="center", va="center")
-    # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
-    angle = np.linspace(np.pi, 1.5 * np.pi, 9)
-    fillet = JUNCTION_M + (JUNCTION_M - half) * np.column_stack([np.cos(angle), np.sin(angle)])
-    corner = np.vstack([[half, far], fillet, [far, half]])
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])  # clockwise, for row vectors
-    turns = [np.linalg.matrix_power(quarter, n) for n in range(4)]
-    outline = np.vstack([corner @ turn for turn in turns])
-    axes.add_patch(Polygon(outline, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
-    for turn in turns:
-        centre = np.array([[0.0, JUNCTION_M], [0.0, far]]) @ turn
-        axes.plot(*centre.T, color="white", linewidth=1.0, dashes=(5, 4))
-        stop = np.array([[0.0, JUNCTION_M], [-half, JUNCTION_M]]) @ turn
-        axes.plot(*stop.T, color="white", linewidth=2.0, solid_capstyle="butt")
-    axes.plot([-76, -56], [-76, -76], color=INK, linewidth=1.5, solid_capstyle="butt")
-    axes.text(-66, -74.8, "20 m", size=TEXT_PT, ha="center", va="bottom")
-    axes.annotate(
-        "N",
-        (75, 76),
-        (75, 67),
-        size=8,
-        ha="center",
-        va="center",
-        arrowprops={"arrowstyle": "-|>", "color": INK},
-    )
 
 
 def _look(scene: Scene, vehicle: VehicleState) -> str:
@@ -128,7 +88,7 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
     marks += ["hidden"] if hidden else []
     marks += ["crashed"] if vehicle.crashed else []
     text = f"{printable(vehicle.id)} {vehicle.kind}" + (f"\n{', '.join(marks)}" if marks else "")
-    centre = _north_up(np.array([vehicle.x_m, vehicle.y_m]))
+    centre = north_up(np.array([vehicle.x_m, vehicle.y_m]))
     beyond_m = float(np.abs(centre).max()) - (VIEW_M - 3.0)
     if beyond_m > 0:
         edge = centre.clip(1.5 - VIEW_M, VIEW_M - 1.5)
@@ -138,14 +98,14 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
         axes.plot(*edge, marker=marker, color=VERMILLION if look == "danger" else GREY, markersize=5)
         labels.add(edge, 1.5, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
-    corners = _north_up(vehicle.corners())
+    corners = north_up(vehicle.corners())
     style = dict(LOOKS[look])
     if hidden:
         style |= {"facecolor": "none", "linestyle": (0, (2, 1.2)), "linewidth": 1.1}
         style["edgecolor"] = VERMILLION if look == "danger" else style["edgecolor"]
         style.pop("hatch", None)
     axes.add_patch(Polygon(corners, **style, zorder=3))
-    along = _north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
+    along = north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
     nose = centre + along * vehicle.length_m / 2
     wings = corners[:2] - along * 1.2
     axes.plot(
@@ -163,7 +123,7 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
             "shrinkB": 0,
         }
         tip = nose + along * vehicle.speed_mps
-        axes.annotate("", tip, nose, arrowprops=arrow)
+        axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow)
         labels.block(np.array([nose, tip]))
     if look == "danger":
         axes.plot(
@@ -183,7 +143,7 @@ def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
     for conflict in scene.record["graphs"][viewer]["conflicts"]:
         forward, left = conflict["point"]["forward_m"], conflict["point"]["left_m"]
-        point = _north_up(
+        point = north_up(
             np.array([eye.x_m + forward * cos + left * sin, eye.y_m + forward * sin - left * cos])
         )
         axes.plot(
@@ -207,7 +167,7 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
     figure.text(left, 1 - 0.24 / height, title, size=10, weight="bold")
     others = [v.id for v in state.vehicles if v.id != viewer]
     parts = [
-        f"{viewer} ({'ego' if viewer == state.ego.id else 'helper'}) sees {_list(v for v in others if v in seen)}",
+        f"{viewer} ({graph['role']}) sees {_list(v for v in others if v in seen)}",
         f"hidden: {_list(v for v in others if v not in seen)}",
         f"occluded sectors: {_list(s['sector'] for s in graph['sectors'] if s['occluded'])}",
     ]
@@ -225,7 +185,7 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
         )
     )
     handles.append(Line2D([], [], color="#005A8C", linewidth=0.9, label="sight line"))
-    cross = {"marker": "X", "color": PURPLE, "markeredgecolor": INK, "markersize": 7}
+    cross: dict[str, Any] = {"marker": "X", "color": PURPLE, "markeredgecolor": INK, "markersize": 7}
     handles.append(Line2D([], [], linestyle="none", label="conflict point, time to it", **cross))
     handles.append(Line2D([], [], color=INK, marker=">", markersize=3, linewidth=0.8, label="way in 1 s"))
     figure.legend(

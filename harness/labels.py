@@ -52,8 +52,8 @@ class Labels:
             if np.hypot(*(edge - at)) > radius_m + 3.0:
                 self.axes.plot(*np.array([at, edge]).T, color=colour, linewidth=0.6, zorder=4)
             self.axes.text(
-                *spot, text, size=self.size_pt, weight="bold" if bold else "normal", color=colour, zorder=5,
-                ha="center", va="center", linespacing=1.1,
+                spot[0], spot[1], text, size=self.size_pt, weight="bold" if bold else "normal", color=colour,
+                ha="center", va="center", linespacing=1.1, zorder=5,
                 bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8},
             )  # fmt: skip
 

@@ -1,9 +1,9 @@
-"""What all pictures share: the look, colours that the colour-blind can tell apart, and the same bytes every time."""
+"""What pictures share: the look, colours that the colour-blind can tell apart, the same bytes every time."""
 
 import io
 import warnings
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,7 +27,7 @@ BLUE, SKY, GREEN, ORANGE, VERMILLION, PURPLE = (
 )
 INK, GREY, PALE = "#222222", "#777777", "#DDDDDD"
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.0,
@@ -61,11 +61,11 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
         # A name in a script that the measuring font lacks is still text in the SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         if format == "svg":
-            nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-            FigureCanvasSVG(figure).print_svg(data, metadata=nothing)
+            FigureCanvasSVG(figure)
+            figure.savefig(data, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
         else:
-            figure.set_dpi(dpi)
-            FigureCanvasAgg(figure).print_png(data, metadata={"Software": None})
+            FigureCanvasAgg(figure)
+            figure.savefig(data, format="png", dpi=dpi, metadata={"Software": None})
     if isinstance(out, Path):
         write_whole(out, data.getvalue())
     else:
