@@ -125,6 +125,7 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
         tip = nose + along * vehicle.speed_mps
         axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow)
         labels.block(np.array([nose, tip]))
+    radius_m = vehicle.length_m / 2
     if look == "danger":
         axes.plot(
             *centre,
@@ -134,24 +135,26 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
             markeredgecolor=VERMILLION,
             markeredgewidth=1.4,
         )
+        radius_m = max(radius_m, 4.2)
+        labels.block(centre + np.array([[-4.0, -4.0], [4.0, 4.0]]))
     labels.block(corners)
-    labels.add(centre, vehicle.length_m / 2, text, bold=look in ("ego", "danger"))
+    labels.add(centre, radius_m, text, bold=look in ("ego", "danger"))
 
 
 def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
     eye, ego = scene.state.vehicle(viewer), printable(scene.state.ego.id)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
-    for conflict in scene.record["graphs"][viewer]["conflicts"]:
-        forward, left = conflict["point"]["forward_m"], conflict["point"]["left_m"]
-        point = north_up(
-            np.array([eye.x_m + forward * cos + left * sin, eye.y_m + forward * sin - left * cos])
-        )
+    conflicts = scene.record["graphs"][viewer]["conflicts"]
+    relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
+    points = north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
+    for conflict, point in zip(conflicts, points, strict=True):
         axes.plot(
             *point, marker="X", markersize=7, color=PURPLE, markeredgecolor=INK, markeredgewidth=0.7, zorder=4
         )
         labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))
         text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
-        labels.add(point, 2.0, text, colour="#8E3B6B")
+        # Labels of two points go apart, or their lines would cross.
+        labels.add(point, 2.0, text, colour="#8E3B6B", toward=point - points.mean(axis=0))
 
 
 def _when(arrival: Mapping[str, Any]) -> str:
