@@ -1,0 +1,164 @@
+"""One HTML file about one run: needs no network and runs no script.
+
+Whatever a model, a prompt or a file name says is text: templates escape everything, characters that show
+nothing or turn the line around are spelt out, and the page's own policy forbids scripts and requests.
+"""
+
+import base64
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, Undefined
+from markupsafe import Markup
+
+from harness.dataset.load import Scene
+from harness.drawing import draw
+from harness.errors import UserError, printable
+from harness.files import write_whole
+from harness.report import figures, words
+from harness.report.choose import Pick, decisions_of, pick
+from harness.report.folder import Row, Run, dataset_of, read
+
+DECISIONS = 60
+TEMPLATES = Path(__file__).parent / "templates"
+
+Prompts = Callable[[Scene, str], Sequence[Mapping[str, str]]]
+
+
+def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = None) -> Path:
+    """Write a run's report.
+
+    Args:
+        run: the run's folder.
+        out: file to replace; None for `report.html` in the run's folder.
+        prompts: gives the chat messages that a viewer was sent in a scene; None leaves them out.
+
+    Returns:
+        The file written.
+
+    Raises:
+        UserError: the folder is no run, its dataset is gone or has changed, or `out` is a folder.
+    """
+    out = run / "report.html" if out is None else out
+    if out.is_dir():
+        raise UserError(f"--out {printable(out)} is a folder; name a file in it")
+    page = render(read(run), prompts)
+    write_whole(out, page)
+    return out
+
+
+def render(run: Run, prompts: Prompts | None = None) -> str:
+    """The page."""
+    scenes = {scene.id: scene for scene in dataset_of(run).scenes}
+    picks = pick(run.rows, DECISIONS)
+    for chosen in picks:
+        if chosen.row["scene"] not in scenes:
+            raise UserError(
+                f"{printable(run.path / 'rows.jsonl')} has scene {printable(chosen.row['scene'])!r}, "
+                "which its dataset has not; run `harness eval` again"
+            )
+    chart = figures.success_latency(run)
+    by_verdict = _count(run.rows, "verdict")
+    return _environment().get_template("page.html.j2").render(
+        run=run,
+        config=run.config,
+        title=run.config.get("name") or run.path.name,
+        headline=words.headline(run),
+        latency=words.latency_source(run.config["latency"]),
+        points=_table(run.config["conditions"]),
+        metrics=_metrics(run, run.conditions),
+        answers=_metrics(run, ["all"]),
+        chart=chart and _uri(chart),
+        statuses=_count(run.rows, "status"),
+        verdicts=_uri(figures.verdicts(by_verdict)),
+        decisions=[_decision(chosen, scenes[chosen.row["scene"]], run, prompts) for chosen in picks],
+    )  # fmt: skip
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=visible,
+    )
+    environment.filters |= {"number": words.number, "facts": words.facts}
+    return environment
+
+
+def visible(value: Any) -> Any:
+    """Text with every character that shows nothing, or turns the line around, spelt out. None is a dash."""
+    if value is None or isinstance(value, Undefined):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
+
+
+def _uri(svg: bytes) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Head and body of a table with a column for every key."""
+    head = list(dict.fromkeys(key for row in rows for key in row))
+    return head, [[row.get(key) for key in head] for row in rows]
+
+
+def _metrics(run: Run, conditions: Sequence[str]) -> list[dict[str, Any]]:
+    """The summary: a metric a line, with its value in each condition."""
+    known = {s.metric: None for s in run.scores if s.condition in conditions}
+    return [
+        {
+            "name": words.metric_name(metric),
+            "meaning": words.MEANINGS.get(metric, ""),
+            "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in conditions],
+        }
+        for metric in known
+    ]
+
+
+def _count(rows: Iterable[Row], key: str) -> dict[str, Counter[str]]:
+    """How many answers have which `status` or `verdict`, by role."""
+    counts: dict[str, Counter[str]] = {}
+    for row in rows:
+        for answer in row["answers"].values():
+            counts.setdefault(answer["role"], Counter())[answer[key]] += 1
+    return counts
+
+
+def _decision(chosen: Pick, scene: Scene, run: Run, prompts: Prompts | None) -> dict[str, Any]:
+    actions, row = run.config["actions"], chosen.row
+    picture = io.BytesIO()
+    draw(scene, picture, "svg")
+    outcomes = [
+        {**scene.record["outcomes"][action], "action": action, "safe": safe, "delay_s": delay_s}
+        for action, safe, delay_s in zip(actions, row["safe"], row["delay_s"], strict=True)
+    ]
+    return {
+        "scene": scene,
+        "why": chosen.why,
+        "picture": _uri(picture.getvalue()),
+        "outcomes": outcomes,
+        "avoidable": any(row["safe"]),
+        "choices": [{**d, "bars": _bars(actions, d["fused"])} for d in decisions_of(row)],
+        "answers": [
+            {
+                **answer,
+                "viewer": viewer,
+                "bars": _bars(actions, answer.get("intent")),
+                "prompt": prompts(scene, viewer) if prompts else None,
+            }
+            for viewer, answer in row["answers"].items()
+        ],
+    }
+
+
+def _bars(actions: Sequence[str], p: Sequence[float] | None) -> list[tuple[str, float]]:
+    return list(zip(actions, map(float, p), strict=True)) if p else []

@@ -1,0 +1,123 @@
+"""Numbers and findings in the words of the report."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from harness.report.folder import Run, Score
+
+SUCCESS, LATENCY = "success_rate", "latency_proxy_ms"
+GAIN = "success_gain_over_"  # and the name of the condition it is over
+
+MEANINGS = {
+    SUCCESS: "episodes with every decision safe, and their delays within the allowance",
+    "unsafe_rate": "episodes with a decision that leads to a collision or a forced failure",
+    "late_rate": "episodes with all decisions safe, but delays beyond the allowance",
+    "collision_rate": "episodes that end in a collision",
+    LATENCY: "start of the decision to the end of the whole exchange, inference included",
+    "trigger_rate": "decisions in which the ego asked",
+    "messages_per_episode": "replies scheduled; the request is none",
+    "message_count": "replies scheduled in the whole run; the request is none",
+    "effective_loss": "probability that one crossing was lost",
+    "observed_reply_loss": "scheduled replies that did not arrive; request and reply must both cross",
+    "deadline_miss_rate": "decisions whose exchange outlasted the decision window",
+    "entropy_nats": "of the ego's own intent",
+    "normalised_entropy": "of the ego's own intent; 1 is undecided",
+    "brier": "of the fused policy against the safe actions; 0 best, 2 worst",
+    "negative_log_likelihood": "of the safe actions in the fused policy; 0 best",
+    "fallback_rate": "decisions in which the ego's own answer could not be read",
+}
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number with so many decimals; a dash for None."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def unit(metric: str) -> tuple[float, str, int]:
+    """How a metric is shown: factor, unit, decimals."""
+    if "_gain_" in metric:
+        return 100.0, " points", 1
+    if "_rate" in metric or metric.endswith("_loss"):
+        return 100.0, " %", 1
+    if metric.endswith("_ms"):
+        return 1.0, " ms", 1
+    if metric.endswith("_nats"):
+        return 1.0, " nats", 3
+    return 1.0, "", 1 if "message" in metric or "tokens" in metric else 3
+
+
+def shown(score: Score) -> dict[str, str]:
+    """Value, interval and n of a score, for a cell of the table."""
+    factor, suffix, digits = unit(score.metric)
+    value = "–" if score.value is None else number(score.value * factor, digits) + suffix
+    n = f"n = {score.n} {score.interval}"
+    if score.n_excluded:
+        n += f", {score.n_excluded} excluded"
+    return {"value": value, "interval": interval(score), "n": n}
+
+
+def interval(score: Score) -> str:
+    """`low to high` in the metric's unit; empty where there is none."""
+    if score.low is None or score.high is None:
+        return ""
+    factor, suffix, digits = unit(score.metric)
+    return f"{number(score.low * factor, digits)} to {number(score.high * factor, digits)}{suffix}"
+
+
+def metric_name(metric: str) -> str:
+    """A metric's name in words; its unit is shown with the value."""
+    return metric.removesuffix("_ms").removesuffix("_nats").replace("_", " ")
+
+
+def headline(run: Run) -> str:
+    """What came out, in one sentence: the best condition, and the one without V2V beside it."""
+    found = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
+    model, dataset = run.config["model"].get("name"), run.config["dataset"].get("name")
+    if not found:
+        return f"{model} on {dataset}: the run has no success rate."
+    best = max(found, key=lambda c: found[c].value or 0.0)
+    text = f"With {model}, {best} {_clears(found[best])} of {dataset}"
+    latency = run.score(best, LATENCY)
+    if latency is not None:
+        text += f" at {shown(latency)['value']} a decision"
+    alone = [c["name"] for c in run.config["conditions"] if c.get("profile") is None and c["name"] in found]
+    base = alone[0] if alone else min(found, key=lambda c: found[c].value or 0.0)
+    if base == best:
+        return text + (", and no other condition does better." if len(found) > 1 else ".")
+    text += f"; {base} {_clears(found[base])}"
+    gain = run.score(best, GAIN + base)
+    if gain is not None and gain.low is not None and gain.high is not None:
+        clear = "a clear difference" if gain.low > 0 or gain.high < 0 else "which may be chance"
+        text += f", a gap of {shown(gain)['value']} ({interval(gain)}), {clear}"
+    return text + "."
+
+
+def _clears(score: Score) -> str:
+    bounds = f" (95 % interval {interval(score)})" if interval(score) else ""
+    return f"clears {shown(score)['value']}{bounds} of the episodes"
+
+
+def latency_source(latency: Mapping[str, Any]) -> str:
+    """Where the inference time comes from, and how long it is."""
+    source = {
+        "measured": "measured where it ran, one answer at a time",
+        "card": "stated by the model card, not measured here",
+        "declared": "declared by whoever started the run, not measured",
+    }.get(latency["source"], latency["source"])
+    seconds = latency["inference_s"]
+    by_role = dict(seconds) if isinstance(seconds, Mapping) else {"each vehicle": seconds}
+    known = [f"{role} {s * 1000:.0f} ms" for role, s in by_role.items() if s is not None]
+    return f"{', '.join(known) or 'each answer has its own time'}; {source} ({latency['basis']})"
+
+
+def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
+    """A nested mapping as lines of a table: dotted name and value."""
+    if isinstance(value, Mapping):
+        return [
+            line
+            for key, inner in value.items()
+            for line in facts(inner, f"{name}.{key}" if name else str(key))
+        ]
+    if isinstance(value, list):
+        return [(name, ", ".join(map(str, value)))]
+    return [(name, value)]
