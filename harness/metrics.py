@@ -83,10 +83,15 @@ def episode_interval(values_by_episode: Floats, level: float = 0.95) -> Estimate
         level: confidence level.
     """
     values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
+    return _student(known_mean(values, axis=-1), level)
+
+
+def known_mean(values: Floats, axis: int) -> Floats:
+    """Mean along an axis of what is not NaN; NaN where nothing is."""
     known = ~np.isnan(values)
-    count = np.sum(known, axis=-1)
-    total = np.sum(np.where(known, values, 0.0), axis=-1)
-    return _student(np.where(count > 0, total / np.maximum(count, 1), np.nan), level)
+    count = np.sum(known, axis=axis)
+    total = np.sum(np.where(known, values, 0.0), axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def rate_interval(outcomes_by_episode: Floats, level: float = 0.95) -> Estimate:

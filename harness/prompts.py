@@ -12,11 +12,11 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import StrictUndefined, Template, TemplateError
+from jinja2 import StrictUndefined, Template, TemplateSyntaxError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from harness.errors import UserError, printable, unknown
-from harness.files import sha256_bytes, write_whole
+from harness.files import canonical_json, sha256_bytes, write_whole
 from harness.resources import folder
 
 Graph = Mapping[str, Any]
@@ -59,7 +59,16 @@ class Prompt:
     @cached_property
     def _templates(self) -> dict[str, Template]:
         environment = ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=False)
-        return {role: environment.from_string(text) for role, text in self.texts.items()}
+        compiled = {}
+        for role, text in self.texts.items():
+            try:
+                compiled[role] = environment.from_string(text)
+            except TemplateSyntaxError as error:
+                raise UserError(
+                    f"prompt {self.version} {role}.j2 line {error.lineno} is no Jinja: "
+                    f"{printable(error.message)}"
+                ) from None
+        return compiled
 
     def render(
         self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]] = ()
@@ -86,7 +95,7 @@ class Prompt:
                 {"role": part, "content": "".join(template.blocks[part](template.new_context(context)))}
                 for part in ("system", "user")
             )
-        except (TemplateError, KeyError, TypeError) as error:
+        except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
                 "it needs the blocks system and user, and may use graph, actions, objects, more, messages"
@@ -103,9 +112,9 @@ def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
     return sorted(graph["nodes"], key=order)[:most]
 
 
-def names() -> list[str]:
-    """Versions there are."""
-    return sorted(p.name for p in folder("prompts").iterdir() if (p / "prompt.toml").is_file())
+def names(where: Path | None = None) -> list[str]:
+    """Versions there are, in a folder of versions other than the harness's own if one is given."""
+    return sorted(p.name for p in (where or folder("prompts")).iterdir() if (p / "prompt.toml").is_file())
 
 
 @lru_cache(maxsize=32)
@@ -116,13 +125,10 @@ def load(version: str, where: Path | None = None) -> Prompt:
         UserError: there is no such version, its files are wrong, or it was released and has changed.
     """
     base = where or folder("prompts")
-    if version not in names() and not (base / version / "prompt.toml").is_file():
-        raise unknown("prompt", version, names())
+    if version not in names(base):
+        raise unknown("prompt", version, names(base))
     texts = {name: _text(base / version / name) for name in FILES}
-    try:
-        settings = tomllib.loads(texts["prompt.toml"])
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"prompt {version} prompt.toml is no TOML: {printable(error)}") from None
+    settings = _toml(texts["prompt.toml"], f"prompt {version} prompt.toml")
     sha256 = digest(texts)
     released = _released(base)
     if version in released and released[version] != sha256:
@@ -145,7 +151,8 @@ def lock(version: str, where: Path | None = None) -> str:
     prompt = load(version, base)
     pins = _released(base) | {version: prompt.sha256}
     head = "# Digests of released prompt versions (`harness prompt lock`). A changed text is a new version.\n"
-    write_whole(base / "released.toml", head + "".join(f'{v} = "{d}"\n' for v, d in sorted(pins.items())))
+    lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
+    write_whole(base / "released.toml", head + "".join(lines))
     load.cache_clear()
     return prompt.sha256
 
@@ -164,7 +171,14 @@ def _text(file: Path) -> str:
 
 def _released(base: Path) -> dict[str, str]:
     file = base / "released.toml"
-    return tomllib.loads(file.read_text()) if file.is_file() else {}
+    return _toml(_text(file), f"prompt file {printable(file)}") if file.is_file() else {}
+
+
+def _toml(text: str, what: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{what} is no TOML: {printable(error)}") from None
 
 
 def _checked(version: str, settings: dict[str, Any]) -> dict[str, Any]:
@@ -187,4 +201,12 @@ def _checked(version: str, settings: dict[str, Any]) -> dict[str, Any]:
         raise unknown(f"helper_answer in prompt {version} prompt.toml", settings["helper_answer"], ANSWERS)
     if set(settings["max_answer_tokens"]) != set(ROLES):
         raise UserError(f"prompt {version} prompt.toml: max_answer_tokens wants exactly ego and helper")
-    return {**settings, "token_budget": tuple(settings["token_budget"])}
+    budget = settings["token_budget"]
+    for n in (settings["max_objects"], *budget, *settings["max_answer_tokens"].values()):
+        if type(n) is not int or n < 1:
+            raise UserError(
+                f"prompt {version} prompt.toml: {printable(n)} where a whole number of 1 or more belongs"
+            )
+    if len(budget) != 2 or budget[0] > budget[1]:
+        raise UserError(f"prompt {version} prompt.toml: token_budget is {budget}, wants [least, most]")
+    return {**settings, "token_budget": tuple(budget)}

@@ -51,5 +51,5 @@ def test_a_helper_gives_a_recommendation_or_a_distribution_but_not_both() -> Non
 
 
 def test_an_unknown_role_is_named_with_those_known() -> None:
-    with pytest.raises(UserError, match="unknown role 'driver' known: ego, helper"):
+    with pytest.raises(UserError, match="unknown role 'driver'; known: ego, helper"):
         answer_schema("driver", ACTIONS)

@@ -47,7 +47,7 @@ def ask(i: int, *, max_tokens: int = 24, thinking: bool = False, text: str = "")
         {"role": "system", "content": "You drive."},
         {"role": "user", "content": text or f"Scene {i * 'x'}: truck {i * 7} m"},
     )
-    return Request(f"s{i}/ego", "ego", messages, ("SLOWER", "IDLE", "FASTER"), max_tokens, thinking)
+    return Request(f"s{i}/ego", "ego", messages, ("SLOWER", "IDLE", "FASTER"), max_tokens, thinking=thinking)
 
 
 REQUESTS = [ask(i) for i in (9, 0, 5, 15, 3, 11, 1, 12, 7)]

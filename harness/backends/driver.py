@@ -26,12 +26,12 @@ class DriverBackend:
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in order."""
-        return [self._answer(request, len(requests)) for request in requests]
+        return [self._answer(request) for request in requests]
 
-    def _answer(self, request: Request, batch_size: int) -> Completion:
+    def _answer(self, request: Request) -> Completion:
         action = choose(self.driver, request.view or {}, request.truth, request.actions)
         text = canonical_json({"action_distribution": {a: float(a == action) for a in request.actions}})
-        return Completion(request.id, text, None, None, "stop", None, batch_size)
+        return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
         """The driver and the version of its rules."""

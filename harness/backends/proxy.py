@@ -30,7 +30,7 @@ class Proxy:
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in order."""
-        return [Completion(r.id, answer(r), None, None, "stop", None, len(requests)) for r in requests]
+        return [Completion(r.id, answer(r), None, None, "stop", None, 1) for r in requests]
 
     def identity(self) -> dict[str, Any]:
         """Its version."""

@@ -15,28 +15,43 @@ def open(card: Card, **_: Any) -> "Replay":
     """The answers stored in the run folder that a card names.
 
     Raises:
-        UserError: it is no finished run.
+        UserError: it is no finished run, or a driver's, which is asked for the ego alone.
     """
     run = Path(card.weights or "")
-    rows = run / "rows.jsonl"
-    if not rows.is_file():
-        raise UserError(f"{printable(run)} is no finished run: it has no rows.jsonl; finish it with --resume")
-    stored = {}
-    with rows.open(encoding="utf-8") as lines:
-        for number, line in enumerate(lines, 1):
-            try:
-                row = json.loads(line)
+    rows, shown = run / "rows.jsonl", printable(run)
+    if not rows.is_file() or not (run / "run.json").is_file():
+        raise UserError(
+            f"{shown} is no finished run: it lacks rows.jsonl or run.json; finish it with --resume"
+        )
+    stored, line = {}, "run.json"
+    try:
+        manifest = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        if manifest["model"]["engine"] == "driver":
+            raise UserError(
+                f"{shown} is a run of a driver; run it again with --model {manifest['model']['name']}"
+            )
+        with rows.open(encoding="utf-8") as lines:
+            for number, text in enumerate(lines, 1):
+                line = f"rows.jsonl line {number}"
+                row = json.loads(text)
                 stored.update({f"{row['scene']}/{viewer}": a for viewer, a in row["answers"].items()})
-            except (ValueError, KeyError, TypeError, AttributeError):
-                raise UserError(f"{printable(rows)} line {number} is no row of a run; run it again") from None
-    return Replay(run, stored)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UserError(f"{shown}: {line} is not of a run; run it again") from None
+    return Replay(run, manifest, stored)
 
 
 class Replay:
-    """Looks answers up by scene and viewer. A prompt that was never asked is an error, not a guess."""
+    """Looks answers up by scene and viewer. A prompt that was never asked is an error, not a guess.
 
-    def __init__(self, run: Path, stored: dict[str, dict[str, Any]]) -> None:
+    Attributes:
+        run: the run's folder.
+        manifest: its manifest, with the latency that its decisions were made with.
+        stored: answers by request id.
+    """
+
+    def __init__(self, run: Path, manifest: dict[str, Any], stored: dict[str, dict[str, Any]]) -> None:
         self.run = run
+        self.manifest = manifest
         self.stored = stored
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
@@ -44,17 +59,19 @@ class Replay:
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:
-        answer = self.stored.get(request.id)
+        answer, shown = self.stored.get(request.id), printable(self.run)
         if answer is None:
             raise UserError(
-                f"{printable(self.run)} holds no answer for {request.id}; "
-                "replay a run of the same dataset and limit"
+                f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
             )
         if answer["prompt_sha256"] != digest(request.messages):
             raise UserError(
-                f"{printable(self.run)} was asked {request.id} with another prompt; "
-                "replay it with that run's --prompt"
+                f"{shown} was asked {request.id} with another prompt or dataset; "
+                "replay it with that run's --prompt and --dataset"
             )
+        if request.thinking != self.manifest["thinking"]:
+            how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
+            raise UserError(f"{shown} was run with thinking {how}")
         return Completion(
             request.id, answer["raw"], answer["prompt_tokens"], answer["completion_tokens"],
             answer["finish_reason"], answer["seconds"], answer["batch_size"], answer["error"],
@@ -62,8 +79,7 @@ class Replay:
 
     def identity(self) -> dict[str, Any]:
         """The run and the digest of its rows."""
-        manifest = json.loads((self.run / "run.json").read_text(encoding="utf-8"))
         return {
             "engine": "replay", "rows_sha256": sha256_file(self.run / "rows.jsonl"),
-            "of": {"model": manifest["model"], "identity": manifest["identity"]},
+            "of": {"model": self.manifest["model"], "identity": self.manifest["identity"]},
         }  # fmt: skip

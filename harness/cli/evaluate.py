@@ -84,11 +84,16 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """Seeds from `0:5` (0 to 4) or `3,7,9`."""
     start, colon, stop = text.partition(":")
     try:
-        seeds = tuple(range(int(start), int(stop))) if colon else tuple(int(s) for s in text.split(","))
+        # A range is counted before it is made: 0:99999999999 would not fit into memory.
+        most = int(start) + MOST_SEEDS + 1 if colon else 0
+        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
     except ValueError:
         seeds = ()
     if not 0 < len(seeds) <= MOST_SEEDS:
-        raise UserError(f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9")
+        raise UserError(
+            f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
+            f"of {MOST_SEEDS} seeds at most"
+        )
     return seeds
 
 

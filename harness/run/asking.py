@@ -1,10 +1,12 @@
 """Asking: every viewer of every scene once, kept as they come, so that a killed run continues."""
 
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from harness.backends.base import Backend, Completion, Request, Role
 from harness.dataset.load import Scene
@@ -49,41 +51,30 @@ def ask_all(spec: Spec, backend: Backend, kept: Path, progress: Callable[[int], 
         spec: the evaluation.
         backend: who answers.
         kept: JSON Lines file of answers so far; may be torn at its end by a kill.
-        progress: called with the number of answers just had.
+        progress: called with the number of answers just had, those kept from before included.
 
     Returns:
         Answers by request id.
     """
     answers = read_kept(kept)
-    progress(len(answers))
-    chunk: list[Request] = []
-    most = max(CHUNK, spec.batch_size)
+    # Chunks begin at the same places in a resumed run, and a torn one is asked again whole: an engine may
+    # answer with an eye on a request's company.
+    size = spec.batch_size * math.ceil(CHUNK / spec.batch_size)
+    asked = requests(spec, spec.dataset.scenes)
     with kept.open("a", encoding="utf-8") as file:
-        for request in requests(spec, spec.dataset.scenes):
-            if request.id in answers:
-                continue
-            chunk.append(request)
-            if len(chunk) == most:
-                _ask(backend, chunk, file, answers, progress)
-                chunk = []
-        if chunk:
-            _ask(backend, chunk, file, answers, progress)
+        while chunk := list(islice(asked, size)):
+            if any(request.id not in answers for request in chunk):
+                _ask(backend, chunk, file, answers)
+            progress(len(chunk))
     return answers
 
 
-def _ask(
-    backend: Backend,
-    chunk: list[Request],
-    file: Any,
-    answers: dict[str, Answer],
-    progress: Callable[[int], None],
-) -> None:
+def _ask(backend: Backend, chunk: list[Request], file: TextIO, answers: dict[str, Answer]) -> None:
     for request, completion in zip(chunk, backend.complete(chunk), strict=True):
         answers[request.id] = answer = _answer(request, completion)
         file.write(canonical_json([request.id, answer]) + "\n")
     file.flush()
     os.fsync(file.fileno())
-    progress(len(chunk))
 
 
 def _answer(request: Request, completion: Completion) -> Answer:

@@ -2,18 +2,18 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from harness.backends.registry import open_backend
 from harness.errors import UserError, printable
-from harness.files import canonical_json, digest, write_whole
+from harness.files import alone, canonical_json, digest, write_whole
 from harness.run import record
 from harness.run.asking import ask_all
 from harness.run.intents import intents
@@ -23,6 +23,7 @@ from harness.run.summary import summary
 from harness.run.timing import inference_s, measure
 
 WORK = ".work"
+CONFIG = "config.json"  # what the run was begun with; its work counts only once this is there
 
 
 @dataclass(frozen=True)
@@ -51,43 +52,62 @@ def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None
     _refuse(spec, out, resume)
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     identity = backend.identity()
-    work = _begin(spec, out, identity)
-    latency = measure(spec, backend, work / "latency.json")
-    by_id = ask_all(spec, backend, work / "answers.jsonl", progress)
+    with _begun(spec, out, identity) as work:
+        latency = measure(spec, backend, work / "latency.json")
+        by_id = ask_all(spec, backend, work / "answers.jsonl", progress)
 
-    known, laid = intents(spec, by_id), table(spec)
-    seconds = inference_s(latency, known.answers)
-    # Where nobody was asked no time passes; a helper without an answer sends nothing anyway.
-    runs = [
-        score(spec, laid, known, np.nan_to_num(seconds), point, seed)
-        for point in spec.points
-        for seed in spec.seeds
-    ]
-    result = summary(spec, laid, known, runs)
-    manifest = {
-        "format": FORMAT,
-        "name": out.name,
-        "created": json.loads((work / "config.json").read_text())["created"],
-        "command": spec.command(out),
-        **spec.settings(),
-        "identity": identity,
-        "latency": latency,
-        "delay_allowance_s": allowance_s(spec),
-        "versions": versions(),
-    }
-    manifest["dataset"]["path"] = str(spec.dataset.path)
-    write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs)))
-    write_whole(out / "episodes.csv", record.episodes(spec, laid, runs).to_csv(index=False))
-    write_whole(out / "summary.csv", result.to_csv(index=False))
-    write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
-    shutil.rmtree(work)
+        known, laid = intents(spec, by_id), table(spec)
+        seconds = inference_s(latency, known.answers)
+        runs = [
+            score(spec, laid, known, seconds, point, seed) for point in spec.points for seed in spec.seeds
+        ]
+        result = summary(spec, laid, known, runs)
+        manifest = {
+            "format": FORMAT,
+            "name": out.name,
+            "created": json.loads((work / CONFIG).read_text())["created"],
+            "command": spec.command(out),
+            **spec.settings(),
+            "identity": identity,
+            "latency": latency,
+            "delay_allowance_s": allowance_s(spec),
+            "versions": versions(),
+        }
+        manifest["dataset"]["path"] = str(spec.dataset.path)
+        write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs)))
+        write_whole(out / "episodes.csv", record.episodes(spec, laid, runs).to_csv(index=False))
+        write_whole(out / "summary.csv", result.to_csv(index=False))
+        write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    _tidy(out)
     return Evaluated(out, manifest, result)
 
 
 def _finished(spec: Spec, out: Path) -> Evaluated:
-    manifest = json.loads((out / "run.json").read_text())
-    _same(spec.settings(), manifest, out)
-    return Evaluated(out, manifest, pd.read_csv(out / "summary.csv"))
+    try:
+        manifest = json.loads((out / "run.json").read_text())
+        _same(spec.settings(), manifest, out)
+        # Names stay text: a model may be called "null" and a prompt "1".
+        text = dict.fromkeys(("model", "prompt", "condition", "metric", "interval"), str)
+        result = pd.read_csv(
+            out / "summary.csv",
+            dtype=text,
+            keep_default_na=False,
+            na_values=[""],
+            float_precision="round_trip",
+        )
+    except (OSError, ValueError, AttributeError) as error:
+        raise UserError(
+            f"--out {printable(out)} holds a damaged run ({printable(error)}); delete it and run again"
+        ) from None
+    _tidy(out)
+    return Evaluated(out, manifest, result)
+
+
+def _tidy(out: Path) -> None:
+    """Remove what the work left, and what kills left of files half written."""
+    shutil.rmtree(out / WORK, ignore_errors=True)
+    for part in out.glob(".*.part"):
+        part.unlink(missing_ok=True)
 
 
 def _refuse(spec: Spec, out: Path, resume: bool) -> None:
@@ -95,11 +115,11 @@ def _refuse(spec: Spec, out: Path, resume: bool) -> None:
     shown = printable(out)
     if (out / "run.json").exists():
         raise UserError(f"--out {shown} already holds a finished run; choose another folder or delete it")
-    if (out / WORK / "config.json").is_file():
+    if (out / WORK / CONFIG).is_file():
         if not resume:
             raise UserError(f"--out {shown} holds an unfinished run; add --resume to go on, or delete it")
-        _same(spec.settings(), json.loads((out / WORK / "config.json").read_text())["settings"], out)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        _same(spec.settings(), json.loads((out / WORK / CONFIG).read_text())["settings"], out)
+    elif out.exists() and (not out.is_dir() or any(p.name != WORK for p in out.iterdir())):
         raise UserError(f"--out {shown} exists and is no run; choose another folder")
 
 
@@ -120,17 +140,35 @@ def _stored(stored: dict[str, Any], key: str) -> Any:
     return {k: v for k, v in value.items() if k != "path"} if key == "dataset" and value else value
 
 
-def _begin(spec: Spec, out: Path, identity: dict[str, Any]) -> Path:
-    work = out / WORK
-    config = work / "config.json"
-    if config.is_file():
-        if json.loads(config.read_text())["identity"] != digest(identity):
-            raise UserError(
-                f"--resume: the model behind {spec.card.name} is not the one this run was begun with; "
-                "start a new run in another --out"
-            )
-        return work
-    begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"), "settings": spec.settings(),
-             "identity": digest(identity)}  # fmt: skip
-    write_whole(config, canonical_json(begun))
-    return work
+@contextmanager
+def _begun(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
+    """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
+    work, existed = out / WORK, out.exists()
+    new = not (work / CONFIG).is_file()
+    if not new and json.loads((work / CONFIG).read_text())["identity"] != digest(identity):
+        raise UserError(
+            f"--resume: the model behind {printable(spec.card.name)} is not the one this run was begun with "
+            "(its files, package versions or device differ); start a new run in another --out"
+        )
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(out)} cannot be made ({error.strerror}); choose another folder"
+        ) from None
+    try:
+        with alone(work / "lock"):
+            if new:
+                (work / "answers.jsonl").unlink(missing_ok=True)
+                begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"),
+                         "settings": spec.settings(), "identity": digest(identity)}  # fmt: skip
+                write_whole(work / CONFIG, canonical_json(begun))
+            yield work
+    except BlockingIOError:
+        raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
+    except UserError:
+        if new:
+            shutil.rmtree(work)
+            if not existed:
+                out.rmdir()
+        raise

@@ -8,6 +8,7 @@ import pandas as pd
 
 from harness.dataset.load import Scene
 from harness.files import canonical_json
+from harness.metrics import known_mean
 from harness.parse import Parsed
 from harness.run.asking import Answer
 from harness.run.intents import Intents
@@ -59,7 +60,7 @@ def _decisions(run: Scored, scenes: Sequence[Scene], actions: tuple[str, ...]) -
     arrival_ms, weights = (c.arrival_s * 1000).round(3).tolist(), c.weights.round(6).tolist()
     fused, action = c.fused.round(6).tolist(), c.action.tolist()
     latency_ms, missed = (c.latency_s * 1000).round(3).tolist(), c.deadline_missed.tolist()
-    safe, delay_s = run.safe.tolist(), run.delay_s.tolist()
+    timed, safe, delay_s = (~np.isnan(c.latency_s)).tolist(), run.safe.tolist(), run.delay_s.tolist()
     made = []
     for i, scene in enumerate(scenes):
         messages = [
@@ -73,7 +74,7 @@ def _decisions(run: Scored, scenes: Sequence[Scene], actions: tuple[str, ...]) -
             "condition": run.point.name, "seed": run.seed, "entropy_nats": entropy[i],
             "triggered": triggered[i], "messages": messages, "own_weight": weights[i][0],
             "own_failed": failed[i], "fused": fused[i], "action": actions[action[i]],
-            "latency_ms": _number(latency_ms[i]), "deadline_missed": missed[i],
+            "latency_ms": _number(latency_ms[i]), "deadline_missed": missed[i] if timed[i] else None,
             "safe": safe[i], "delay_s": _number(delay_s[i]),
         })  # fmt: skip
     return made
@@ -89,7 +90,7 @@ def episodes(spec: Spec, laid: Table, runs: Sequence[Scored]) -> pd.DataFrame:
 
         def per_episode(values: Any, sums: bool = False) -> Any:
             laid_out = laid.by_episode(np.asarray(values, dtype=float))
-            return np.nansum(laid_out, axis=1) if sums else np.nanmean(laid_out, axis=1)
+            return np.nansum(laid_out, axis=1) if sums else known_mean(laid_out, axis=1)
 
         frames.append(pd.DataFrame({
             "model": spec.card.name, "prompt": spec.prompt.version,

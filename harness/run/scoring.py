@@ -1,7 +1,7 @@
 """Scoring: the same intents under every condition and seed, decision by decision and episode by episode."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,11 +82,15 @@ def table(spec: Spec) -> Table:
 def score(
     spec: Spec, laid: Table, known: Intents, inference_s: Floats, point: OperatingPoint, seed: int
 ) -> Scored:
-    """Coordinate every decision at one operating point with one seed's luck, and look up what comes of it."""
+    """Coordinate every decision at one operating point with one seed's luck, and look up what comes of it.
+
+    `inference_s` is (n, 1+H), the ego first. Where the ego's is unknown (NaN), so is the decision's latency.
+    """
     result = coordinate(
         point, known.own, known.helpers, known.valid, known.distance_m, known.range_m,
-        known.payload_bits, inference_s, draw(laid, seed, known.valid.shape),
+        known.payload_bits, np.nan_to_num(inference_s), draw(laid, seed, known.valid.shape),
     )  # fmt: skip
+    result = replace(result, latency_s=np.where(np.isnan(inference_s[:, 0]), np.nan, result.latency_s))
     rows = np.arange(len(result.action))
     safe, delay_s = laid.safe[rows, result.action], laid.delay_s[rows, result.action]
     verdict = judge(

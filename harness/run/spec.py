@@ -1,6 +1,7 @@
 """What is evaluated, resolved and complete: enough to run it again."""
 
 import platform
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -8,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from harness import __version__
-from harness.cards import Card, names
+from harness.cards import Card, load, names
 from harness.dataset.load import Dataset
-from harness.errors import UserError
+from harness.errors import UserError, printable
 from harness.operating_point import OperatingPoint
 from harness.prompts import Prompt
 
@@ -52,8 +53,15 @@ class Spec:
             )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        if self.thinking and self.card.thinking == "none" and self.card.engine != "transformers":
-            raise UserError(f"--thinking: {self.card.name} cannot think; leave it out")
+        if self.thinking and self.card.engine not in ("transformers", "replay"):
+            raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
+        if self.card.thinking == "always":  # its answers hold a thought, asked for or not
+            object.__setattr__(self, "thinking", True)
+        for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
+            if value is not None and self.card.engine != "transformers":
+                raise UserError(
+                    f"{flag} {printable(value)}: {printable(self.card.name)} has no weights; leave it out"
+                )
 
     def settings(self) -> dict[str, Any]:
         """What a resumed run must have in common with the one it continues."""
@@ -74,21 +82,20 @@ class Spec:
         }  # fmt: skip
 
     def command(self, out: Path) -> str:
-        """A command line that runs this again."""
-        parts = [
-            "harness eval", f"--model {model_argument(self.card)}", f"--prompt {self.prompt.version}",
-            f"--dataset {self.dataset.path}", f"--seeds {','.join(map(str, self.seeds))}",
-            *(f"--condition {point.name}" for point in self.points), f"--batch-size {self.batch_size}",
+        """A command line that runs this again, quoted for a shell."""
+        options = [
+            ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
+            ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
+            *(("--condition", point.name) for point in self.points), ("--batch-size", self.batch_size),
+            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype), ("--out", out),
         ]  # fmt: skip
-        optional = {"--limit": self.limit, "--device": self.device, "--dtype": self.dtype}
-        parts += [f"{flag} {value}" for flag, value in optional.items() if value is not None]
-        parts += ["--thinking"] if self.thinking else []
-        return " ".join([*parts, f"--out {out}"])
+        parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
+        return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])
 
 
 def model_argument(card: Card) -> str:
     """What `--model` was given, or anything that resolves to the same card."""
-    if card.name in names():
+    if card.name in names() and load(card.name) == card:
         return card.name
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 

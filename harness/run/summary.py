@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from harness.arrays import Floats
-from harness.metrics import Estimate, episode_interval, rate_interval, seed_interval
+from harness.metrics import Estimate, episode_interval, known_mean, rate_interval, seed_interval
 from harness.run.intents import Intents
 from harness.run.scoring import Scored, Table, statuses
 from harness.run.spec import Spec
@@ -46,12 +46,11 @@ def _estimates(
     by_condition: dict[str, dict[str, Floats]] = {}
     for point in spec.points:
         mine = [r for r in runs if r.point == point]
-        metrics = {
-            name: np.stack([_metrics(laid, r)[name] for r in mine]) for name in _metrics(laid, mine[0])
-        }
+        by_seed = [_metrics(laid, r) for r in mine]
+        metrics = {name: np.stack([m[name] for m in by_seed]) for name in by_seed[0]}
         by_condition[point.name] = metrics
         for name, values in metrics.items():  # (seeds, episodes)
-            yield point.name, name, seed_interval(_mean(values, axis=1)), "seed means"
+            yield point.name, name, seed_interval(known_mean(values, axis=1)), "seed means"
             yield point.name, name, _over_episodes(name, values), "episodes"
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
@@ -78,7 +77,7 @@ def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
     c = r.coordination
 
     def mean(values: Any) -> Floats:
-        return _mean(laid.by_episode(np.asarray(values, dtype=float)), axis=1)
+        return known_mean(laid.by_episode(np.asarray(values, dtype=float)), axis=1)
 
     with np.errstate(invalid="ignore", divide="ignore"):
         observed = np.where(c.messages > 0, c.lost / c.messages, np.nan)
@@ -87,7 +86,7 @@ def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
         "unsafe_rate": r.verdict.unsafe.astype(float),
         "late_rate": r.verdict.late.astype(float),
         "latency_proxy_ms": mean(c.latency_s * 1000),
-        "deadline_miss_rate": mean(c.deadline_missed),
+        "deadline_miss_rate": mean(np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed)),
         "trigger_rate": mean(c.triggered),
         "messages_per_episode": mean(c.messages) * (laid.index >= 0).sum(axis=1),
         "effective_loss": mean(np.where(c.triggered, c.loss, np.nan)),
@@ -102,17 +101,9 @@ def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
 
 def _over_episodes(name: str, values: Floats) -> Estimate:
     """Interval over episodes of a metric's values (seeds, episodes)."""
-    each = _mean(values, axis=0)
+    each = known_mean(values, axis=0)
     settled = each[~np.isnan(each)]
     # Student's t would give 0 of 20 episodes an interval of no width.
     if name in YES_OR_NO and np.isin(settled, (0.0, 1.0)).all():
         return rate_interval(each)
     return episode_interval(each)
-
-
-def _mean(values: Floats, axis: int) -> Floats:
-    """Mean of what is not NaN; NaN where nothing is."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

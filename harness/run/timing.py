@@ -2,14 +2,16 @@
 
 import json
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from harness.arrays import Floats
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Request
+from harness.backends.replay import Replay
+from harness.dataset.load import Scene
 from harness.files import canonical_json, write_whole
 from harness.run.asking import Answer, requests
 from harness.run.spec import Spec
@@ -24,6 +26,9 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
         `source` (`card` or `measured`), `inference_s` by role (None where each answer's own time counts),
         `basis`, and for a sample its `n` by role.
     """
+    if isinstance(backend, Replay):  # whatever the decisions replayed were made with
+        replayed: dict[str, Any] = backend.manifest["latency"]
+        return replayed
     card = spec.card.latency
     if card.source == "card":
         return {
@@ -31,26 +36,29 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
             "inference_s": dict.fromkeys(("ego", "helper"), card.inference_s),
             "basis": card.basis,
         }
+    first, *_ = asked = list(requests(spec, _sample(spec.dataset.scenes)))
+    backend.complete([first])  # the first answer of a process pays for warming up
     if kept.is_file():
         found: dict[str, Any] = json.loads(kept.read_text())
         return found
-    if spec.batch_size == 1 or spec.card.engine == "replay":
+    if spec.batch_size == 1:
         latency: dict[str, Any] = {
             "source": "measured",
             "inference_s": None,
             "basis": "each answer alone, batch 1",
         }
     else:
-        latency = _sample(spec, backend)
+        latency = _timed(backend, asked)
     write_whole(kept, canonical_json(latency))
     return latency
 
 
-def _sample(spec: Spec, backend: Backend) -> dict[str, Any]:
-    scenes = spec.dataset.scenes[:: max(1, len(spec.dataset.scenes) // SAMPLE)][:SAMPLE]
+def _sample(scenes: Sequence[Scene]) -> Sequence[Scene]:
+    return scenes[:: max(1, len(scenes) // SAMPLE)][:SAMPLE]
+
+
+def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
     times: dict[str, list[float]] = {"ego": [], "helper": []}
-    asked = list(requests(spec, scenes))
-    backend.complete(asked[:1])  # the first answer pays for warming up
     for request in asked:
         seconds = backend.complete([request])[0].seconds
         if seconds is not None:
@@ -66,12 +74,20 @@ def _sample(spec: Spec, backend: Backend) -> dict[str, Any]:
 
 
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
-    """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known."""
+    """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
+
+    Where each answer's own time counts, one that failed has none and takes its role's median.
+    """
+    asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]
-    seconds = np.full((len(answers), len(answers[0])), np.nan)
-    for i, row in enumerate(answers):
-        for j, answer in enumerate(row):
-            if answer is not None:
-                value = answer["seconds"] if fixed is None else fixed["ego" if j == 0 else "helper"]
-                seconds[i, j] = np.nan if value is None else value
-    return seconds
+    if fixed is None:
+        own = np.array([[a["seconds"] if a else None for a in row] for row in answers], dtype=float)
+        typical = [_median(own[:, :1]), *[_median(own[:, 1:])] * (own.shape[1] - 1)]
+        return np.where(asked & np.isnan(own), typical, own)
+    by_place = np.array([fixed["ego"], *[fixed["helper"]] * (asked.shape[1] - 1)], dtype=float)
+    return np.where(asked, by_place, np.nan)
+
+
+def _median(seconds: Floats) -> float:
+    known = seconds[~np.isnan(seconds)]
+    return float(np.median(known)) if len(known) else np.nan
