@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from harness.cli import evaluate, model, parse, prompt
+from harness.cli import evaluate, model, parse, prompt, report
 from harness.errors import UserError, printable
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app = typer.Typer(
 app.command("eval")(evaluate.evaluate)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(model.app, name="model")
+app.command("report")(report.command)
 app.command("parse")(parse.command)
 
 # typer carries a click of its own and exports of its errors only this one's children.

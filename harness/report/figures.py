@@ -6,8 +6,20 @@ from collections.abc import Mapping
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from harness.drawing.pictures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PALE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    save,
+    styled,
+)
 from harness.errors import printable
-from harness.pictures import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, SKY, VERMILLION, save, styled
 from harness.report.folder import Run, Score
 from harness.report.words import LATENCY, SUCCESS
 

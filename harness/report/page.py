@@ -14,8 +14,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
+from harness import prompts as versions
 from harness.dataset.load import Scene
-from harness.drawing import draw
+from harness.drawing.scene import draw
 from harness.errors import UserError, printable
 from harness.files import write_whole
 from harness.report import figures, words
@@ -34,7 +35,8 @@ def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = N
     Args:
         run: the run's folder.
         out: file to replace; None for `report.html` in the run's folder.
-        prompts: gives the chat messages that a viewer was sent in a scene; None leaves them out.
+        prompts: gives the chat messages that a viewer was sent in a scene; None renders the run's own
+            prompt version, where it is here and unchanged.
 
     Returns:
         The file written.
@@ -45,9 +47,20 @@ def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = N
     out = run / "report.html" if out is None else out
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    page = render(read(run), prompts)
-    write_whole(out, page)
+    found = read(run)
+    write_whole(out, render(found, prompts or prompts_of(found)))
     return out
+
+
+def prompts_of(run: Run) -> Prompts | None:
+    """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
+    version, actions = str(run.config["prompt"]["version"]), tuple(run.config["actions"])
+    if version not in versions.names():
+        return None
+    prompt = versions.load(version)
+    if prompt.sha256 != run.config["prompt"]["sha256"]:
+        return None
+    return lambda scene, viewer: prompt.render(scene.record["graphs"][viewer], actions)
 
 
 def render(run: Run, prompts: Prompts | None = None) -> str:

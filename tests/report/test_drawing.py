@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from harness.dataset.load import Scene
-from harness.drawing import draw
+from harness.drawing.labels import Labels
+from harness.drawing.pictures import styled
+from harness.drawing.scene import draw
 from harness.errors import UserError
-from harness.labels import Labels
-from harness.pictures import styled
 
 
 def picture(scene, format="svg", viewer=None):

@@ -15,10 +15,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from harness.dataset.load import Scene
+from harness.drawing.ground import ground, north_up
+from harness.drawing.labels import Labels
+from harness.drawing.pictures import BLUE, GREY, INK, PURPLE, VERMILLION, Format, save, styled
 from harness.errors import printable, unknown
-from harness.ground import ground, north_up
-from harness.labels import Labels
-from harness.pictures import BLUE, GREY, INK, PURPLE, VERMILLION, Format, save, styled
 from harness.road import LANE_WIDTH_M
 from harness.scene import VehicleState
 

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from harness.drawing.pictures import INK
 from harness.errors import printable
-from harness.pictures import INK
 from harness.road import JUNCTION_M, LANE_WIDTH_M
 from harness.scene import Building
 

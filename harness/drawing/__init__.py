@@ -1,0 +1,1 @@
+"""Pictures with matplotlib: a scene from above, and what every figure shares."""
