@@ -132,7 +132,7 @@ def _table(done: "Evaluated") -> None:
     figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
     table = Table(box=None, width=80, pad_edge=False)
     table.add_column("condition", no_wrap=True)
-    for heading in ("success % [95 % CI]", "gain, points", "latency ms", "trigger %", "msgs/ep"):
+    for heading in ("success % [95 % CI]", "gain, points", "latency", "trigger", "msgs"):
         table.add_column(heading, justify="right", no_wrap=True)
     for point in done.manifest["conditions"]:
         name = point["name"]
@@ -148,8 +148,8 @@ def _table(done: "Evaluated") -> None:
             name,
             cell("success_rate", 100, True),
             cell("success_gain_over_single-local", 100, True),
-            cell("latency_proxy_ms"),
-            cell("trigger_rate", 100),
+            f"{cell('latency_proxy_ms')} ms",
+            f"{cell('trigger_rate', 100)} %",
             cell("messages_per_episode"),
         )
     m = done.manifest
@@ -159,16 +159,15 @@ def _table(done: "Evaluated") -> None:
     console.print(table)
     n = m["dataset"]["episodes"]
     console.print(
-        f"n = {n} episodes, {len(m['seeds'])} channel seeds; intervals over episodes; gain over single-local"
+        f"n = {n} episodes × {len(m['seeds'])} channel seeds; intervals over episodes; msgs an episode;"
     )
+    console.print("gain is over single-local, paired by episode")
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
-    parts = []
     for role in ("ego", "helper"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
-            parts.append(f"{role} {values} (n = {shares[0].n})")
-    console.print(f"answers strict / recovered / failed %: {'; '.join(parts)}")
+            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
 
 
 def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:

@@ -1,13 +1,14 @@
 """Summary of a run: every metric with n, an interval, and what the interval is over.
 
-Two intervals, because they answer different questions. `seed means` (Student's t across seeds, the paper's
-error bars): how much the channel's luck moves the figure, given these very episodes. `episodes` (Wilson for
-yes/no outcomes that no seed changes, else Student's t across episodes, each averaged over seeds and steps):
-how far the figure would move with other episodes of the scenario. Both are conditional on the one set of
+Two intervals, because they answer different questions (docs/decisions/0004). `seed means`: Student's t across
+seeds, the paper's error bars: how much the channel's luck moves the figure, given these very episodes.
+`episodes`: how far it would move with other episodes of the scenario, each averaged over seeds and steps;
+Wilson for yes/no outcomes that no seed changes, else Student's t. Both are conditional on the one set of
 answers the model gave.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,4 +107,7 @@ def _over_episodes(name: str, values: Floats) -> Estimate:
     # Student's t would give 0 of 20 episodes an interval of no width.
     if name in YES_OR_NO and np.isin(settled, (0.0, 1.0)).all():
         return rate_interval(each)
-    return episode_interval(each)
+    found = episode_interval(each)
+    if name in YES_OR_NO:  # a share of episodes ends at 0 and at 1, Student's t does not know that
+        return replace(found, low=max(found.low, 0.0), high=min(found.high, 1.0))
+    return found
