@@ -211,6 +211,11 @@ class World:
         env.road.vehicles = vehicles
         env.controlled_vehicles = vehicles[:1]
         env.define_spaces()  # binds the action type to the ego
+        if snapshot["frame"]:
+            # What touches is pushed apart in the next frame: highway-env's last act in every frame.
+            for n, vehicle in enumerate(vehicles):
+                for other in vehicles[n + 1 :]:
+                    vehicle.handle_collisions(other, 1 / env.parameters.simulation_hz)
         return cls(env, state.episode_seed, state.step, snapshot["frame"])
 
     def state(self) -> WorldState:
