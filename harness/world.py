@@ -242,18 +242,16 @@ class World:
 
     def _advance(self) -> None:
         p, road = self.env.parameters, self.env.road
-        standing = {id(v) for v in road.vehicles if v.crashed}
+        standing = {v.spawn.id for v in road.vehicles if v.crashed}
         road.act()
         road.step(1 / p.simulation_hz)
         self.frame += 1
         ego, others = road.vehicles[0], road.vehicles[1:]
-        crashed = [v for v in others if v.crashed and id(v) not in standing]
+        crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
             mine = _state(ego)
-            partner = min(
-                (_state(v) for v in crashed or others),
-                key=lambda v: float(outline(mine).distance(outline(v))),
-            )
+            partner = min(map(_state, others), key=lambda v: float(outline(mine).distance(outline(v))))
+            crashed.discard(partner.id)
             how = {"partner": partner.id, "striker": striker(mine, partner), "fault": fault(mine, partner)}
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
@@ -265,7 +263,7 @@ class World:
         self.outcome = replace(
             self.outcome,
             least_gap_m=_least_gap_m(ego, others, self.outcome.least_gap_m),
-            other_crashes=self.outcome.other_crashes + len(crashed) - bool(ego.crashed and crashed),
+            other_crashes=self.outcome.other_crashes + len(crashed),
         )
 
 
