@@ -1,0 +1,65 @@
+"""How an episode of frozen decisions is scored, without a simulator.
+
+The rule. A decision is looked up in its scene's outcome table: its action, followed by the full-view driver,
+either clears the intersection (it is *safe*) or does not; a safe action clears it some seconds later than the
+best safe action would have (its *delay*). An episode succeeds if every decision is safe and the delays add up
+to no more than the scenario's allowance. A decision in which no action is safe blames nobody and is left out.
+
+Why the delays count: after one needless SLOWER a perfect driver still gets through, so "safe" alone would
+make always braking perfect. Live driving is judged alike: clearing later than the full-view driver by more
+than the allowance is a forced failure. `harness dataset rank` holds the two against each other.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.arrays import Bools, Floats, Ints
+from harness.dataset.load import Dataset
+from harness.drivers import choose
+from harness.perception.graph import truth_graph
+
+ROUNDING_S = 0.01  # half a frame
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of episodes, each array of shape (...).
+
+    Attributes:
+        success: every avoidable decision safe, delays within the allowance.
+        unsafe: some avoidable decision led to a collision or a forced failure.
+        late: all safe, but too late.
+        delay_s: delays added up, unsafe decisions left out.
+    """
+
+    success: Bools
+    unsafe: Bools
+    late: Bools
+    delay_s: Floats
+
+
+def judge(safe: Bools, delay_s: Floats, avoidable: Bools, allowance_s: float) -> Verdict:
+    """Judge episodes.
+
+    Args:
+        safe: whether the chosen action was safe, (..., S); S decisions an episode.
+        delay_s: delay of the chosen action, (..., S); NaN where it was not safe.
+        avoidable: whether any action was safe, (..., S); False also pads episodes with fewer decisions.
+        allowance_s: delay that is forgiven.
+    """
+    unsafe = np.any(avoidable & ~safe, axis=-1)
+    total = np.sum(np.where(avoidable & safe, np.nan_to_num(delay_s), 0.0), axis=-1)
+    late = ~unsafe & (total > allowance_s + ROUNDING_S)
+    return Verdict(~unsafe & ~late, unsafe, late, total)
+
+
+def driver_choices(dataset: Dataset, driver: str) -> Ints:
+    """Index of a reference driver's action in every scene, (n,)."""
+    actions = dataset.actions
+    chosen = []
+    for scene in dataset.scenes:
+        graph = scene.record["graphs"][scene.state.ego.id]
+        truth = truth_graph(scene.state) if driver == "full-view" else None
+        chosen.append(actions.index(choose(driver, graph, truth, actions)))
+    return np.array(chosen)
