@@ -1,0 +1,1 @@
+"""What a vehicle knows: rays, sensors with noise, and the scene graph made of them."""
