@@ -64,10 +64,11 @@ def file_problems(path: Path, manifest: dict[str, Any]) -> Iterator[str]:
 def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[str]]]:
     """Each line's record, and what is wrong with it; a record is good for use only if nothing is."""
     validator = record_validator(tuple(manifest["actions"]))
-    before = (-1, 0)
+    before: tuple[int, int] | None = (-1, 0)  # episode and step; None after a line that cannot be read
     with file.open("rb") as lines:
         for number, text in enumerate(lines, 1):
             where = f"{file.name} line {number}"
+            last, before = before, None
             if not text.endswith(b"\n"):
                 yield {}, [f"{where}: cut off"]
                 continue
@@ -80,10 +81,9 @@ def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, An
             problems = [f"{where} at {printable(e.json_path)}: {printable(e.message)}" for e in broken[:3]]
             if not broken:
                 problems = [f"{where}: {what}" for what in _contradictions(record)]
-                now = (record["episode"], record["step"])
-                if now not in ((before[0], before[1] + 1), (before[0] + 1, 0)):
+                before = (record["episode"], record["step"])
+                if last and before not in ((last[0], last[1] + 1), (last[0] + 1, 0)):
                     problems.append(f"{where}: scene {record['scene']} does not follow the line before")
-                before = now
             yield record, problems
 
 
@@ -102,7 +102,8 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
     ids = [v["id"] for v in state["vehicles"]]
     parts = [v["part"] for v in state["vehicles"]]
     viewers = {v["id"] for v in state["vehicles"] if v["part"] != "other"}
-    crossing = {(c["sector"], c["route"]) for graph in graphs.values() for c in graph["conflicts"]}
+    nodes = {node["id"] for graph in graphs.values() for node in graph["nodes"]}
+    conflicts = [conflict for graph in graphs.values() for conflict in graph["conflicts"]]
     holds = {
         "scene is not <episode>-<step>": record["scene"] == f"{record['episode']:05d}-{record['step']}",
         "state is of another step": state["step"] == record["step"],
@@ -112,7 +113,11 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
         "graphs are not those of the ego and the helpers": graphs.keys() == viewers,
         "a graph is of another viewer": all(graph["viewer"] == viewer for viewer, graph in graphs.items()),
         "distances are not those of the ego and the helpers": record["distance_m"].keys() == viewers,
-        "a conflict is on a path that does not cross the ego's": crossing <= crossings().keys(),
+        "a conflict is on a path that does not cross the ego's": {
+            (c["sector"], c["route"]) for c in conflicts
+        }
+        <= crossings().keys(),
+        "a graph names a vehicle that is not there": nodes | {c["with"] for c in conflicts} <= set(ids),
         "the dangerous vehicle is not there": record["danger"]["vehicle"] in (None, *ids),
         "sections are not one a vehicle": len(record["snapshot"]["sections"]) == len(ids),
     }
