@@ -45,9 +45,7 @@ def build(
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else.
     """
     config = {
-        "scenario": NAME,
-        "actions": list(ACTIONS),
-        "parameters": asdict(Parameters()),
+        **settings(),
         "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
@@ -61,7 +59,7 @@ def build(
             f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or '-', "
             "a letter or digit first"
         )
-    work = _begin(out, json.loads(canonical_json(config)))
+    work = _begin(out, config)
     done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
     progress(len(done))
     todo = sorted(set(range(episodes)) - set(done))
@@ -86,6 +84,12 @@ def build(
     write_whole(out / "manifest.json", _pretty(manifest))
     shutil.rmtree(work)
     return manifest
+
+
+def settings() -> dict[str, Any]:
+    """What decides how an episode goes, as JSON has it: scenario, actions, parameters."""
+    parameters: dict[str, Any] = json.loads(canonical_json(asdict(Parameters())))
+    return {"scenario": NAME, "actions": list(ACTIONS), "parameters": parameters}
 
 
 def _begin(out: Path, config: dict[str, Any]) -> Path:
