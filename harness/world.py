@@ -17,7 +17,8 @@ from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
 from harness.outcome import Outcome, fault, outline, striker
 from harness.road import APPROACHES, JUNCTION_M, Path, paths
-from harness.scenarios.occluded_intersection import NAME, Layout, Parameters, Spawn, layout
+from harness.scenarios.occluded_intersection import NAME as NAME
+from harness.scenarios.occluded_intersection import Layout, Parameters, Spawn, layout
 from harness.scene import SIZES_M, VehicleState, WorldState
 
 Snapshot = Mapping[str, Any]

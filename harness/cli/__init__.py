@@ -7,6 +7,7 @@ import sys
 
 import typer
 
+from harness.cli import dataset, scenario
 from harness.errors import UserError
 
 app = typer.Typer(
@@ -17,6 +18,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.add_typer(scenario.app, name="scenario")
+app.add_typer(dataset.app, name="dataset")
 
 
 def main() -> None:
