@@ -9,7 +9,7 @@ import typer
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
-    from harness.dataset.rank import Standing
+    from harness.rank import Standing
 
 app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
@@ -103,7 +103,7 @@ def rank_drivers(dataset: str = DATASET, workers: int = WORKERS, as_json: bool =
 
     in_range("--workers", workers, 1, MOST_WORKERS)
     data = load.load(load.find(dataset))
-    from harness.dataset.rank import rank, ranks_agree
+    from harness.rank import rank, ranks_agree
 
     episodes = int(data.manifest["episodes"])
     with bar(f"driving {printable(data.name, 30)} live", episodes) as progress:

@@ -1,1 +1,1 @@
-"""What a vehicle knows: rays, sensors with noise, and the scene graph made of them."""
+"""From the world to what one vehicle knows of it: rays, sensors, scene graph."""
