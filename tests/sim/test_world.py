@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -96,12 +97,10 @@ def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
     finally:
         IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
     code = (
-        "import test_world, harness.files as f; print(f.digest(test_world.trajectory(test_world.ONCOMING)))"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from harness.files import digest; "
+        "import test_world as t; print(digest(t.trajectory(t.ONCOMING)))"
     )
-    fresh = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(__file__.rpartition('/')[0])!r}); {code}"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert fresh.stdout.strip() == here
 
 
@@ -165,7 +164,7 @@ def head_on(world, apart_m):
     """Two helpers drive into each other, far from the ego; `apart_m` is between their bumpers."""
     first, second = world.env.road.vehicles[1:3]
     first.position, first.heading, first.speed = np.array([-40.0, -2.0]), 0.0, 6.0
-    second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi, 5.0
+    second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi - 0.3, 5.0
     asleep_at_the_wheel(world)
 
 
@@ -202,7 +201,7 @@ def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
             assert thawed.state() == world.state()
 
 
-@pytest.mark.parametrize("apart_m", [10.85, 10.9, 10.95, 11.0, 11.05, 11.1])
+@pytest.mark.parametrize("apart_m", [9.6, 9.7, 9.9, 10.0, 11.0])
 def test_wrecks_that_touch_when_frozen_are_pushed_apart_when_thawed(apart_m):
     world = World.start(NO_DANGER)
     head_on(world, apart_m)
