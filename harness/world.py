@@ -17,7 +17,8 @@ from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
 from harness.outcome import Outcome, fault, outline, striker
 from harness.road import APPROACHES, JUNCTION_M, Path, paths
-from harness.scenarios.occluded_intersection import NAME, Layout, Parameters, Spawn, layout
+from harness.scenarios.occluded_intersection import NAME as NAME
+from harness.scenarios.occluded_intersection import Layout, Parameters, Spawn, layout
 from harness.scene import SIZES_M, VehicleState, WorldState
 
 Snapshot = Mapping[str, Any]
@@ -211,6 +212,11 @@ class World:
         env.road.vehicles = vehicles
         env.controlled_vehicles = vehicles[:1]
         env.define_spaces()  # binds the action type to the ego
+        if snapshot["frame"]:
+            # What touches is pushed apart in the next frame: highway-env's last act in every frame.
+            for n, vehicle in enumerate(vehicles):
+                for other in vehicles[n + 1 :]:
+                    vehicle.handle_collisions(other, 1 / env.parameters.simulation_hz)
         return cls(env, state.episode_seed, state.step, snapshot["frame"])
 
     def state(self) -> WorldState:
@@ -237,18 +243,16 @@ class World:
 
     def _advance(self) -> None:
         p, road = self.env.parameters, self.env.road
-        standing = {id(v) for v in road.vehicles if v.crashed}
+        standing = {v.spawn.id for v in road.vehicles if v.crashed}
         road.act()
         road.step(1 / p.simulation_hz)
         self.frame += 1
         ego, others = road.vehicles[0], road.vehicles[1:]
-        crashed = [v for v in others if v.crashed and id(v) not in standing]
+        crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
             mine = _state(ego)
-            partner = min(
-                (_state(v) for v in crashed or others),
-                key=lambda v: float(outline(mine).distance(outline(v))),
-            )
+            partner = min(map(_state, others), key=lambda v: float(outline(mine).distance(outline(v))))
+            crashed.discard(partner.id)
             how = {"partner": partner.id, "striker": striker(mine, partner), "fault": fault(mine, partner)}
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
@@ -260,7 +264,7 @@ class World:
         self.outcome = replace(
             self.outcome,
             least_gap_m=_least_gap_m(ego, others, self.outcome.least_gap_m),
-            other_crashes=self.outcome.other_crashes + len(crashed) - bool(ego.crashed and crashed),
+            other_crashes=self.outcome.other_crashes + len(crashed),
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from harness.cli import evaluate, model, parse, prompt, report
+from harness.cli import dataset, evaluate, model, parse, prompt, report, scenario
 from harness.errors import UserError, printable
 
 app = typer.Typer(
@@ -21,6 +21,8 @@ app = typer.Typer(
 )
 app.command("eval")(evaluate.evaluate)
 app.add_typer(prompt.app, name="prompt")
+app.add_typer(dataset.app, name="dataset")
+app.add_typer(scenario.app, name="scenario")
 app.add_typer(model.app, name="model")
 app.command("report")(report.command)
 app.command("parse")(parse.command)

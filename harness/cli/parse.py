@@ -25,12 +25,12 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Parse one completion and say what was read, what was mended, or why it failed."""
+    from harness import scenarios
     from harness.parse import parse
-    from harness.scenario_names import actions_of
 
     if finish_reason not in _FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, _FINISH_REASONS)
-    actions = actions_of(scenario)
+    actions = scenarios.get(scenario).ACTIONS
     text = _read(file)
     parsed = parse(text, role=role, actions=actions, thinking=thinking, finish_reason=finish_reason)
     typer.echo(_json(parsed, actions) if as_json else _table(parsed, actions))

@@ -1,10 +1,12 @@
 """`harness dataset build`: episodes into a folder, in any number of processes, and on after a kill.
 
 Each finished episode is a file of its own under `.building/`; when all are there they become one
-`scenes.jsonl`. The bytes depend on the scenario, the seed and the number of episodes alone.
+`scenes.jsonl`. The bytes depend on the scenario, the seed, the number of episodes and the folder's name
+alone.
 """
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
@@ -15,7 +17,7 @@ from typing import Any
 
 from harness import __version__
 from harness.dataset.freeze import Behaviour, freeze
-from harness.dataset.schema import manifest_schema, record_schema, record_validator
+from harness.dataset.schema import FILE_NAME, manifest_schema, record_schema, record_validator
 from harness.errors import UserError, printable
 from harness.files import canonical_json, sha256_bytes, write_whole
 from harness.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
@@ -43,9 +45,7 @@ def build(
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else.
     """
     config = {
-        "scenario": NAME,
-        "actions": list(ACTIONS),
-        "parameters": asdict(Parameters()),
+        **settings(),
         "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
@@ -54,7 +54,12 @@ def build(
             **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
         },
     }
-    work = _begin(out, json.loads(canonical_json(config)))
+    if not re.fullmatch(FILE_NAME, out.absolute().name):
+        raise UserError(
+            f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or '-', "
+            "a letter or digit first"
+        )
+    work = _begin(out, config)
     done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
     progress(len(done))
     todo = sorted(set(range(episodes)) - set(done))
@@ -62,14 +67,14 @@ def build(
 
     shards = [(work / _shard(e)).read_bytes() for e in range(episodes)]
     files = {
-        "README.md": _readme(out.name, config).encode(),
+        "README.md": _readme(out.absolute().name, config).encode(),
         "scenes.jsonl": b"".join(shards),
         "scene.schema.json": _pretty(record_schema(ACTIONS)),
         "manifest.schema.json": _pretty(manifest_schema()),
     }
     manifest = {
         "format": "swarmdrive-dataset/1",
-        "name": out.name,
+        "name": out.absolute().name,
         **config,
         "decisions": sum(shard.count(b"\n") for shard in shards),
         "files": {name: sha256_bytes(data) for name, data in files.items()},
@@ -79,6 +84,12 @@ def build(
     write_whole(out / "manifest.json", _pretty(manifest))
     shutil.rmtree(work)
     return manifest
+
+
+def settings() -> dict[str, Any]:
+    """What decides how an episode goes, as JSON has it: scenario, actions, parameters."""
+    parameters: dict[str, Any] = json.loads(canonical_json(asdict(Parameters())))
+    return {"scenario": NAME, "actions": list(ACTIONS), "parameters": parameters}
 
 
 def _begin(out: Path, config: dict[str, Any]) -> Path:
@@ -96,7 +107,12 @@ def _begin(out: Path, config: dict[str, Any]) -> Path:
         raise UserError(f"--out {shown} is a folder with other files in it; choose an empty or a new one")
     elif out.exists() and not out.is_dir():
         raise UserError(f"--out {shown} is a file; choose a folder")
-    write_whole(work / "config.json", canonical_json(config))
+    try:
+        write_whole(work / "config.json", canonical_json(config))
+    except OSError as error:
+        raise UserError(
+            f"--out {shown} cannot be written ({error.strerror}); choose another folder"
+        ) from None
     return work
 
 

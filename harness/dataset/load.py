@@ -1,6 +1,6 @@
-"""Reading a frozen dataset: what is read has the digest its manifest states, or is not used."""
+"""Reading a frozen dataset: what has not the digest and the form that were stated for it is not used."""
 
-import json
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.dataset.schema import manifest_schema, record_validator
+from harness.dataset.verify import file_problems, read_manifest, records
 from harness.errors import UserError, printable, unknown
-from harness.files import sha256_bytes, sha256_file
 from harness.resources import folder
 from harness.scene import WorldState
 
@@ -97,7 +96,7 @@ class Dataset:
 
 def find(name: str) -> Path:
     """Folder of a dataset given by path or by the name of a shipped one."""
-    if Path(name).is_dir():
+    if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         return Path(name)
     known = [p.name for p in folder("datasets").iterdir() if (p / "manifest.json").is_file()]
     if name in known:
@@ -112,93 +111,21 @@ def load(path: Path, limit: int | None = None) -> Dataset:
         UserError: a file is missing, changed or broken.
     """
     manifest, digest = read_manifest(path)
-    for name, expected in manifest["files"].items():
-        file = path / name
-        if not file.is_file():
-            raise UserError(
-                f"dataset file {printable(file)} is missing; restore it or build the dataset again"
-            )
-        if sha256_file(file) != expected:
-            raise UserError(
-                f"dataset file {printable(file)} has changed (sha256 differs from manifest.json); "
-                "`harness dataset check` shows where"
-            )
-    scenes = []
-    with (path / "scenes.jsonl").open("rb") as lines:
-        for number, text in enumerate(lines, 1):
-            try:
-                record = json.loads(text)
-                if limit is not None and record["episode"] >= limit:
-                    break
-                scenes.append(Scene(record))
-            except (ValueError, KeyError, TypeError) as error:
-                raise UserError(
-                    f"dataset file {printable(path / 'scenes.jsonl')} line {number} is no decision point "
-                    f"({printable(error)}); build the dataset again"
-                ) from None
+    scenes: list[Scene] = []
+    for problem in file_problems(path, manifest):
+        raise _unusable(path, problem)
+    for record, problems in records(path / "scenes.jsonl", manifest):
+        if problems:
+            raise _unusable(path, problems[0])
+        if limit is not None and record["episode"] >= limit:
+            break
+        scenes.append(Scene(record))
     if not scenes:
         raise UserError(f"dataset {printable(path)} holds no scenes; build it with at least one episode")
     return Dataset(path, manifest, digest, tuple(scenes))
 
 
-def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
-    """The manifest, valid by its schema, and its digest."""
-    from jsonschema import Draft202012Validator
-
-    file = path / "manifest.json"
-    try:
-        data = file.read_bytes()
-        manifest = json.loads(data)
-    except FileNotFoundError:
-        raise UserError(
-            f"{printable(path)} is no dataset (no manifest.json); build one with `harness dataset build`"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
-        ) from None
-    for broken in Draft202012Validator(manifest_schema()).iter_errors(manifest):
-        raise UserError(f"{printable(file)} at {broken.json_path}: {printable(broken.message)}")
-    return manifest, sha256_bytes(data)
-
-
-def check(path: Path) -> list[str]:
-    """Everything that is wrong with a dataset, one line each, with file and line number. Empty if sound."""
-    manifest, _ = read_manifest(path)
-    problems = []
-    for name, expected in manifest["files"].items():
-        file = path / name
-        if not file.is_file():
-            problems.append(f"{name}: missing")
-        elif sha256_file(file) != expected:
-            problems.append(f"{name}: changed, its sha256 is not the manifest's")
-    if (path / "scenes.jsonl").is_file():
-        problems += _check_scenes(path / "scenes.jsonl", manifest)
-    return problems
-
-
-def _check_scenes(file: Path, manifest: dict[str, Any]) -> list[str]:
-    validator = record_validator(tuple(manifest["actions"]))
-    problems, seen = [], set()
-    with file.open("rb") as lines:
-        number = 0
-        for number, text in enumerate(lines, 1):
-            where = f"{file.name} line {number}"
-            if not text.endswith(b"\n"):
-                problems.append(f"{where}: cut off")
-            try:
-                record = json.loads(text)
-            except (ValueError, RecursionError) as error:
-                problems.append(f"{where}: no JSON ({printable(error)})")
-                continue
-            errors = sorted(validator.iter_errors(record), key=lambda e: e.json_path)
-            problems += [f"{where} at {e.json_path}: {printable(e.message)}" for e in errors[:3]]
-            if not errors:
-                if record["scene"] in seen:
-                    problems.append(f"{where}: scene {record['scene']} appears twice")
-                seen.add(record["scene"])
-        if number != manifest["decisions"]:
-            problems.append(
-                f"{file.name}: {number} decision points, the manifest says {manifest['decisions']}"
-            )
-    return problems
+def _unusable(path: Path, problem: str) -> UserError:
+    return UserError(
+        f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or rebuild it"
+    )

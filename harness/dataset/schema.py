@@ -1,16 +1,24 @@
 """JSON Schemas of a frozen dataset: published beside it, enforced when it is built and checked."""
 
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
 from harness.road import APPROACHES, ROUTES, SECTORS
+from harness.scenarios.occluded_intersection import Parameters
 from harness.scene import SIZES_M
 
 Schema = dict[str, Any]
 
 VEHICLE_ID = {"type": "string", "pattern": "^v[1-9][0-9]?$"}
-NUMBER = {"type": "number"}
-NUMBER_OR_NULL = {"type": ["number", "null"]}
+FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # of a dataset and of its files: never a path
+LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
+# No metre, second or share comes near these bounds; infinity and thousand-digit integers do not pass them.
+NUMBER = {"type": "number", "minimum": -1e6, "maximum": 1e6}
+NUMBER_OR_NULL = {**NUMBER, "type": ["number", "null"]}
+EPISODE = {"type": "integer", "minimum": 0, "maximum": LAST_EPISODE}
+SEED = {"type": "integer", "minimum": 0, "maximum": LAST_SEED + LAST_EPISODE}
+COUNT = {"type": "integer", "minimum": 0, "maximum": 1_000_000}
 
 
 def _object(**properties: Any) -> Schema:
@@ -43,7 +51,7 @@ _ARRIVAL = {"arc_m": NUMBER, "time_s": NUMBER_OR_NULL}
 _GRAPH = _object(
     viewer=VEHICLE_ID,
     role=_enum("ego", "helper"),
-    step={"type": "integer", "minimum": 0},
+    step=COUNT,
     self=_object(speed_mps=NUMBER, lane={"type": "string"}, zone_m=NUMBER),
     ego=_object(
         id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER,
@@ -77,7 +85,7 @@ _OUTCOME = _object(
     striker=_enum("ego", "other", "both", "neither", None),
     fault=_enum("ego", "other", None),
     least_gap_m=NUMBER,
-    other_crashes={"type": "integer", "minimum": 0},
+    other_crashes=COUNT,
 )
 
 
@@ -89,9 +97,9 @@ def record_schema(actions: tuple[str, ...]) -> Schema:
         "title": "decision point",
         **_object(
             scene={"type": "string", "pattern": "^[0-9]{5}-[0-9]$"},
-            episode={"type": "integer", "minimum": 0},
-            episode_seed={"type": "integer"},
-            step={"type": "integer", "minimum": 0},
+            episode=EPISODE,
+            episode_seed=SEED,
+            step=COUNT,
             road=_object(
                 kind={"type": "string"}, lane_width_m=NUMBER, junction_m=NUMBER, ego={"type": "string"}
             ),
@@ -100,17 +108,17 @@ def record_schema(actions: tuple[str, ...]) -> Schema:
                 action=_enum(*actions), reason=_enum("cruise", "local-view", "full-view", "random", "guard")
             ),
             state=_object(
-                scenario={"type": "string"}, episode_seed={"type": "integer"},
-                step={"type": "integer", "minimum": 0}, time_s=NUMBER, target_speed_mps=NUMBER,
+                scenario={"type": "string"}, episode_seed=SEED, step=COUNT, time_s=NUMBER,
+                target_speed_mps=NUMBER,
                 vehicles={**_list(_VEHICLE), "minItems": 1}, buildings=_list(_BUILDING),
             ),
             graphs={**by_viewer, "additionalProperties": _GRAPH},
             distance_m={**by_viewer, "additionalProperties": NUMBER},
             outcomes=_object(**dict.fromkeys(actions, _OUTCOME)),
             snapshot=_object(
-                frame={"type": "integer", "minimum": 0},
+                frame=COUNT,
                 sections=_list({"type": "integer", "minimum": 0, "maximum": 2}),
-                speed_index={"type": "integer", "minimum": 0},
+                speed_index={**COUNT, "maximum": len(Parameters().target_speeds_mps) - 1},
             ),
         ),
     }  # fmt: skip
@@ -118,29 +126,42 @@ def record_schema(actions: tuple[str, ...]) -> Schema:
 
 def manifest_schema() -> Schema:
     """Schema of `manifest.json`."""
-    text = {"type": "string"}
+    text = {"type": "string", "maxLength": 200}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "dataset manifest",
         **_object(
             format={"const": "swarmdrive-dataset/1"},
-            name={"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"},
+            name={"type": "string", "pattern": FILE_NAME},
             scenario=text,
-            actions={**_list(text), "minItems": 2},
-            parameters={"type": "object"},
-            behaviour={"type": "object"},
-            episodes={"type": "integer", "minimum": 1},
-            decisions={"type": "integer", "minimum": 1},
-            seed={"type": "integer"},
+            actions={**_list(text), "minItems": 2, "uniqueItems": True},
+            parameters=_object(
+                **{
+                    name: _list(NUMBER) if isinstance(value, tuple) else NUMBER
+                    for name, value in asdict(Parameters()).items()
+                }
+            ),
+            behaviour={"type": "object", "additionalProperties": NUMBER},
+            episodes={**EPISODE, "minimum": 1, "maximum": LAST_EPISODE + 1},
+            decisions={**COUNT, "minimum": 1},
+            seed={**SEED, "maximum": LAST_SEED},
             versions={"type": "object", "additionalProperties": text},
-            files={"type": "object", "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"}},
+            files={
+                "type": "object",
+                "required": ["scenes.jsonl"],
+                "propertyNames": {"pattern": FILE_NAME},
+                "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
+            },
         ),
     }
 
 
 @lru_cache(maxsize=8)
 def record_validator(actions: tuple[str, ...]) -> Any:
-    """Compiled validator of one record."""
+    """Compiled validator of one record; 1.0 is no integer to it."""
     from jsonschema import Draft202012Validator
+    from jsonschema.validators import extend
 
-    return Draft202012Validator(record_schema(actions))
+    whole = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
+    strict: Any = extend(Draft202012Validator, type_checker=whole)  # type: ignore[no-untyped-call]
+    return strict(record_schema(actions))

@@ -158,7 +158,7 @@ def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
 
 
 def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
-    """How much of each sector's approach is in sight past what the viewer knows of; what hides the rest."""
+    """How much of each sector's approach lane is in sight, and which known thing hides the rest."""
     found = []
     for sector in SECTORS:
         path = paths()[sector, "straight"]

@@ -1,0 +1,89 @@
+"""Whether frozen episodes rank the reference drivers as live driving on the same seeds does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from harness.arrays import Bools
+from harness.dataset.build import settings
+from harness.dataset.load import Dataset
+from harness.drivers import DRIVERS
+from harness.errors import UserError, printable
+from harness.frozen import driver_choices, judge
+from harness.live import drive_all
+from harness.metrics import Estimate, paired_difference, rate_interval
+from harness.workers import spread
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One driver, frozen and live.
+
+    Attributes:
+        frozen: success by the rule of `harness.frozen`.
+        live: success in the simulator.
+        difference_points: frozen minus live, in percentage points, paired by episode.
+        agreement: share of episodes with the same result.
+    """
+
+    frozen: Estimate
+    live: Estimate
+    difference_points: Estimate
+    agreement: Estimate
+
+
+def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
+    """Each driver's standing over the dataset's episodes; every one of them is driven live again.
+
+    Raises:
+        UserError: the dataset was built from another scenario than the one that would be driven.
+    """
+    for what, here in settings().items():
+        if dataset.manifest[what] != here:
+            raise UserError(
+                f"dataset {printable(dataset.path)} was built with other {what} than are driven here; "
+                "build it again to compare"
+            )
+    seeds = {s.record["episode"]: s.record["episode_seed"] for s in dataset.scenes}
+    live = spread(drive_all, seeds.values(), workers, progress)
+    return {
+        driver: _standing(frozen_success(dataset, driver), np.array([o[driver].success for o in live]))
+        for driver in DRIVERS
+    }
+
+
+def frozen_success(dataset: Dataset, driver: str) -> Bools:
+    """Success of each frozen episode if a reference driver takes its decisions, `(E,)`."""
+    scenes = np.arange(len(dataset.scenes))
+    chosen = driver_choices(dataset, driver)
+    safe, delay_s = dataset.outcome_arrays()
+    row = np.unique([s.record["episode"] for s in dataset.scenes], return_inverse=True)[1]
+    step = np.array([s.record["step"] for s in dataset.scenes])
+
+    shape = (row.max() + 1, step.max() + 1)
+    taken_safe, avoidable = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    taken_delay_s = np.zeros(shape)
+    taken_safe[row, step] = safe[scenes, chosen]
+    taken_delay_s[row, step] = delay_s[scenes, chosen]
+    avoidable[row, step] = safe.any(axis=1)
+    allowance_s = dataset.manifest["parameters"]["delay_allowance_s"]
+    return judge(taken_safe, taken_delay_s, avoidable, allowance_s).success
+
+
+def ranks_agree(standings: dict[str, Standing]) -> bool:
+    """Whether no pair of drivers stands one way frozen and the other way live; a tie goes with either."""
+    return all(
+        (a.frozen.value - b.frozen.value) * (a.live.value - b.live.value) >= 0
+        for a, b in combinations(standings.values(), 2)
+    )
+
+
+def _standing(frozen: Bools, live: Bools) -> Standing:
+    return Standing(
+        rate_interval(frozen.astype(float)),
+        rate_interval(live.astype(float)),
+        paired_difference(np.where(frozen, 100.0, 0.0), np.where(live, 100.0, 0.0)),
+        rate_interval((frozen == live).astype(float)),
+    )

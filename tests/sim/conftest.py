@@ -1,0 +1,22 @@
+"""Six frozen episodes, built once a session: dangers from the left, the right and oncoming, and none."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.dataset.build import build
+from harness.dataset.load import Dataset, load
+
+FIRST_SEED = 6  # left, none, left, right, oncoming, oncoming
+
+
+@pytest.fixture(scope="session")
+def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("built") / "small-v1"
+    build(folder, 6, FIRST_SEED, 1, lambda done: None)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small(small_folder: Path) -> Dataset:
+    return load(small_folder)

@@ -1,0 +1,44 @@
+"""Reference drivers in the simulator."""
+
+from harness.drivers import DRIVERS
+from harness.live import check, drive_all, summary
+from harness.outcome import Outcome
+
+
+def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():
+    outcomes = drive_all(6)  # a danger from the left
+    assert outcomes["cruise"].result == "collision"
+    assert outcomes["full-view"].result == "cleared"
+    assert outcomes["brake"].result == "time_out"
+
+
+def test_who_clears_too_long_after_the_full_view_driver_is_late():
+    outcomes = drive_all(6)
+    assert outcomes["local-view"].result == "late"
+    assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
+
+
+def test_a_check_counts_every_episode_once_for_any_number_of_workers():
+    done = []
+    alone = check(4, 5, 1, done.append)
+    assert sum(done) == 4
+    assert check(4, 5, 2, lambda n: None) == alone
+    for driver in DRIVERS:
+        ends = [alone[driver][end] for end in ("success", "collision", "late", "time_out", "off_road")]
+        assert sum(e.value for e in ends) == 1.0
+        assert {e.n for e in ends} == {4}
+
+
+def test_a_summary_counts_ends_faults_and_crashes_of_others():
+    found = summary(
+        [
+            Outcome("cleared", 6.0),
+            Outcome("late", 8.0, other_crashes=2),
+            Outcome("collision", 3.0, "v5", "ego", "ego"),
+            Outcome("collision", 3.0, "v5", "other", "other"),
+        ]
+    )
+    rates = {end: found[end].value for end in ("success", "late", "collision", "time_out", "off_road")}
+    assert rates == {"success": 0.25, "late": 0.25, "collision": 0.5, "time_out": 0.0, "off_road": 0.0}
+    assert (found["ego_at_fault"], found["other_at_fault"], found["other_crashes"]) == (1, 1, 2)
+    assert 0.0 < found["success"].low < 0.25 < found["success"].high < 1.0

@@ -1,0 +1,329 @@
+"""Sensors, lines of sight and scene graphs, on scenes placed by hand, and that nothing hidden leaks."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness.files import canonical_json
+from harness.perception.graph import scene_graph, truth_graph
+from harness.perception.rays import blocked_by, first_hits, sweep
+from harness.perception.sensors import detect
+from harness.scene import Building, VehicleState, WorldState
+from harness.world import World
+
+NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
+EGO = VehicleState("v1", "car", "ego", 2.0, 52.0, NORTH, 14.0, "own", "straight")
+
+
+def other(x, y, heading=NORTH, speed=10.0, kind="car", approach="left", route="straight", vehicle="v5"):
+    return VehicleState(vehicle, kind, "other", x, y, heading, speed, approach, route)
+
+
+def scene(*others, buildings=(), ego=EGO, step=0, seed=0):
+    return WorldState("by hand", seed, step, 0.0, 14.0, (ego, *others), tuple(buildings))
+
+
+def seen(state, viewer=None):
+    """Detections by id."""
+    viewer = viewer or state.ego
+    return {d.id: d for d in detect(state, viewer, sweep(state, viewer))}
+
+
+def ahead(distance_m, off_axis_deg=0.0, **kwargs):
+    """A car at a bearing from the ego's heading, clockwise."""
+    angle = NORTH + math.radians(off_axis_deg)
+    return other(EGO.x_m + distance_m * math.cos(angle), EGO.y_m + distance_m * math.sin(angle), **kwargs)
+
+
+# Lines of sight.
+
+WALL = Building("b1", west_m=-10.0, north_m=20.0, east_m=10.0, south_m=30.0)
+
+
+def test_a_car_behind_a_building_is_not_seen_and_one_beside_it_is():
+    assert seen(scene(other(2.0, 0.0), buildings=[WALL])) == {}
+    assert seen(scene(other(2.0, 0.0))).keys() == {"v5"}
+    assert seen(scene(other(30.0, 20.0), buildings=[WALL])).keys() == {"v5"}
+
+
+def test_a_car_that_looks_out_from_behind_a_corner_is_seen():
+    # From (2, 52) the building's south-east corner (10, 30) hides what is west of x = 20.9 at y = 0.
+    hidden, half = other(17.0, 0.0, heading=EAST), other(21.0, 0.0, heading=EAST)
+    assert seen(scene(hidden, buildings=[WALL])) == {}
+    assert seen(scene(half, buildings=[WALL])).keys() == {"v5"}
+
+
+def test_a_truck_hides_the_car_right_behind_it():
+    truck = other(2.0, 20.0, kind="truck")
+    follower = other(2.0, 5.0, vehicle="v6")
+    assert seen(scene(truck, follower)).keys() == {"v5"}
+    assert seen(scene(truck, replace(follower, x_m=12.0))).keys() == {"v5", "v6"}
+
+
+def test_a_ray_ends_on_the_first_surface_it_meets():
+    near = Building("b1", -1.0, -6.0, 1.0, -5.0).corners()
+    far = Building("b2", -1.0, -9.0, 1.0, -8.0).corners()
+    parameter, met = first_hits(np.zeros(2), np.array([[0.0, -1.0], [0.0, 1.0]]), np.array([far, near]))
+    assert parameter.tolist() == [5.0, math.inf]
+    assert met[0] == 1
+
+
+def test_points_are_seen_up_to_the_wall_that_hides_those_behind_it():
+    points = np.array([[2.0, 40.0], [2.0, 10.0], [40.0, 10.0]])
+    assert blocked_by(scene(buildings=[WALL]), EGO, points) == [None, "b1", None]
+
+
+# Which sensor sees what.
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "off_axis_deg", "sensors"),
+    [
+        (59.0, 0.0, ("camera", "lidar", "radar")),
+        (59.0, 59.0, ("camera", "lidar", "radar")),
+        (59.0, 61.0, ("lidar",)),
+        (59.0, 90.0, ("lidar",)),
+        (59.0, 119.0, ("lidar",)),
+        (59.0, 121.0, ("camera", "lidar", "radar")),
+        (59.0, 180.0, ("camera", "lidar", "radar")),
+        (61.0, 0.0, ("lidar", "radar")),
+        (79.0, 0.0, ("lidar", "radar")),
+        (81.0, 0.0, ("radar",)),
+        (149.0, 0.0, ("radar",)),
+        (151.0, 0.0, None),
+        (81.0, 90.0, None),
+    ],
+)
+def test_every_sensor_has_its_reach_and_its_field(distance_m, off_axis_deg, sensors):
+    found = seen(scene(ahead(distance_m, off_axis_deg, heading=EAST, kind="truck")))
+    assert found.get("v5", None) is None if sensors is None else found["v5"].sensors == sensors
+
+
+def test_only_the_camera_knows_the_kind_and_the_indicator():
+    near = seen(scene(ahead(30.0, kind="truck", route="left")))["v5"]
+    far = seen(scene(ahead(70.0, kind="truck", route="left")))["v5"]
+    assert (near.kind, near.indicator) == ("truck", "left")
+    assert (far.kind, far.indicator) == (None, None)
+
+
+def test_only_the_lidar_knows_a_heading():
+    assert seen(scene(ahead(70.0)))["v5"].heading_rad is not None
+    assert seen(scene(ahead(100.0)))["v5"].heading_rad is None
+
+
+def test_range_rate_is_negative_while_closing_and_positive_while_parting():
+    closing = seen(scene(ahead(50.0, heading=SOUTH, speed=10.0)))["v5"]
+    parting = seen(scene(ahead(50.0, heading=NORTH, speed=20.0)))["v5"]
+    assert closing.range_rate_mps == pytest.approx(-24.0, abs=0.75)
+    assert parting.range_rate_mps == pytest.approx(6.0, abs=0.75)
+    assert seen(scene(ahead(50.0, 90.0)))["v5"].range_rate_mps is None
+
+
+def draws(distance_m, off_axis_deg=0.0, n=4000):
+    """Many detections of one car, one a step."""
+    first = scene(ahead(distance_m, off_axis_deg, heading=WEST, speed=10.0))
+    view = sweep(first, EGO)
+    return [detect(replace(first, step=step), EGO, view)[0] for step in range(n)]
+
+
+def spread(values):
+    return float(np.std(np.array(values)))
+
+
+def test_lidar_noise_is_what_is_stated():
+    found = draws(70.0, 90.0)
+    truth = ahead(70.0, 90.0)
+    assert spread([d.x_m for d in found]) == pytest.approx(0.1, rel=0.06)
+    assert spread([d.y_m for d in found]) == pytest.approx(0.1, rel=0.06)
+    assert spread([d.heading_rad for d in found]) == pytest.approx(math.radians(2.0), rel=0.06)
+    assert spread([d.speed_mps for d in found]) == pytest.approx(0.8, rel=0.06)
+    assert np.mean([d.x_m for d in found]) == pytest.approx(truth.x_m, abs=0.01)
+    assert np.mean([d.speed_mps for d in found]) == pytest.approx(10.0, abs=0.06)
+
+
+def test_radar_noise_is_what_is_stated():
+    found = draws(100.0)
+    assert spread([d.y_m for d in found]) == pytest.approx(0.4, rel=0.06)  # range, straight ahead
+    assert spread([d.x_m for d in found]) == pytest.approx(100.0 * math.radians(1.0), rel=0.06)  # bearing
+    assert spread([d.range_rate_mps for d in found]) == pytest.approx(0.15, rel=0.06)
+    assert spread([d.speed_mps for d in found]) == pytest.approx(0.2, rel=0.06)
+
+
+def test_noise_is_a_draw_for_episode_step_viewer_and_object():
+    state = scene(ahead(30.0))
+    assert seen(state) == seen(state)
+    assert seen(state)["v5"].x_m != seen(replace(state, step=1))["v5"].x_m
+    assert seen(state)["v5"].x_m != seen(replace(state, episode_seed=1))["v5"].x_m
+
+
+def test_a_standing_car_never_has_a_negative_speed():
+    assert min(d.speed_mps for d in draws_of(ahead(70.0, 90.0, speed=0.0))) == 0.0
+
+
+def draws_of(vehicle, n=200):
+    first = scene(vehicle)
+    view = sweep(first, EGO)
+    return [detect(replace(first, step=step), EGO, view)[0] for step in range(n)]
+
+
+# The graph.
+
+
+def test_positions_are_forward_and_to_the_left_and_headings_counter_clockwise():
+    # The ego looks north; a car 20 m ahead and 6 m to the left drives east, to the ego's right.
+    (node,) = truth_graph(scene(other(-4.0, 32.0, heading=EAST)))["nodes"]
+    assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (20.0, 6.0, -90)
+    (node,) = truth_graph(scene(other(2.0, 72.0, heading=WEST)))["nodes"]
+    assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (-20.0, 0.0, 90)
+
+
+def test_a_conflict_has_the_arc_lengths_and_times_of_both():
+    # The ego at y 52 has 50 m to the crossing at (2, 2); a car at x −38 has 40 m at 10 m/s.
+    graph = truth_graph(scene(other(-38.0, 2.0, heading=EAST, speed=10.0)))
+    (conflict,) = graph["conflicts"]
+    assert (conflict["with"], conflict["sector"], conflict["route"]) == ("v5", "left", "straight")
+    assert conflict["point"] == {"forward_m": 50.0, "left_m": 0.0}
+    assert conflict["ego"] == {"arc_m": 50.0, "time_s": 3.6}
+    assert conflict["other"] == {"arc_m": 40.0, "time_s": 4.0, "speed_mps": 10.0}
+
+
+def test_a_standing_car_has_an_arc_length_and_no_time():
+    (conflict,) = truth_graph(scene(other(-38.0, 2.0, heading=EAST, speed=0.0)))["conflicts"]
+    assert conflict["other"] == {"arc_m": 40.0, "time_s": None, "speed_mps": 0.0}
+
+
+def test_an_oncoming_car_is_a_conflict_only_if_it_turns_left():
+    straight = other(-2.0, -40.0, heading=SOUTH, approach="oncoming")
+    assert truth_graph(scene(straight))["conflicts"] == []
+    (conflict,) = truth_graph(scene(replace(straight, route="left")))["conflicts"]
+    assert (conflict["sector"], conflict["route"]) == ("oncoming", "left")
+
+
+def test_a_car_that_has_passed_the_conflict_point_is_none():
+    assert truth_graph(scene(other(10.0, 2.0, heading=EAST)))["conflicts"] == []
+    assert truth_graph(scene(other(6.0, 2.0, heading=EAST)))["conflicts"] != []  # its tail is still there
+
+
+def test_lanes_are_named_from_the_egos_seat_and_off_the_road_there_is_none():
+    lanes = {
+        "approach-left": other(-38.0, 2.0, heading=EAST),
+        "approach-right": other(38.0, -2.0, heading=WEST),
+        "exit-ahead": other(2.0, -30.0, heading=NORTH),
+        "junction": other(0.0, 2.0, heading=EAST),
+        "off-lane": other(30.0, 30.0),
+    }
+    for lane, vehicle in lanes.items():
+        assert truth_graph(scene(vehicle))["nodes"][0]["lane"] == lane
+
+
+def test_a_helper_judges_the_egos_conflicts_from_its_own_seat():
+    helper = replace(other(30.0, 2.0, heading=EAST, vehicle="v2"), part="helper")
+    danger = other(-38.0, 2.0, heading=EAST)
+    graph = scene_graph(scene(helper, danger), "v2")
+    (conflict,) = graph["conflicts"]
+    assert (graph["role"], conflict["with"], conflict["sector"]) == ("helper", "v5", "left")
+    assert conflict["ego"] == {"arc_m": 50.0, "time_s": 3.6}  # by the request, so without noise
+    assert conflict["point"] == {"forward_m": -28.0, "left_m": 0.0}
+    assert (graph["ego"]["forward_m"], graph["ego"]["left_m"]) == (-28.0, -50.0)
+
+
+def test_a_sector_behind_a_building_is_occluded_by_it_and_an_open_one_is_not():
+    corner = Building("b1", west_m=-70.0, north_m=8.0, east_m=-8.0, south_m=70.0)
+    sectors = {s["sector"]: s for s in scene_graph(scene(buildings=[corner]), "v1")["sectors"]}
+    assert sectors["left"]["occluded"]
+    assert sectors["left"]["by"] == ["b1"]
+    assert sectors["left"]["seen_share"] < 0.5
+    assert sectors["right"] == {"sector": "right", "seen_share": 1.0, "occluded": False, "by": []}
+
+
+def test_a_reported_truck_hides_a_stretch_of_a_sector_and_is_named():
+    truck = other(-2.0, -20.0, heading=SOUTH, kind="truck", approach="oncoming")
+    sectors = {s["sector"]: s for s in scene_graph(scene(truck), "v1")["sectors"]}
+    assert sectors["oncoming"]["by"] == ["v5"]
+    assert sectors["oncoming"]["seen_share"] < 1.0
+
+
+# Nothing hidden leaks.
+
+
+def without(state, vehicle):
+    return replace(state, vehicles=tuple(v for v in state.vehicles if v.id != vehicle))
+
+
+def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
+    hidden = 0
+    for seed in range(24):
+        world = World.start(seed)
+        for action in ("IDLE", "SLOWER", "IDLE", "FASTER", "IDLE"):
+            state = world.state()
+            for viewer in (state.ego, *state.helpers):
+                graph = scene_graph(state, viewer.id)
+                listed = {node["id"] for node in graph["nodes"]} | {viewer.id, state.ego.id}
+                for v in state.vehicles:
+                    if v.id not in listed:
+                        hidden += 1
+                        less = scene_graph(without(state, v.id), viewer.id)
+                        assert canonical_json(less) == canonical_json(graph), (
+                            seed,
+                            state.step,
+                            viewer.id,
+                            v.id,
+                        )
+            world.act(action)
+            if world.outcome.ended:
+                break
+    assert hidden > 300
+
+
+def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_does_not_see_it():
+    hidden_steps = 0
+    for seed in range(24):
+        world = World.start(seed)
+        danger = world.env.layout.danger_id
+        if danger is None:
+            continue
+        harmless = world.branch()
+        vehicles = harmless.env.road.vehicles
+        vehicles[:] = [v for v in vehicles if v.spawn.id != danger]
+        for _ in range(4):
+            graph = scene_graph(world.state(), "v1")
+            if danger not in {node["id"] for node in graph["nodes"]}:
+                hidden_steps += 1
+                assert canonical_json(scene_graph(harmless.state(), "v1")) == canonical_json(graph)
+            world.act("IDLE")
+            harmless.act("IDLE")
+    assert hidden_steps > 40
+
+
+def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
+    for seed in (1, 6, 10, 11):
+        world = World.start(seed)
+        for _ in range(4):
+            state = world.state()
+            for viewer in (state.ego, *state.helpers):
+                graph = scene_graph(state, viewer.id)
+                known = {node["id"] for node in graph["nodes"]}
+                assert {c["with"] for c in graph["conflicts"]} <= known
+                hiding = {name for s in graph["sectors"] for name in s["by"]}
+                assert hiding <= known | {b.id for b in state.buildings}
+            world.act("IDLE")
+
+
+def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions_before():
+    dangers = hidden = helped = 0
+    for seed in range(40):
+        world = World.start(seed)
+        danger = world.env.layout.danger_id
+        if danger is None:
+            continue
+        world.act("IDLE")
+        world.act("IDLE")
+        state = world.state()
+        views = [{n["id"] for n in scene_graph(state, v.id)["nodes"]} for v in (state.ego, *state.helpers)]
+        dangers += 1
+        hidden += danger not in views[0]
+        helped += any(danger in view for view in views[1:])
+    assert hidden / dangers > 0.8
+    assert helped / dangers > 0.9

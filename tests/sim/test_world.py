@@ -1,0 +1,231 @@
+"""The live world: physics, determinism, how episodes end, and thawing."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from highway_env.envs.intersection_env import IntersectionEnv
+from highway_env.vehicle.behavior import IDMVehicle
+
+from harness.files import digest
+from harness.live import drive
+from harness.outcome import Outcome, outline
+from harness.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.scene import WorldState
+from harness.world import World
+
+NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # seeds
+P = Parameters()
+
+
+def trajectory(seed, actions=("IDLE", "SLOWER", "FASTER", "IDLE")):
+    """States at each decision, as JSON has them."""
+    world = World.start(seed)
+    states = [world.state().to_dict()]
+    for action in actions:
+        world.act(action)
+        states.append(world.state().to_dict())
+    return states
+
+
+def through_json(world):
+    """The world thawed from what is left of it in a file."""
+    state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
+    return World.thaw(WorldState.from_dict(state), snapshot)
+
+
+def advance(world, frames):
+    for _ in range(frames):
+        world._advance()
+
+
+def test_actions_are_highway_envs_by_name_and_order():
+    assert World.start(0).actions == ACTIONS == tuple(IntersectionEnv.ACTIONS.values())
+
+
+@pytest.mark.parametrize("seed", [NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING])
+def test_an_episode_starts_at_14_mps_in_the_egos_lane_before_the_first_decision(seed):
+    state = World.start(seed).state()
+    assert (state.ego.speed_mps, state.target_speed_mps, state.step, state.time_s) == (14.0, 14.0, 0, 0.0)
+    assert (state.ego.id, state.ego.x_m, state.ego.route) == ("v1", 2.0, "straight")
+    assert P.ego_start_m[0] <= state.ego.y_m + 0.54 <= P.ego_start_m[1]  # the conflict zone is 0.54 m north
+
+
+def test_the_ego_brakes_and_accelerates_within_its_limits():
+    world = World.start(NO_DANGER)
+    speeds = [world.state().ego.speed_mps]
+    for action in ("SLOWER", "SLOWER", "FASTER", "FASTER", "SLOWER"):
+        world.env.action_type.act(world.env.action_type.actions_indexes[action])
+        for _ in range(P.simulation_hz):
+            advance(world, 1)
+            speeds.append(world.state().ego.speed_mps)
+    changes = np.diff(speeds) * P.simulation_hz
+    assert changes.min() == pytest.approx(-P.braking_mps2)  # both limits are reached, neither is passed
+    assert changes.max() == pytest.approx(P.acceleration_mps2)
+
+
+def test_one_decision_lasts_one_second_of_fifty_frames():
+    world = World.start(NO_DANGER)
+    world.act("IDLE")
+    state = world.state()
+    assert (state.step, state.time_s, world.frame) == (1, 1.0, 50)
+    assert state.ego.y_m == pytest.approx(World.start(NO_DANGER).state().ego.y_m - 14.0)
+
+
+def test_an_unhindered_cruise_clears_when_the_distance_is_covered():
+    start = World.start(7).state().ego.y_m
+    outcome = drive("cruise", 7)
+    frames = np.ceil((start + 11.0 + P.cleared_m) / 14.0 * P.simulation_hz)
+    assert (outcome.result, outcome.time_s) == ("cleared", pytest.approx(frames / P.simulation_hz))
+
+
+def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
+    defaults = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
+    try:
+        for name in ("intersection-v0", "highway-v0"):  # the first writes to a class that others share
+            env = gymnasium.make(name)
+            env.reset(seed=3)
+            for _ in range(3):
+                env.step(1)
+            env.close()
+        drive("brake", 3)
+        here = digest(trajectory(ONCOMING))
+    finally:
+        IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from harness.files import digest; "
+        "import test_world as t; print(digest(t.trajectory(t.ONCOMING)))"
+    )
+    fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert fresh.stdout.strip() == here
+
+
+def test_a_world_leaves_highway_envs_classes_as_they_were():
+    before = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
+    World.start(FROM_LEFT).act("IDLE")
+    assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
+
+
+def test_two_seeds_are_two_episodes():
+    assert digest(trajectory(FROM_LEFT)) != digest(trajectory(FROM_RIGHT))
+
+
+@pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
+def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
+    world = World.start(seed)
+    gaps = []
+    while not world.outcome.ended:
+        advance(world, 1)
+        state = world.state()
+        gaps.append(min(outline(state.ego).distance(outline(v)) for v in state.vehicles[1:]))
+    assert world.outcome.result == "collision"
+    assert world.outcome.time_s == pytest.approx(len(gaps) / P.simulation_hz)
+    assert gaps[-2] > 0.0
+    assert gaps[-2] < 0.6  # 28 m/s is 0.56 m a frame, and no two vehicles close faster
+    assert gaps[-1] < gaps[-2]
+    assert world.outcome.partner == world.env.layout.danger_id
+    assert world.outcome.least_gap_m == 0.0
+    assert world.outcome.other_crashes == 0
+
+
+@pytest.mark.parametrize(("seed", "blamed"), [(FROM_RIGHT, "ego"), (FROM_LEFT, "ego"), (ONCOMING, "other")])
+def test_a_cruising_ego_owes_way_to_the_crossing_road_and_is_owed_it_by_a_left_turn(seed, blamed):
+    assert drive("cruise", seed).fault == blamed
+
+
+def test_always_braking_never_arrives():
+    outcome = drive("brake", NO_DANGER)
+    assert (outcome.result, outcome.time_s, outcome.partner) == ("time_out", P.time_limit_s, None)
+    assert outcome.least_gap_m > 10.0
+
+
+def test_running_into_the_car_ahead_is_the_egos_fault_and_its_partner_is_that_car():
+    world = World.start(NO_DANGER)
+    ego, ahead = world.env.road.vehicles[0], world.env.road.vehicles[3]
+    ahead.position, ahead.speed = ego.position - [0.0, 9.0], 4.0
+    world.act("IDLE")
+    assert world.outcome.result == "collision"
+    assert (world.outcome.partner, world.outcome.striker, world.outcome.fault) == ("v4", "ego", "ego")
+
+
+def test_a_crash_of_two_others_is_counted_apart_and_ends_nothing():
+    world = World.start(NO_DANGER)
+    head_on(world, apart_m=6.0)
+    world.act("IDLE")
+    assert [v.id for v in world.state().vehicles if v.crashed] == ["v2", "v3"]
+    assert (world.outcome.other_crashes, world.outcome.ended) == (2, False)
+
+
+def head_on(world, apart_m):
+    """Two helpers drive into each other, far from the ego; `apart_m` is between their bumpers."""
+    first, second = world.env.road.vehicles[1:3]
+    first.position, first.heading, first.speed = np.array([-40.0, -2.0]), 0.0, 6.0
+    second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi - 0.3, 5.0
+    asleep_at_the_wheel(world)
+
+
+def asleep_at_the_wheel(world):
+    """The two helpers neither steer nor brake."""
+    for vehicle in world.env.road.vehicles[1:3]:
+        vehicle.speed_control = lambda target_speed: 0.0
+        vehicle.steering_control = lambda lane_index: 0.0
+
+
+@pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
+def test_a_thawed_world_goes_on_exactly_as_the_one_it_was_taken_from(seed):
+    world = World.start(seed)
+    for behaviour in ("IDLE", "SLOWER", "SLOWER", "FASTER"):
+        for action in ACTIONS:
+            thawed, original = through_json(world), world.branch()
+            original.outcome = Outcome()  # what happened before is not part of a frozen world
+            for then in (action, "IDLE"):
+                thawed.act(then)
+                original.act(then)
+                assert thawed.state() == original.state()
+                assert thawed.snapshot() == original.snapshot()
+            assert thawed.outcome == original.outcome
+        world.act(behaviour)
+
+
+def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
+    for seed in range(20, 32):
+        world = World.start(seed)
+        for action in ("IDLE", "FASTER", "SLOWER"):
+            thawed = through_json(world)
+            world.act(action)
+            thawed.act(action)
+            assert thawed.state() == world.state()
+
+
+@pytest.mark.parametrize("apart_m", [9.6, 9.7, 9.9, 10.0, 11.0])
+def test_wrecks_that_touch_when_frozen_are_pushed_apart_when_thawed(apart_m):
+    world = World.start(NO_DANGER)
+    head_on(world, apart_m)
+    world.act("IDLE")
+    thawed = through_json(world)
+    asleep_at_the_wheel(thawed)
+    world.act("IDLE")
+    thawed.act("IDLE")
+    assert thawed.state() == world.state()
+    assert [v.id for v in thawed.state().vehicles if v.crashed] == ["v2", "v3"]
+
+
+def test_a_branch_goes_its_own_way():
+    world = World.start(FROM_LEFT)
+    before = world.state()
+    world.branch().act("SLOWER")
+    assert world.state() == before
+
+
+def test_a_snapshot_is_a_frame_a_section_a_vehicle_and_a_speed_level():
+    world = World.start(ONCOMING)
+    world.act("SLOWER")
+    snapshot = world.snapshot()
+    assert snapshot.keys() == {"frame", "sections", "speed_index"}
+    values = [snapshot["frame"], snapshot["speed_index"], *snapshot["sections"]]
+    assert {type(value) for value in values} == {int}
+    assert len(snapshot["sections"]) == len(world.state().vehicles)
