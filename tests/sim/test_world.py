@@ -137,6 +137,13 @@ def test_a_cruising_ego_owes_way_to_the_crossing_road_and_is_owed_it_by_a_left_t
     assert drive("cruise", seed).fault == blamed
 
 
+def test_an_ego_beside_its_lane_has_left_the_road():
+    world = World.start(NO_DANGER)
+    world.env.road.vehicles[0].position[0] += 6.0
+    world.act("IDLE")
+    assert (world.outcome.result, world.outcome.time_s) == ("off_road", 1 / P.simulation_hz)
+
+
 def test_always_braking_never_arrives():
     outcome = drive("brake", NO_DANGER)
     assert (outcome.result, outcome.time_s, outcome.partner) == ("time_out", P.time_limit_s, None)

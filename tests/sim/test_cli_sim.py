@@ -1,0 +1,160 @@
+"""`harness scenario` and `harness dataset` as they are typed."""
+
+import json
+import shutil
+import sys
+
+import pytest
+
+from harness.cli import main
+
+
+@pytest.fixture
+def harness(monkeypatch, capsys):
+    """Runs one command line; gives exit code, stdout and stderr."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+NAME = "occluded-intersection"
+
+
+def test_scenarios_are_listed_and_shown_for_people_and_machines(harness):
+    code, out, _ = harness("scenario", "list")
+    assert code == 0
+    assert out.startswith(f"{NAME}: ")
+    assert json.loads(harness("scenario", "list", "--json")[1])[0]["name"] == NAME
+    _, out, _ = harness("scenario", "show", NAME)
+    assert "actions: SLOWER, IDLE, FASTER" in out
+    assert "ego_start_m = 61, 69\n    distance from the start to the centroid of the conflict zone." in out
+    assert max(map(len, out.splitlines())) <= 110
+
+
+def test_every_parameter_is_shown_with_value_and_meaning(harness):
+    shown = json.loads(harness("scenario", "show", NAME, "--json")[1])
+    assert shown["actions"] == ["SLOWER", "IDLE", "FASTER"]
+    assert shown["parameters"]["time_limit_s"]["value"] == 10.0
+    assert shown["parameters"]["corner_m"]["value"] == [8.0, 18.0]
+    assert all(p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values())
+
+
+def test_a_scenario_check_states_rates_intervals_and_n(harness):
+    code, out, err = harness(
+        "scenario", "check", NAME, "--episodes", 3, "--seed", 6, "--workers", 1, "--json"
+    )
+    found = json.loads(out)
+    assert (code, err) == (0, "")
+    assert found["drivers"].keys() == {"cruise", "brake", "local-view", "full-view"}
+    success = found["drivers"]["full-view"]["success"]
+    assert success.keys() == {"value", "low", "high", "n"}
+    assert (success["value"], success["high"], success["n"]) == (1.0, 1.0, 3)
+    assert found["drivers"]["brake"]["time_out"]["value"] == 1.0
+    code, out, _ = harness("scenario", "check", NAME, "--episodes", 3, "--seed", 6, "--workers", 2)
+    assert code == 0
+    assert "n = 3 episodes, seeds 6 to 8" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
+    out_folder = tmp_path / "two-v1"
+    code, out, _ = harness(
+        "dataset", "build", NAME, "--episodes", 2, "--seed", 6, "--workers", 1, "--out", out_folder
+    )
+    assert (code, "2 episodes, 12 decision points" in out) == (0, True)
+    code, out, _ = harness("dataset", "check", out_folder)
+    assert (code, out.splitlines()[0]) == (0, "two-v1 is sound: 2 episodes, 12 decision points, 4 files")
+    code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")
+    ranked = json.loads(out)
+    assert (code, ranked["episodes"], ranked["ranks_agree"]) == (0, 2, True)
+    cruise = ranked["drivers"]["cruise"]
+    assert cruise["frozen"]["value"] == cruise["live"]["value"] == 0.5
+    assert (cruise["difference_points"]["value"], cruise["agreement"]["value"]) == (0.0, 1.0)
+    code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1)
+    assert "n = 2 episodes; ranks agree: yes" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_damaged_dataset_is_told_line_by_line_with_exit_code_1(harness, small_folder, tmp_path):
+    damaged = shutil.copytree(small_folder, tmp_path / "damaged")
+    with (damaged / "scenes.jsonl").open("ab") as f:
+        f.write(b'{"scene": "00006-0"}\n{"sce')
+    code, out, err = harness("dataset", "check", damaged)
+    lines = out.splitlines()
+    assert (code, err) == (1, "")
+    assert lines[0] == "scenes.jsonl: changed, its sha256 is not the manifest's"
+    assert lines[1].startswith("scenes.jsonl line 37 at $: 'behaviour' is a required property")
+    assert lines[-2:] == [
+        "scenes.jsonl line 38: cut off",
+        "scenes.jsonl: 38 decision points, the manifest says 36",
+    ]
+    code, out, _ = harness("dataset", "check", damaged, "--json")
+    assert (code, json.loads(out)["problems"]) == (1, lines)
+
+
+def test_ranking_refuses_a_dataset_of_other_parameters(harness, small_folder, tmp_path):
+    other = shutil.copytree(small_folder, tmp_path / "other")
+    manifest = json.loads((other / "manifest.json").read_text())
+    manifest["parameters"]["time_limit_s"] = 11.0
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    code, out, err = harness("dataset", "rank", other)
+    assert (code, out) == (2, "")
+    assert "was built with other parameters than are driven here" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("scenario show occluded-crossing", "unknown scenario 'occluded-crossing'"),
+        ("scenario check nowhere --episodes 1", "unknown scenario 'nowhere'"),
+        (f"scenario check {NAME} --episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
+        (f"scenario check {NAME} --episodes 1 --workers 0", "--workers 0 is out of range; give 1 to 256"),
+        (f"scenario check {NAME} --episodes 1 --seed -1", "--seed -1 is out of range"),
+        ("dataset build nowhere --out OUT", "unknown scenario 'nowhere'"),
+        (f"dataset build {NAME} --episodes 0 --out OUT", "--episodes 0 is out of range"),
+        (f"dataset build {NAME} --episodes 1 --workers 0 --out OUT", "--workers 0 is out of range"),
+        (f"dataset build {NAME} --episodes 1 --out OUT/.hidden", "cannot name a dataset"),
+        ("dataset check OUT", "unknown dataset"),
+        ("dataset check EMPTY", "is no dataset (no manifest.json)"),
+        ("dataset rank EMPTY", "is no dataset (no manifest.json)"),
+        ("dataset rank SMALL --workers 0", "--workers 0 is out of range"),
+        ("dataset show SMALL 00099-0 --out OUT.svg", "unknown scene '00099-0'"),
+        ("dataset show SMALL 00000-0 --out OUT.gif", "end it in .svg or .png"),
+        ("dataset show SMALL 00000-0 --viewer v9 --out OUT.svg", "unknown viewer of scene 00000-0 'v9'"),
+        ("dataset show EMPTY 00000-0 --out OUT.svg", "is no dataset"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
+    harness, small_folder, tmp_path, words, says
+):
+    (tmp_path / "empty").mkdir()
+    places = {"OUT": tmp_path / "out", "EMPTY": tmp_path / "empty", "SMALL": small_folder}
+    for name, place in places.items():
+        words = words.replace(name, str(place))
+    before = sorted(small_folder.rglob("*"))
+    code, out, err = harness(*words.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("harness: ")
+    assert err.count("\n") == 1
+    assert says in err
+    assert [p.name for p in tmp_path.rglob("*")] == ["empty"]
+    assert sorted(small_folder.rglob("*")) == before
+
+
+def test_a_scene_is_drawn_whole(harness, small_folder, tmp_path):
+    pytest.importorskip("harness.drawing")
+    for suffix, start in {"svg": b"<?xml", "png": b"\x89PNG"}.items():
+        picture = tmp_path / f"scene.{suffix}"
+        code, out, _ = harness("dataset", "show", small_folder, "00000-2", "--viewer", "v2", "--out", picture)
+        assert (code, out) == (0, f"wrote {picture}\n")
+        assert picture.read_bytes().startswith(start)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.png", "scene.svg"]

@@ -1,0 +1,22 @@
+"""The scenario's page says what the code does."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from harness.scenarios.occluded_intersection import ACTIONS, Parameters
+
+PAGE = (Path(__file__).parents[2] / "docs/scenarios/occluded-intersection.md").read_text()
+
+
+def test_the_pages_table_has_every_parameter_with_its_value():
+    rows = dict(line.strip("| ").split(" | ")[:2] for line in PAGE.splitlines() if line.count(" | ") == 2)
+    stated = {name.strip("`"): value for name, value in rows.items() if name.startswith("`")}
+    values = {
+        name: ", ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}"
+        for name, value in asdict(Parameters()).items()
+    }
+    assert stated == values
+
+
+def test_the_page_names_the_actions():
+    assert all(f"`{action}`" in PAGE for action in ACTIONS)
