@@ -62,7 +62,7 @@ class Parameters:
     time_limit_s: float = 10.0
     delay_allowance_s: float = 1.0
     cleared_m: float = 2.5
-    danger_share: float = 0.58
+    danger_share: float = 0.75
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
     danger_offset_s: tuple[float, float] = (-0.4, 1.2)
     crossing_speed_mps: tuple[float, float] = (9.0, 13.0)
