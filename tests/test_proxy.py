@@ -28,9 +28,7 @@ speeds = st.floats(0, 20).map(lambda x: round(x, 1))
 
 @st.composite
 def conflicts(draw: st.DrawFn) -> dict[str, Any]:
-    sector, route = draw(
-        st.sampled_from([("left", "straight"), ("right", "straight"), ("oncoming", "left")])
-    )
+    sector, route = draw(st.sampled_from([("left", "straight"), ("right", "straight"), ("oncoming", "left")]))
     return {
         "with": f"v{draw(st.integers(2, 99))}",
         "sector": sector,
