@@ -1,6 +1,7 @@
 """What tests share that takes seconds to make."""
 
 import fcntl
+import os
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,10 @@ from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 
 EPISODES, SEED = 4, 100
+
+# Before anyone imports torch: threads of several workers that wait for each other make tiny models a
+# hundred times slower.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session")

@@ -50,8 +50,8 @@ def graphs(draw: st.DrawFn, role: str | None = None) -> dict[str, Any]:
         "step": draw(st.integers(0, Parameters().decisions - 1)),
         "self": {"speed_mps": draw(speeds), "lane": "approach-own", "zone_m": 40.0},
         "ego": {
-            "id": "v1", "speed_mps": draw(speeds), "target_speed_mps": draw(st.sampled_from([0.0, 7.0, 14.0])),
-            "zone_m": draw(tenths), "forward_m": 0.0, "left_m": 0.0,
+            "id": "v1", "speed_mps": draw(speeds), "zone_m": draw(tenths), "forward_m": 0.0, "left_m": 0.0,
+            "target_speed_mps": draw(st.sampled_from([0.0, 7.0, 14.0])),
         },
         "nodes": [],
         "conflicts": draw(st.lists(conflicts(), max_size=3)),
