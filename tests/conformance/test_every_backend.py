@@ -1,0 +1,96 @@
+"""What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
+
+import json
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from evaluating import run, spec_of
+
+from harness import cards
+from harness.backends.base import Backend, Request
+from harness.backends.registry import missing, open_backend
+from harness.dataset.load import load
+from harness.run.asking import requests
+
+
+@dataclass(frozen=True)
+class Case:
+    """An opened backend and five requests that it can answer; helpers' too, where it answers for them."""
+
+    backend: Backend
+    asked: tuple[Request, ...]
+
+
+def model_free() -> list[str]:
+    return [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
+
+
+ENGINES = [*model_free(), "replay", "transformers"]
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder, model = tmp_path_factory.mktemp("conformance"), request.param
+    data = load(small_path, limit=1)
+    if model == "replay":
+        run(spec_of(data, seeds=(0,)), folder / "run")
+        model = f"replay:{folder / 'run'}"
+    if model == "transformers":
+        if find_spec("torch") is None or find_spec("transformers") is None:
+            pytest.skip("needs the transformers extra")
+        import tiny_qwen3
+
+        model = str(tiny_qwen3.build(folder / "tiny", context_tokens=2048))
+    spec = spec_of(data, model)
+    asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in requests(spec, data.scenes[:5])]
+    device = "cpu" if spec.card.engine == "transformers" else None
+    return Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
+
+
+def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", "transformers"}
+    assert tried == set(cards.Engine.__args__)
+    assert all(missing(cards.load(name)) is None for name in model_free())
+
+
+def test_there_is_one_completion_a_request_in_the_order_asked(case: Case) -> None:
+    for asked in (case.asked, case.asked[::-1], case.asked[2:3]):
+        assert [c.request_id for c in case.backend.complete(asked)] == [r.id for r in asked]
+
+
+def test_asking_nothing_gives_nothing(case: Case) -> None:
+    assert case.backend.complete(()) == []
+
+
+def test_each_completion_keeps_the_contract(case: Case) -> None:
+    for c in case.backend.complete(case.asked):
+        assert c.finish_reason in ("stop", "length", "error")
+        assert (c.error is None) == (c.finish_reason != "error")
+        assert c.finish_reason == "error" or c.text, "these five are answered with some text"
+        assert c.batch_size >= 1
+        assert c.seconds is None or (c.batch_size == 1 and c.seconds > 0)
+        for tokens in (c.prompt_tokens, c.completion_tokens):
+            assert tokens is None or tokens > 0
+
+
+def test_an_engine_that_has_tokens_keeps_to_the_most_that_is_allowed(case: Case) -> None:
+    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+        if c.completion_tokens is not None:
+            assert c.completion_tokens <= r.max_tokens
+
+
+def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) -> None:
+    first = [c.text for c in case.backend.complete(case.asked)]
+    assert [c.text for c in case.backend.complete(case.asked)] == first
+    assert [case.backend.complete([r])[0].text for r in case.asked] == first
+    assert [c.text for c in case.backend.complete(case.asked[::-1])] == first[::-1]
+
+
+def test_its_identity_is_json_and_stays_the_same(case: Case) -> None:
+    identity = case.backend.identity()
+    assert json.loads(json.dumps(identity, allow_nan=False)) == identity
+    assert identity["engine"] in cards.Engine.__args__
+    case.backend.complete(case.asked[:1])
+    assert case.backend.identity() == identity

@@ -1,0 +1,29 @@
+"""What holds for every prompt version that lies in prompts/."""
+
+import pytest
+
+from harness import prompts
+from harness.dataset.load import Dataset
+
+
+@pytest.mark.parametrize("version", prompts.names())
+def test_it_renders_every_graph_of_the_dataset_the_same_each_time(version: str, small: Dataset) -> None:
+    prompt = prompts.load(version)
+    for scene in small.scenes:
+        for graph in scene.record["graphs"].values():
+            messages = prompt.render(graph, small.actions)
+            assert [m["role"] for m in messages] == ["system", "user"]
+            assert all(m["content"].strip() for m in messages)
+            assert prompt.render(graph, small.actions) == messages
+
+
+@pytest.mark.parametrize("version", prompts.names())
+def test_it_tells_every_viewer_the_actions_and_the_form_of_the_answer(version: str, small: Dataset) -> None:
+    prompt = prompts.load(version)
+    assert prompt.helper_answer in prompts.ANSWERS
+    for graph in small.scenes[0].record["graphs"].values():
+        system = prompt.render(graph, small.actions)[0]["content"]
+        form = "distribution" if graph["role"] == "ego" else prompt.helper_answer
+        assert ("action_distribution" in system) == (form == "distribution")
+        assert ("recommended_maneuver" in system) == (form == "recommendation")
+        assert all(action in system for action in small.actions)

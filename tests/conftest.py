@@ -1,0 +1,34 @@
+"""What tests share that takes seconds to make."""
+
+import fcntl
+import os
+from pathlib import Path
+
+import pytest
+
+from harness.dataset.build import build
+from harness.dataset.load import Dataset, load
+
+EPISODES, SEED = 4, 100
+
+# Before anyone imports torch: threads of several workers that wait for each other make tiny models a
+# hundred times slower.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session")
+def small_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """Folder of a real dataset of four episodes, built once, whoever of several workers comes first."""
+    base = tmp_path_factory.getbasetemp()
+    if hasattr(request.config, "workerinput"):
+        base = base.parent
+    with (base / "small.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (base / "small" / "manifest.json").is_file():
+            build(base / "small", EPISODES, SEED, 1, lambda done: None)
+    return base / "small"
+
+
+@pytest.fixture(scope="session")
+def small(small_path: Path) -> Dataset:
+    return load(small_path)

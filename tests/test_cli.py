@@ -1,0 +1,247 @@
+"""The command line as typed: bad input is one line on stderr and exit code 2, whatever it is."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+from evaluating import spec_of
+from tokenizers import Tokenizer, models
+
+from harness import cli
+from harness.cli.evaluate import default_out, parse_seeds
+from harness.dataset.load import Dataset
+from harness.errors import UserError
+
+HEAVY = (
+    "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",
+    "highway_env", "gymnasium", "shapely", "matplotlib", "rich",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Said:
+    code: int
+    out: str
+    err: str
+
+
+Harness = Callable[..., Said]
+
+
+@pytest.fixture
+def harness(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Harness:
+    """Runs a command line in an empty folder."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+    def run(*args: str | Path) -> Said:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return Said(int(ended.value.code or 0), *capsys.readouterr())
+
+    return run
+
+
+def one_line(said: Said) -> str:
+    """The one line of a refusal."""
+    assert (said.code, said.out) == (2, ""), said
+    assert said.err.startswith("harness: ")
+    assert said.err.endswith("\n")
+    line = said.err.removesuffix("\n")
+    assert line.isprintable(), said.err
+    assert os.listdir() == [], "a refusal writes nothing"
+    return line
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["eval", "--model", "proxi"], "unknown model 'proxi'; did you mean 'proxy'?"),
+        (["eval", "--model", "replay:nowhere"], "no such run directory"),
+        (["eval", "--prompt", "v22"], "unknown prompt 'v22'; did you mean 'v2'?"),
+        (["eval", "--prompt", "../prompts/v2"], "unknown prompt '../prompts/v2'"),
+        (["eval", "--condition", "5g"], "unknown operating point '5g'; known: 6g, single-local, v2x"),
+        (["eval", "--condition", "6g", "--condition", "\x1b[31m"], "unknown operating point"),
+        (["eval", "--limit", "0"], "--limit 0: give 1 or more episodes"),
+        (["eval", "--limit", "-3"], "--limit -3: give 1 or more episodes"),
+        (["eval", "--limit", "ten"], "Invalid value for '--limit'"),
+        (["eval", "--seeds", ""], "--seeds : give a range such as 0:5, or a list"),
+        (["eval", "--seeds", "5:0"], "--seeds 5:0: give a range"),
+        (["eval", "--seeds", "1,1"], "--seeds [1, 1]: give one or more different whole numbers"),
+        (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
+        (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),
+        (["eval", "--batch-size", "0"], "--batch-size 0: give 1 or more"),
+        (["eval", "--thinking"], "--thinking: proxy cannot think; leave it out"),
+        (["eval", "--device", "cuda"], "--device cuda: proxy has no weights; leave it out"),
+        (["eval", "--dtype", "int3"], "--dtype int3: proxy has no weights; leave it out"),
+        (["eval", "--modle", "proxy"], "No such option: --modle"),
+        (["eval", "extra"], "unexpected extra argument"),
+        (["evaluate"], "No such command 'evaluate'"),
+        (["--verbose"], "No such option: --verbose"),
+        (["prompt", "shwo"], "No such command 'shwo'"),
+        (["prompt", "show", "v2"], "Missing option '--scene'"),
+        (["prompt", "show", "v3", "--scene", "00000-0"], "unknown prompt 'v3'"),
+        (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
+        (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer 'v77'"),
+        (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
+        (["prompt", "lock", "v2"], "prompt v2 is released already; copy it to a new version"),
+        (["prompt", "lock", "v3"], "unknown prompt 'v3'"),
+        (["prompt", "show", "v2", "--viewer"], "Option '--viewer' requires an argument"),
+        (["model", "check"], "Missing argument 'name'"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_that_says_what_is_allowed(
+    harness: Harness, args: list[str], said: str, small_path: Path
+) -> None:
+    if args[0] == "eval":
+        args = ["eval", "--dataset", str(small_path), *args[1:]]
+    if args[:2] in (["prompt", "show"], ["prompt", "check"]):
+        args = [*args[:2], "--dataset", str(small_path), *args[2:]]
+    assert said in one_line(harness(*args))
+
+
+@pytest.fixture
+def broken(small_path: Path, tmp_path: Path) -> Path:
+    """A copy of the dataset to break."""
+    return Path(shutil.copytree(small_path, tmp_path / "broken"))
+
+
+def test_a_dataset_that_is_none_is_one_line(harness: Harness, tmp_path: Path) -> None:
+    assert "unknown dataset 'nowhere'" in one_line(harness("eval", "--dataset", "nowhere"))
+    (tmp_path / "empty").mkdir()
+    assert "is no dataset (no manifest.json)" in one_line(harness("eval", "--dataset", tmp_path / "empty"))
+
+
+@pytest.mark.parametrize("keep", [0, 1, -1, -4000])
+def test_a_truncated_dataset_is_refused(harness: Harness, broken: Path, keep: int) -> None:
+    data = (broken / "scenes.jsonl").read_bytes()
+    (broken / "scenes.jsonl").write_bytes(data[:keep])
+    line = one_line(harness("eval", "--dataset", broken))
+    assert "scenes.jsonl has changed (sha256 differs from manifest.json)" in line
+
+
+@pytest.mark.parametrize("name", ["scenes.jsonl", "scene.schema.json", "manifest.schema.json", "README.md"])
+def test_one_changed_byte_is_noticed_in_any_file(harness: Harness, broken: Path, name: str) -> None:
+    data = bytearray((broken / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (broken / name).write_bytes(data)
+    for command in (["eval"], ["prompt", "check", "v2"]):
+        assert f"{name} has changed (sha256 differs" in one_line(harness(*command, "--dataset", broken))
+
+
+def test_a_manifest_that_is_none_is_one_line(harness: Harness, broken: Path) -> None:
+    (broken / "manifest.json").write_text("{")
+    assert "manifest.json cannot be read" in one_line(harness("eval", "--dataset", broken))
+    (broken / "manifest.json").write_text('{"\\u001b[31m": 1}')
+    assert "manifest.json at $: " in one_line(harness("eval", "--dataset", broken))
+
+
+def test_a_tokenizer_that_is_none_is_one_line(harness: Harness, small_path: Path, tmp_path: Path) -> None:
+    (tmp_path / "t.gguf").write_bytes(b"GGUF")
+    args = ("eval", "--dry-run", "--dataset", small_path, "--tokenizer", tmp_path / "t.gguf")
+    assert "is no readable tokenizer" in one_line(harness(*args))
+
+
+def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, small_path: Path) -> None:
+    said = harness("eval", "--dry-run", "--dataset", small_path, "--limit", "2", "--seeds", "7,9")
+    assert (said.code, said.err, os.listdir()) == (0, "", [])
+    assert "48 requests for 12 scenes; would score 3 conditions × 2 seeds; no model was called" in said.out
+    assert "prompt tokens: not counted" in said.out
+    said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
+    told = json.loads(said.out)
+    assert (told["requests"], told["seeds"], told["limit"]) == (24, [0, 1, 2, 3, 4], None)
+    assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
+
+
+def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
+    listed = json.loads(harness("prompt", "list", "--json").out)
+    assert [p["version"] for p in listed] == ["v1", "v2"]
+    args = ("prompt", "show", "v2", "--scene", "00001-2", "--dataset", small_path)
+    shown = json.loads(harness(*args, "--json").out)
+    assert list(shown) == ["v1", "v2", "v3", "v4"]
+    assert [m["role"] for m in shown["v3"]] == ["system", "user"]
+    assert list(json.loads(harness(*args, "--viewer", "v3", "--json").out)) == ["v3"]
+    checked = json.loads(harness("prompt", "check", "v1", "--dataset", small_path, "--json").out)
+    assert checked == {"version": "v1", "budget": [200, 400], "tokens": {}, "outside": []}
+
+
+def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
+    said = harness("prompt", "list")
+    assert [line.split()[:2] for line in said.out.splitlines()] == [["v1", "released"], ["v2", "released"]]
+    assert max(map(len, said.out.splitlines())) <= 80
+    said = harness("prompt", "show", "v2", "--scene", "00001-2", "--viewer", "v1", "--dataset", small_path)
+    assert said.out.startswith("--- v1 system\nYou drive car v1")
+    said = harness("prompt", "check", "v2", "--dataset", small_path)
+    assert said.out.startswith("v2: renders for every viewer of 24 scenes; budget 200 to 400 tokens\n")
+    assert "tokens not counted" in said.out
+
+
+def test_a_prompt_outside_its_budget_ends_with_one(
+    harness: Harness, small_path: Path, tmp_path: Path
+) -> None:
+    """A tokenizer that takes a whole prompt for one word."""
+    Tokenizer(models.WordLevel({"?": 0}, unk_token="?")).save(str(tmp_path / "words.json"))
+    args = ("prompt", "check", "v2", "--dataset", small_path, "--tokenizer", tmp_path / "words.json")
+    said = harness(*args)
+    assert said.code == 1
+    assert "outside the budget: scene 00000-0 viewer v1: 2 tokens" in said.out
+    told = json.loads(harness(*args, "--json").out)
+    assert told["tokens"]["ego"] == {"n": 24, "least": 2, "mean": 2.0, "most": 2}
+    assert len(told["outside"]) == 96
+
+
+@pytest.mark.parametrize("text", ["0:5", "0,1,2,3,4"])
+def test_seeds_are_a_range_or_a_list(text: str) -> None:
+    assert parse_seeds(text) == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize(
+    "text", ["", ":", "1:", ":1", "1:1", "1.5", "0:1001", "-9:-10", "9" * 5000, "0:1:2", "1,,2"]
+)
+def test_any_other_seeds_are_refused(text: str) -> None:
+    with pytest.raises(UserError, match="--seeds"):
+        parse_seeds(text)
+
+
+def test_a_thousand_seeds_are_the_most() -> None:
+    assert len(parse_seeds("0:1000")) == 1000
+    assert len(parse_seeds("-1000:0")) == 1000
+
+
+def test_a_run_has_the_first_free_folder_and_resumes_in_the_last(
+    small: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec = spec_of(small)
+    base = Path("reports/proxy-v2-small")
+    assert default_out(spec, resume=False) == default_out(spec, resume=True) == base
+    base.mkdir(parents=True)
+    second = base.with_name("proxy-v2-small-2")
+    assert (default_out(spec, resume=False), default_out(spec, resume=True)) == (second, base)
+    second.mkdir()
+    assert default_out(spec, resume=True) == second
+    hostile = replace(spec, card=replace(spec.card, name="../../etc/\x00\n"))
+    assert default_out(hostile, resume=False).parent == Path("reports")
+    assert "/" not in default_out(hostile, resume=False).name
+
+
+@pytest.mark.parametrize("args", [["--help"], ["eval", "--help"], ["prompt", "--help"], ["model", "--help"]])
+def test_help_loads_no_heavy_package(args: list[str]) -> None:
+    code = (
+        "import sys, harness.cli as c\n"
+        f"sys.argv = ['harness', *{args!r}]\n"
+        "try:\n    c.main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.lstrip().startswith("Usage: ")
+    assert done.stderr == "[]\n"

@@ -1,0 +1,89 @@
+"""`harness eval` as typed, from the command to the report."""
+
+import json
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from harness import cli
+
+pytest.importorskip("harness.report.page", reason="needs the report")
+
+Said = tuple[int, str, str]
+
+
+@pytest.fixture
+def harness(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Said]:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args: str | Path) -> Said:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0), *capsys.readouterr()
+
+    return run
+
+
+def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, err = harness("eval", "--dataset", small_path, "--limit", "2", "--seeds", "0:2")
+    folder = Path("reports/proxy-v2-small")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    for part in ("success % [95 % CI]", "single-local", "v2x", "6g", "n = 2 episodes, 2 channel seeds"):
+        assert part in out
+    assert out.splitlines()[-1] == f"wrote {folder / 'report.html'}"
+    assert {p.name for p in folder.iterdir()} >= {
+        "run.json",
+        "rows.jsonl",
+        "episodes.csv",
+        "summary.csv",
+        "report.html",
+    }
+
+
+def test_json_is_the_manifest_and_the_summary(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, err = harness("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--json")
+    told = json.loads(out, parse_constant=pytest.fail)
+    assert (code, err) == (0, "")
+    assert told["run"] == "reports/proxy-v2-small"
+    assert told["manifest"]["prompt"]["version"] == "v2"
+    rows = {(r["condition"], r["metric"], r["interval"]): r for r in told["summary"]}
+    assert rows["single-local", "effective_loss", "episodes"]["value"] is None
+    assert rows["6g", "success_rate", "episodes"]["n"] == 1
+
+
+def test_the_same_again_is_refused_and_resumed_it_says_the_same(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
+    args = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out", "run")
+    code, first, _ = harness(*args)
+    assert code == 0
+    code, out, err = harness(*args)
+    assert (code, out) == (2, "")
+    assert err == "harness: --out run already holds a finished run; choose another folder or delete it\n"
+    code, again, err = harness(*args, "--resume")
+    assert (code, again, err) == (0, first, "")
+    code, out, err = harness(*args[:-4], "--seeds", "1", "--out", "run", "--resume")
+    assert (code, out) == (2, "")
+    assert err.startswith("harness: --resume: run was begun with another seeds; repeat its settings")
+
+
+def test_the_command_in_the_manifest_runs_it_again(
+    harness: Callable[..., Said], small_path: Path, tmp_path: Path
+) -> None:
+    harness(
+        "eval", "--dataset", small_path, "--limit", "1", "--seeds", "0,3", "--condition", "6g", "--out", "a b"
+    )
+    manifest = json.loads((tmp_path / "a b" / "run.json").read_text())
+    rows = (tmp_path / "a b" / "rows.jsonl").read_bytes()
+    (tmp_path / "a b").rename(tmp_path / "first")
+    code, _, _ = harness(*shlex.split(manifest["command"])[1:])
+    assert code == 0
+    assert (tmp_path / "a b" / "rows.jsonl").read_bytes() == rows

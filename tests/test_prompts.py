@@ -1,0 +1,308 @@
+"""Prompts: what a model is sent, word by word, and everything that can be wrong with a version."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from graphs import ACTIONS, CAR, CASES, MESSAGES, STANDING, TRUCK, graph
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from harness import prompts
+from harness.dataset.load import Dataset
+from harness.errors import UserError
+from harness.resources import folder
+from harness.tokens import counter, tokenizer
+
+GOLDEN = Path(__file__).parent / "golden"
+VERSIONS = prompts.names()
+ID = re.compile(r"\bv[1-9][0-9]?\b")
+
+
+def text_of(messages: tuple[dict[str, str], ...]) -> str:
+    return "".join(f"--- {m['role']}\n{m['content']}\n" for m in messages)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_prompt_is_the_golden_text(version: str, case: str) -> None:
+    """After a wanted change: `UPDATE_GOLDEN=1 pytest tests/test_prompts.py`, and read the difference."""
+    seen, messages = CASES[case]
+    said = text_of(prompts.load(version).render(seen, ACTIONS, messages))
+    file = GOLDEN / f"{version}-{case}.txt"
+    if os.environ.get("UPDATE_GOLDEN"):
+        file.write_text(said, encoding="utf-8")
+    assert said == file.read_text(encoding="utf-8")
+
+
+def test_every_golden_text_is_of_a_version_and_a_case() -> None:
+    assert {f.stem for f in GOLDEN.glob("*.txt")} == {f"{v}-{case}" for v in VERSIONS for case in CASES}
+
+
+# -- what is told ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_counted(version: str) -> None:
+    near = [{**CAR, "id": f"v{20 + i}", "forward_m": 1.0 + i, "left_m": 0.0} for i in range(4)]
+    prompt = prompts.load(version)
+    [_, user] = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS)
+    listed = [v for v in ("v4", "v20", "v21", "v22", "v23") if re.search(rf"^{v}\b", user["content"], re.M)]
+    assert listed == ["v4", "v20", "v21"]
+    assert re.search(r"2 (more )?farther|2 more", user["content"])
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_action_names_are_the_ones_passed_in(version: str) -> None:
+    for role in prompts.ROLES:
+        said = text_of(prompts.load(version).render(graph(role, [], []), ("LANE_LEFT", "KEEP")))
+        assert "LANE_LEFT" in said
+        assert "KEEP" in said
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_nobody_is_named_who_is_not_in_the_viewers_graph(version: str, small: Dataset) -> None:
+    prompt = prompts.load(version)
+    for scene in small.scenes:
+        present = {v.id for v in scene.state.vehicles}
+        for viewer, seen in scene.record["graphs"].items():
+            known = {viewer, seen["ego"]["id"], *(n["id"] for n in seen["nodes"])}
+            named = set(ID.findall(text_of(prompt.render(seen, small.actions))))
+            assert named <= known, f"{scene.id} {viewer}: {named - known}"
+            assert known <= present
+
+
+WORDS = "{{ graph }} {% raw %} </s> \x1b[31m \n ${x} %s {# #} \u202e \U0001f697"
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("role", prompts.ROLES)
+def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
+    node = {**TRUCK, "id": WORDS, "lane": WORDS, "type": WORDS}
+    seen = graph(role, [node], [{**STANDING, "with": WORDS}])
+    messages = ({**MESSAGES[0], "sender": WORDS, "evidence": WORDS},) if role == "ego" else ()
+    said = text_of(prompts.load(version).render(seen, ACTIONS, messages))
+    assert said.count(WORDS) >= 3
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(st.text(max_size=30), st.sampled_from(VERSIONS))
+def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
+    said = text_of(prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS))
+    assert name in said
+
+
+# -- versions that are wrong ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """A folder of versions like the harness's own, with its pins."""
+    where = tmp_path / "prompts"
+    shutil.copytree(folder("prompts"), where)
+    return where
+
+
+Edit = Callable[[str, str, str], prompts.Prompt]
+
+
+@pytest.fixture
+def draft(copied: Path) -> Edit:
+    """A draft `v9`, which is `v2` with one piece of one file replaced."""
+    shutil.copytree(copied / "v2", copied / "v9")
+
+    def edit(file: str, old: str, new: str) -> prompts.Prompt:
+        text = (copied / "v9" / file).read_text(encoding="utf-8")
+        assert old in text
+        (copied / "v9" / file).write_text(text.replace(old, new), encoding="utf-8")
+        return prompts.load("v9", copied)
+
+    return edit
+
+
+def one_line(error: pytest.ExceptionInfo[UserError]) -> str:
+    message = str(error.value)
+    assert message.isprintable(), message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("template", "said"),
+    [
+        ("{{ graph.nodse }}", "nodse"),
+        ("{{ danger }}", "'danger' is undefined"),
+        ("{{ ''.__class__.__mro__ }}", "__class__"),
+        ("{{ graph.__init__.__globals__ }}", "__init__"),
+        ("{{ actions.__class__ }}", "__class__"),
+        ("{{ graph.update({'role': 'ego'}) }}", "update"),
+        ("{% for i in range(10 ** 9) %}{% endfor %}", "Range too big"),
+        ("{% include 'released.toml' %}", "no loader"),
+        ("{% import 'os' as os %}{{ os }}", "no loader"),
+        ("{{ 1 // 0 }}", "division"),
+        ("{{ graph.nodes['first'].id }}", "first"),
+        ("{{ '%d' | format('seven') }}", "number is required"),
+        ("{{ '\x1b[31m' + 1 }}", "str"),
+    ],
+)
+def test_a_template_that_fails_or_reaches_out_is_one_line(draft: Edit, template: str, said: str) -> None:
+    prompt = draft("ego.j2", "Distribution:", template)
+    with pytest.raises(UserError) as caught:
+        prompt.render(graph("ego", [CAR], []), ACTIONS)
+    message = one_line(caught)
+    assert message.startswith("prompt v9 ego.j2 does not render: ")
+    assert said in message
+    assert "may use graph, actions, objects, more, messages" in message
+
+
+@pytest.mark.parametrize("template", ["{% import os %}", "{{ graph.", "{% if %}", "{% endblock %}"])
+def test_a_template_that_is_no_jinja_is_one_line_with_its_number(draft: Edit, template: str) -> None:
+    prompt = draft("helper.j2", "Message to", f"{template} Message to")
+    with pytest.raises(UserError) as caught:
+        prompt.render(graph("ego", [], []), ACTIONS)
+    assert re.match(r"prompt v9 helper\.j2 line \d+ is no Jinja: ", one_line(caught))
+
+
+def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
+    prompt = draft("ego.j2", "block system", "block preamble")
+    with pytest.raises(UserError, match=r"does not render: 'system'; it needs the blocks system and user"):
+        prompt.render(graph("ego", [], []), ACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("max_objects = 3", "max_object = 3", "unknown key in prompt v9 prompt.toml 'max_object'; did you"),
+        ("max_objects = 3", 'max_objects = "3"', "max_objects is 3, wants a int"),
+        ("max_objects = 3", "max_objects = true", "max_objects is True, wants a int"),
+        ("max_objects = 3", "max_objects = 0", "0 where a whole number of 1 or more belongs"),
+        ("max_objects = 3", "", "lacks max_objects"),
+        ("max_objects = 3", "max_objects = ", "is no TOML"),
+        ("[200, 400]", "[200]", r"token_budget is [200], wants [least, most]"),
+        ("[200, 400]", "[400, 200]", r"token_budget is [400, 200], wants [least, most]"),
+        ("[200, 400]", '["200", 400]', "200 where a whole number"),
+        ("ego = 64", "ego = -64", "-64 where a whole number"),
+        ("ego = 64, ", "", "max_answer_tokens wants exactly ego and helper"),
+        ('"distribution"', '"distributions"', "did you mean 'distribution'?"),
+    ],
+)
+def test_a_prompt_toml_with_a_mistake_is_one_line(draft: Edit, old: str, new: str, said: str) -> None:
+    with pytest.raises(UserError) as caught:
+        draft("prompt.toml", old, new)
+    message = one_line(caught)
+    assert "prompt v9 prompt.toml" in message
+    assert said in message
+
+
+def test_a_missing_or_unreadable_template_is_one_line(copied: Path) -> None:
+    shutil.copytree(copied / "v2", copied / "v9")
+    (copied / "v9" / "helper.j2").write_bytes(b"\xff\xfe")
+    with pytest.raises(UserError, match=r"helper\.j2 cannot be read"):
+        prompts.load("v9", copied)
+    (copied / "v9" / "helper.j2").unlink()
+    with pytest.raises(UserError, match=r"helper\.j2 cannot be read: .*No such file"):
+        prompts.load("v9", copied)
+
+
+@pytest.mark.parametrize("name", ["v22", "", ".", "..", "../prompts/v2", "v2/", "\x1b[31m", "v" * 5000])
+def test_a_version_is_a_name_and_no_path(name: str) -> None:
+    with pytest.raises(UserError, match="unknown prompt") as caught:
+        prompts.load(name)
+    assert one_line(caught).endswith(f"known: {', '.join(VERSIONS)}")
+
+
+# -- release --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", prompts.FILES)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_released_version_whose_text_changed_is_refused(version: str, file: str, copied: Path) -> None:
+    assert prompts.load(version, copied) == prompts.load(version)
+    prompts.load.cache_clear()
+    with (copied / version / file).open("a", encoding="utf-8") as f:
+        f.write("\n")
+    with pytest.raises(UserError) as caught:
+        prompts.load(version, copied)
+    assert one_line(caught).startswith(f"prompt {version} was released and its text has changed; restore it")
+
+
+def test_every_version_here_is_released() -> None:
+    assert all(prompts.load(version).released for version in VERSIONS)
+
+
+@pytest.mark.parametrize("version", ["v9", "v1.1", "über 'v'"])
+def test_a_draft_may_change_until_it_is_locked(version: str, copied: Path) -> None:
+    shutil.copytree(copied / "v2", copied / version)
+    changed = copied / version / "ego.j2"
+    assert not prompts.load(version, copied).released
+    changed.write_text(changed.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    prompts.load.cache_clear()
+
+    digest = prompts.lock(version, copied)
+    locked = prompts.load(version, copied)
+    assert (locked.released, locked.sha256) == (True, digest)
+    assert prompts.load("v1", copied).released
+    changed.write_text(changed.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    prompts.load.cache_clear()
+    with pytest.raises(UserError, match="was released and its text has changed"):
+        prompts.load(version, copied)
+
+
+def test_pins_that_cannot_be_read_are_one_line(copied: Path) -> None:
+    (copied / "released.toml").write_text("<<<<<<< HEAD\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"released\.toml is no TOML"):
+        prompts.load("v1", copied)
+
+
+# -- length ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def vocabulary() -> Path:
+    """Qwen2's tokenizer as a GGUF file, which is too large for this repository."""
+    beside = Path(__file__).parents[2] / "shared" / "tokenizer" / "qwen2-vocab-only.gguf"
+    found = Path(os.environ.get("SWARMDRIVE_TOKENIZER") or beside)
+    if not found.is_file():
+        pytest.skip("no tokenizer: set SWARMDRIVE_TOKENIZER to a GGUF file of the Qwen2 kind")
+    return found
+
+
+# As long as a message may be asked for: twelve words, and long ones.
+LONG = tuple(
+    {**MESSAGES[0], "sender": f"v{n}", "risk": "medium", "intent": (0.33, 0.33, 0.34), "confidence": 0.34,
+     "evidence": "Speeding vehicles approaching intersection, obscured behind parked delivery truck "
+                 "conflicting trajectories imminent"}
+    for n in (12, 13, 14)
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("messages", [(), LONG], ids=["alone", "three-long-messages"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_every_prompt_keeps_its_token_budget(
+    version: str, messages: tuple[Any, ...], small: Dataset, vocabulary: Path
+) -> None:
+    prompt, count = prompts.load(version), counter(vocabulary)
+    assert count is not None
+    least, most = prompt.token_budget
+    assert (least, most) == (200, 400)
+    for scene in small.scenes:
+        for viewer, seen in scene.record["graphs"].items():
+            if messages and seen["role"] == "helper":
+                continue
+            n = count(prompt.render(seen, small.actions, messages))
+            assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_tokens_decode_to_the_prompt_and_every_digit_is_one(
+    version: str, case: str, vocabulary: Path
+) -> None:
+    qwen = tokenizer(vocabulary)
+    said = text_of(prompts.load(version).render(CASES[case][0], ACTIONS, CASES[case][1]))
+    encoded = qwen.encode(said)
+    assert qwen.decode(encoded.ids) == said
+    assert [t for t in encoded.tokens if any(c.isdigit() for c in t)] == [c for c in said if c.isdigit()]

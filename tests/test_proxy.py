@@ -1,0 +1,167 @@
+"""The proxy: what it says, and that it reads nothing but its own view."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from harness.backends.base import Request
+from harness.backends.proxy import answer, distribution
+from harness.dataset.load import Dataset
+from harness.parse import parse
+from harness.perception.graph import truth_graph
+from harness.prompts import load
+from harness.scenarios.occluded_intersection import Parameters
+from harness.trigger import entropy_nats
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+TAU_NATS = 0.7  # the paper's threshold
+
+tenths = st.floats(-60, 60).map(lambda x: round(x, 1))
+seconds = st.none() | st.floats(-5, 9).map(lambda x: round(x, 1))
+speeds = st.floats(0, 20).map(lambda x: round(x, 1))
+
+
+@st.composite
+def conflicts(draw: st.DrawFn) -> dict[str, Any]:
+    sector, route = draw(st.sampled_from([("left", "straight"), ("right", "straight"), ("oncoming", "left")]))
+    return {
+        "with": f"v{draw(st.integers(2, 99))}",
+        "sector": sector,
+        "route": route,
+        "point": {"forward_m": draw(tenths), "left_m": draw(tenths)},
+        "ego": {"arc_m": draw(tenths), "time_s": draw(seconds)},
+        "other": {"arc_m": draw(tenths), "time_s": draw(seconds), "speed_mps": draw(speeds)},
+    }
+
+
+@st.composite
+def graphs(draw: st.DrawFn, role: str | None = None) -> dict[str, Any]:
+    """Any scene graph that a dataset may hold, as far as the proxy can tell."""
+    share = st.floats(0, 1).map(lambda x: round(x, 2))
+    seen = {s: draw(share) for s in ("left", "right", "oncoming")}
+    return {
+        "viewer": "v1",
+        "role": role or draw(st.sampled_from(["ego", "helper"])),
+        "step": draw(st.integers(0, Parameters().decisions - 1)),
+        "self": {"speed_mps": draw(speeds), "lane": "approach-own", "zone_m": 40.0},
+        "ego": {
+            "id": "v1", "speed_mps": draw(speeds), "zone_m": draw(tenths), "forward_m": 0.0, "left_m": 0.0,
+            "target_speed_mps": draw(st.sampled_from([0.0, 7.0, 14.0])),
+        },
+        "nodes": [],
+        "conflicts": draw(st.lists(conflicts(), max_size=3)),
+        "sectors": [
+            {"sector": s, "seen_share": p, "occluded": p < 0.5, "by": ["b1"] if p < 1 else []}
+            for s, p in seen.items()
+        ],
+    }  # fmt: skip
+
+
+def request(graph: dict[str, Any], form: str = "distribution") -> Request:
+    return Request("s/v1", graph["role"], (), ACTIONS, 64, form, view=graph)
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(graphs())
+def test_it_gives_a_distribution_in_hundredths_that_sums_to_one(graph: dict[str, Any]) -> None:
+    p = distribution(graph, ACTIONS)
+    assert tuple(p) == ACTIONS
+    assert all(0 <= x <= 1 and round(x * 100) / 100 == x for x in p.values())
+    assert sum(round(x * 100) for x in p.values()) == 100
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(graphs(), st.sampled_from(["distribution", "recommendation"]))
+def test_every_answer_is_what_its_prompt_asks_for(graph: dict[str, Any], form: str) -> None:
+    """A prompt that asks for a distribution has JSON alone; one that asks for reasons has them first."""
+    text = answer(request(graph, form))
+    parsed = parse(text, role=graph["role"], actions=ACTIONS)
+    assert parsed.verdict == ("strict" if form == "distribution" else "recovered"), parsed.detail
+    assert [str(r) for r in parsed.repairs] == ([] if form == "distribution" else ["prose_around"])
+    assert (parsed.message is None) == (graph["role"] == "ego")
+    p = distribution(graph, ACTIONS)
+    if graph["role"] == "ego" or form == "distribution":
+        assert parsed.intent == pytest.approx(tuple(p.values()))
+    else:
+        assert parsed.message is not None
+        assert parsed.message["confidence"] == max(p.values())
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(graphs(role="ego"), st.sampled_from(["left", "right", "oncoming"]), st.floats(0, 0.45))
+def test_it_is_unsure_where_a_sector_is_hidden_and_nothing_calls_for_braking(
+    graph: dict[str, Any], sector: str, seen: float
+) -> None:
+    sectors = [
+        {**s, "seen_share": seen, "occluded": True} if s["sector"] == sector else s for s in graph["sectors"]
+    ]
+    p = np.array(list(distribution({**graph, "sectors": sectors}, ACTIONS).values()))
+    assert p[0] == 0.9 or entropy_nats(p) > TAU_NATS
+    free = {**graph, "conflicts": [], "ego": {**graph["ego"], "speed_mps": 14.0, "zone_m": 40.0}}
+    p = np.array(list(distribution({**free, "sectors": sectors}, ACTIONS).values()))
+    assert entropy_nats(p) > TAU_NATS
+
+
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
+@given(graphs(role="ego"))
+def test_it_is_sure_where_everything_is_in_sight(graph: dict[str, Any]) -> None:
+    sectors = [{**s, "seen_share": 1.0, "occluded": False} for s in graph["sectors"]]
+    p = np.array(list(distribution({**graph, "sectors": sectors}, ACTIONS).values()))
+    assert entropy_nats(p) < TAU_NATS
+
+
+def test_a_car_that_arrives_with_the_ego_makes_it_brake_and_say_so() -> None:
+    """Both 28 m and 2 s before the conflict point: keeping on means meeting."""
+    crossing = {
+        "with": "v7", "sector": "left", "route": "straight", "point": {"forward_m": 28.0, "left_m": 0.0},
+        "ego": {"arc_m": 28.0, "time_s": 2.0}, "other": {"arc_m": 28.0, "time_s": 2.0, "speed_mps": 14.0},
+    }  # fmt: skip
+    graph = {
+        "viewer": "v3", "role": "helper", "step": 2,
+        "self": {"speed_mps": 0.0, "lane": "approach-right", "zone_m": 20.0},
+        "ego": {"id": "v1", "speed_mps": 14.0, "target_speed_mps": 14.0, "zone_m": 28.0,
+                "forward_m": 10.0, "left_m": 20.0},
+        "nodes": [], "conflicts": [crossing],
+        "sectors": [{"sector": "left", "seen_share": 0.2, "occluded": True, "by": ["b1"]}],
+    }  # fmt: skip
+    assert json.loads(answer(request(graph))) == {
+        "evidence": "v7 from left 28 m before the ego's path.",
+        "risk": "high",
+        "action_distribution": {"SLOWER": 0.9, "IDLE": 0.05, "FASTER": 0.05},
+    }
+    free = json.loads(answer(request({**graph, "conflicts": []})))
+    assert free["evidence"] == "Nothing on the ego's path; hidden: left."
+    assert free["action_distribution"]["SLOWER"] < 0.5
+
+
+def test_it_reads_its_own_view_and_neither_messages_nor_truth(small: Dataset) -> None:
+    prompt = load("v2")
+    for scene in small.scenes[:6]:
+        for viewer in scene.viewers:
+            graph = scene.record["graphs"][viewer]
+            bare = Request("a", graph["role"], (), ACTIONS, 64, view=graph)
+            full = replace(
+                bare, messages=prompt.render(graph, ACTIONS), truth=truth_graph(scene.state), thinking=True
+            )
+            assert answer(bare) == answer(full)
+
+
+def test_without_a_view_it_has_nothing_to_say() -> None:
+    with pytest.raises(ValueError, match="has no view"):
+        answer(Request("s/v1", "ego", (), ACTIONS, 64))
+
+
+def test_a_quarter_of_a_sector_hidden_leaves_it_just_sure_enough() -> None:
+    """SLOWER .05 + .33/4 = .1325, the third action .10, the planned one the rest .7675: 0.697 nats."""
+    graph = {
+        "step": 0, "ego": {"speed_mps": 14.0, "target_speed_mps": 14.0, "zone_m": 60.0}, "conflicts": [],
+        "sectors": [{"sector": "left", "seen_share": 0.75, "occluded": False, "by": ["b1"]}],
+    }  # fmt: skip
+    p = distribution(graph, ACTIONS)
+    assert p == {"SLOWER": 0.13, "IDLE": 0.77, "FASTER": 0.1}
+    assert entropy_nats(np.array(list(p.values()))) == pytest.approx(0.697, abs=5e-4)

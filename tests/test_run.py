@@ -1,0 +1,427 @@
+"""`evaluate` with its real parts: twins that must agree, replay, and everything that is refused."""
+
+import shlex
+import shutil
+from dataclasses import replace
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from evaluating import FILES, decisions, figure, rows_of, run, spec_of
+
+from harness import cards, prompts
+from harness.cards import Latency
+from harness.dataset.load import Dataset, load
+from harness.drivers import DRIVERS
+from harness.errors import UserError
+from harness.frozen import driver_choices
+from harness.operating_point import POINTS, OperatingPoint
+from harness.run.spec import Spec
+
+ALL = tuple(POINTS)
+
+
+@pytest.fixture(scope="module")
+def proxy_run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "proxy"
+    run(spec_of(small), out)
+    return out
+
+
+def without_company(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows less what may differ with the batch: its size, and the seconds of an answer asked alone."""
+    for row in rows:
+        for answer in row["answers"].values():
+            del answer["batch_size"], answer["seconds"]
+    return rows
+
+
+# -- twins ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 64, 1000])
+def test_the_batch_size_changes_no_byte_of_the_proxys_run(
+    batch_size: int, proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    run(spec_of(small, batch_size=batch_size), tmp_path / "run")
+    for file in FILES:
+        assert (tmp_path / "run" / file).read_bytes() == (proxy_run / file).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real Qwen3 with random weights, whose context is too short for some prompts."""
+    if find_spec("torch") is None or find_spec("transformers") is None:
+        pytest.skip("needs the transformers extra")
+    import tiny_qwen3
+
+    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=700)
+
+
+def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
+    card = replace(
+        cards.resolve(str(tiny)), max_new_tokens=6, latency=Latency("card", 0.1, "declared: for this test")
+    )
+    points = tuple(POINTS.values())
+    return Spec(card, prompts.load("v2"), data, points, (0,), device="cpu", dtype="float32", **options)
+
+
+def test_the_batch_size_changes_no_answer_of_a_language_model(
+    tiny: Path, small_path: Path, tmp_path: Path
+) -> None:
+    data = load(small_path, limit=1)
+    runs = {}
+    for batch_size in (1, 3, 64):
+        run(tiny_spec(tiny, data, batch_size=batch_size), tmp_path / str(batch_size))
+        runs[batch_size] = without_company(rows_of(tmp_path / str(batch_size)))
+    assert runs[1] == runs[3] == runs[64]
+    answers = [a for row in runs[1] for a in row["answers"].values()]
+    assert {a["finish_reason"] for a in answers} >= {"length", "error"}
+    assert len({a["raw"] for a in answers}) > 5, "answers that are all alike would show no order"
+
+
+def test_prompts_too_long_for_the_model_are_counted_as_engine_errors(
+    tiny: Path, small_path: Path, tmp_path: Path
+) -> None:
+    data = load(small_path, limit=1)
+    done = run(tiny_spec(tiny, data), tmp_path / "run")
+    answers = [a for row in rows_of(tmp_path / "run") for a in row["answers"].values()]
+    errors = [a for a in answers if a["status"] == "engine_error"]
+    assert 0 < len(errors) < len(answers)
+    assert all(a["error"].startswith("context overflow: ") and a["intent"] is None for a in errors)
+    assert figure(done, "all", "failed_rate_ego", "answers").value == 1.0, "random weights write no JSON"
+    assert figure(done, "6g", "fallback_rate").value == 1.0
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_a_model_without_declared_latency_is_timed_alone(
+    batch_size: int, tiny: Path, small_path: Path, tmp_path: Path
+) -> None:
+    spec = tiny_spec(tiny, load(small_path, limit=1), batch_size=batch_size)
+    card = replace(spec.card, latency=Latency("measured", None, "this machine"), context_tokens=560)
+    done = run(replace(spec, card=card), tmp_path / "run")
+    latency = done.manifest["latency"]
+    assert latency["source"] == "measured"
+    rows = rows_of(tmp_path / "run")
+    found = [d["latency_ms"] for d in decisions(rows, "single-local")]
+    if batch_size == 1:
+        own = [row["answers"]["v1"]["seconds"] for row in rows]
+        typical = float(np.median([s for s in own if s is not None]))
+        assert None in own, "an answer that failed has no time of its own"
+        expected = [1000 * (typical if s is None else s) for s in own]
+        assert latency["inference_s"] is None
+    else:
+        assert latency["n"]["ego"] > 0
+        expected = [1000 * latency["inference_s"]["ego"]] * len(rows)
+    assert found == pytest.approx(expected, abs=1e-3)
+    replayed = run(spec_of(spec.dataset, f"replay:{tmp_path / 'run'}", seeds=(0,)), tmp_path / "again")
+    assert (tmp_path / "again" / "rows.jsonl").read_bytes() == (tmp_path / "run" / "rows.jsonl").read_bytes()
+    assert replayed.manifest["latency"] == latency
+
+
+# -- replay ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prompt", ["v1", "v2"])
+def test_a_replay_makes_the_rows_of_the_run_it_replays(prompt: str, small: Dataset, tmp_path: Path) -> None:
+    first = run(spec_of(small, prompt=prompt), tmp_path / "run")
+    again = run(spec_of(small, f"replay:{tmp_path / 'run'}", prompt), tmp_path / "again")
+    assert (tmp_path / "again" / "rows.jsonl").read_bytes() == (tmp_path / "run" / "rows.jsonl").read_bytes()
+    assert first.summary.drop(columns="model").equals(again.summary.drop(columns="model"))
+    assert again.manifest["identity"]["of"]["model"]["name"] == "proxy"
+
+
+def test_a_replay_is_replayed(proxy_run: Path, small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small, f"replay:{proxy_run}"), tmp_path / "a")
+    run(spec_of(small, f"replay:{tmp_path / 'a'}"), tmp_path / "b")
+    assert (tmp_path / "b" / "rows.jsonl").read_bytes() == (proxy_run / "rows.jsonl").read_bytes()
+
+
+def refused(spec: Spec, out: Path) -> str:
+    """What a run is refused with, after which nothing of it is there."""
+    before = {p: p.read_bytes() for p in out.parent.rglob("*") if p.is_file()}
+    with pytest.raises(UserError) as caught:
+        run(spec, out)
+    assert not out.exists()
+    assert {p: p.read_bytes() for p in out.parent.rglob("*") if p.is_file()} == before
+    message = str(caught.value)
+    assert message.isprintable(), message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"prompt": "v1"}, "was asked 00000-0/v1 with another prompt or dataset; replay it with that run's"),
+        ({"thinking": True}, "was run with thinking off; leave --thinking out"),
+    ],
+)
+def test_a_replay_of_other_questions_is_refused(
+    options: dict[str, Any], said: str, proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    assert said in refused(spec_of(small, f"replay:{proxy_run}", **options), tmp_path / "out")
+
+
+def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
+    proxy_run: Path, small: Dataset, small_path: Path, tmp_path: Path
+) -> None:
+    run(spec_of(load(small_path, limit=3)), tmp_path / "three")
+    said = refused(spec_of(small, f"replay:{tmp_path / 'three'}"), tmp_path / "out")
+    assert said.endswith("holds no answer for 00003-0/v1; replay a run of the same dataset and limit")
+    moved = replace(
+        small.scenes[0], record={**small.scenes[0].record, "graphs": small.scenes[1].record["graphs"]}
+    )
+    other = replace(small, scenes=(moved, *small.scenes[1:]))
+    assert "another prompt or dataset" in refused(spec_of(other, f"replay:{proxy_run}"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("rows.jsonl", None, "is no finished run: it lacks rows.jsonl or run.json"),
+        ("run.json", None, "is no finished run: it lacks rows.jsonl or run.json"),
+        ("run.json", "{}", "run.json is not of a run"),
+        ("run.json", "[", "run.json is not of a run"),
+        ("rows.jsonl", "{}\n", "rows.jsonl line 1 is not of a run"),
+        ("rows.jsonl", '{"scene": "00000-0", "answers": {}}\n[]\n', "rows.jsonl line 2 is not of a run"),
+    ],
+)
+def test_a_replay_of_something_else_is_refused(
+    file: str, content: str | None, said: str, proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    shutil.copytree(proxy_run, tmp_path / "broken")
+    if content is None:
+        (tmp_path / "broken" / file).unlink()
+    else:
+        (tmp_path / "broken" / file).write_text(content)
+    assert said in refused(spec_of(small, f"replay:{tmp_path / 'broken'}"), tmp_path / "out")
+
+
+def test_a_drivers_run_is_not_replayed_but_run_again(small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small, "local-view"), tmp_path / "driver")
+    said = refused(spec_of(small, f"replay:{tmp_path / 'driver'}"), tmp_path / "out")
+    assert said.endswith("is a run of a driver; run it again with --model local-view")
+
+
+# -- refused, and nothing written -------------------------------------------------------------------------
+
+
+def test_a_folder_in_use_is_refused_and_left_as_it_is(
+    proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("all of it")
+    file = tmp_path / "file"
+    file.write_text("x")
+    in_file = file / "run"
+    for out, said in (
+        (proxy_run, "already holds a finished run; choose another folder or delete it"),
+        (other, "exists and is no run; choose another folder"),
+        (file, "exists and is no run; choose another folder"),
+        (in_file, "cannot be made (Not a directory); choose another folder"),
+    ):
+        before = {p: p.read_bytes() for p in (*proxy_run.iterdir(), other / "thesis.tex", file)}
+        with pytest.raises(UserError) as caught:
+            run(spec_of(small), out)
+        assert str(caught.value).endswith(said)
+        assert {p: p.read_bytes() for p in before} == before
+
+
+def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    run(spec_of(small, "cruise"), tmp_path / "empty")
+    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json"}
+
+
+def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("huggingface_hub", reason="needs the transformers extra")
+    assert "no-such-model" in refused(spec_of(small, "nobody/no-such-model"), tmp_path / "out")
+    (tmp_path / "hollow").mkdir()
+    (tmp_path / "hollow" / "config.json").write_text("{}")
+    assert "has no weights" in refused(spec_of(small, str(tmp_path / "hollow")), tmp_path / "out")
+
+
+def test_a_prompt_that_does_not_render_some_scene_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
+    """The template fails at the third step only, when answers have been had."""
+    prompt = prompts.load("v2")
+    text = prompt.texts["ego"].replace("Distribution:", "{{ graph.step + (0 if graph.step < 2 else 'x') }}")
+    broken = replace(prompt, texts={**prompt.texts, "ego": text})
+    said = refused(replace(spec_of(small), prompt=broken), tmp_path / "out")
+    assert said.startswith("prompt v2 ego.j2 does not render")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"seeds": ()}, "--seeds []: give one or more different whole numbers"),
+        ({"seeds": (3, 3)}, "--seeds [3, 3]: give one or more different"),
+        ({"batch_size": 0}, "--batch-size 0: give 1 or more"),
+        ({"thinking": True}, "--thinking: proxy cannot think; leave it out"),
+        ({"device": "cuda"}, "--device cuda: proxy has no weights; leave it out"),
+        ({"dtype": "float32"}, "--dtype float32: proxy has no weights; leave it out"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(options: dict[str, Any], said: str, small: Dataset) -> None:
+    with pytest.raises(UserError) as caught:
+        spec_of(small, **options)
+    assert str(caught.value).startswith(said)
+
+
+def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to(small: Dataset) -> None:
+    card = replace(cards.load("qwen3-4b"), thinking="always")
+    assert Spec(card, prompts.load("v2"), small, (), (0,)).thinking is True
+    assert Spec(cards.load("qwen3-4b"), prompts.load("v2"), small, (), (0,)).thinking is False
+
+
+# -- conditions -------------------------------------------------------------------------------------------
+
+
+def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
+    for d in decisions(rows_of(proxy_run), "single-local"):
+        assert (d["triggered"], d["messages"], d["own_weight"]) == (False, [], 1.0)
+        assert d["latency_ms"] == 145.0
+
+
+def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
+    small: Dataset, tmp_path: Path
+) -> None:
+    losses = (0.0, 0.05, 0.3, 0.6, 1.0)
+    points = tuple(OperatingPoint(f"loss-{x}", "6g", loss=x, tau_nats=0.0) for x in losses)
+    run(spec_of(small, points=points, seeds=(0, 1, 2)), tmp_path / "run")
+    heard = []
+    for point in points:
+        by_name = [
+            {m["from"] for m in d["messages"] if m["delivered"]}
+            for d in decisions(rows_of(tmp_path / "run"), point.name)
+        ]
+        assert all(len(d["messages"]) == 3 for d in decisions(rows_of(tmp_path / "run"), point.name))
+        heard.append(by_name)
+    for clearer, worse in pairwise(heard):
+        assert all(w <= c for c, w in zip(clearer, worse, strict=True))
+    counts = [sum(map(len, by_name)) for by_name in heard]
+    assert counts[0] == 24 * 3 * 3
+    assert counts[0] > counts[1] > counts[2] > counts[3] > counts[4] == 0
+
+
+def test_a_blocked_link_stays_blocked_for_its_episode(small: Dataset, tmp_path: Path) -> None:
+    point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
+    run(spec_of(small, points=(point,), seeds=tuple(range(5))), tmp_path / "run")
+    up: dict[tuple[int, int, str], set[bool]] = {}
+    for row in rows_of(tmp_path / "run"):
+        for d in row["decisions"]:
+            for m in d["messages"]:
+                up.setdefault((row["episode"], d["seed"], m["from"]), set()).add(m["delivered"])
+    assert all(len(states) == 1 for states in up.values())
+    assert {True, False} == {state for states in up.values() for state in states}
+
+
+def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_path: Path) -> None:
+    """Asked by a proxy with v1 or v2, a helper's link is up or down alike."""
+    point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
+    links = []
+    for prompt in ("v1", "v2"):
+        run(spec_of(small, prompt=prompt, points=(point,)), tmp_path / prompt)
+        links.append(
+            [
+                [(m["from"], m["delivered"]) for m in d["messages"]]
+                for d in decisions(rows_of(tmp_path / prompt), "half")
+            ]
+        )
+    assert links[0] == links[1]
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
+    driver: str, small: Dataset, tmp_path: Path
+) -> None:
+    done = run(spec_of(small, driver), tmp_path / "run")
+    rows = rows_of(tmp_path / "run")
+    chosen = [small.actions[i] for i in driver_choices(small, driver)]
+    for condition in ALL:
+        for seed in (0, 1):
+            made = [d for d in decisions(rows, condition) if d["seed"] == seed]
+            assert [d["action"] for d in made] == chosen
+            assert all((d["messages"], d["latency_ms"]) == ([], 0.0) for d in made)
+        assert figure(done, condition, "messages_per_episode").value == 0
+    assert all(list(row["answers"]) == ["v1"] for row in rows)
+    for metric in ("success_rate", "brier", "entropy_nats"):
+        assert len({figure(done, condition, metric).value for condition in ALL}) == 1
+    assert figure(done, "6g", "success_gain_over_single-local").value == 0
+
+
+def test_the_driver_that_sees_everything_is_the_upper_reference(small: Dataset, tmp_path: Path) -> None:
+    best = run(spec_of(small, "full-view"), tmp_path / "full")
+    worst = run(spec_of(small, "brake"), tmp_path / "brake")
+    assert figure(best, "6g", "success_rate").value == 1.0
+    assert figure(worst, "6g", "success_rate").value < 1.0
+
+
+# -- the record -------------------------------------------------------------------------------------------
+
+
+def test_the_summary_can_be_made_again_from_the_rows(proxy_run: Path) -> None:
+    """Recounted with pandas, from nothing but `rows.jsonl`."""
+    rows = rows_of(proxy_run)
+    table = pd.DataFrame([
+        {"episode": r["episode"], "condition": d["condition"], "seed": d["seed"], "sent": len(d["messages"]),
+         "triggered": d["triggered"], "ms": d["latency_ms"], "missed": d["deadline_missed"],
+         "entropy": d["entropy_nats"],
+         "unsafe": not d["safe"] and any(r["safe"]), "delay": d["delay_s"] if d["safe"] else 0.0}
+        for r in rows for d in r["decisions"]
+    ])  # fmt: skip
+    episodes = table.groupby(["condition", "seed", "episode"]).agg(
+        sent=("sent", "sum"), triggered=("triggered", "mean"), ms=("ms", "mean"), missed=("missed", "mean"),
+        entropy=("entropy", "mean"), unsafe=("unsafe", "any"), delay=("delay", "sum"),
+    )  # fmt: skip
+    episodes["success"] = ~episodes.unsafe & (episodes.delay <= 1.01)
+    means = episodes.groupby("condition").mean()
+    summary = pd.read_csv(proxy_run / "summary.csv").query("interval == 'episodes'")
+    figures = summary.set_index(["condition", "metric"]).value
+    for condition in ALL:
+        for column, metric in {
+            "success": "success_rate", "sent": "messages_per_episode", "triggered": "trigger_rate",
+            "ms": "latency_proxy_ms", "missed": "deadline_miss_rate", "entropy": "entropy_nats",
+            "unsafe": "unsafe_rate",
+        }.items():  # fmt: skip
+            assert figures[condition, metric] == pytest.approx(float(means.loc[condition, column]), abs=1e-3)
+
+
+def test_the_episodes_table_agrees_with_the_rows(proxy_run: Path) -> None:
+    table = pd.read_csv(proxy_run / "episodes.csv", keep_default_na=False)
+    assert len(table) == 4 * 3 * 2
+    rows = rows_of(proxy_run)
+    for e in table.itertuples():
+        mine = [r for r in rows if r["episode"] == e.episode]
+        made = [
+            d for r in mine for d in r["decisions"] if (d["condition"], d["seed"]) == (e.condition, e.seed)
+        ]
+        assert e.messages == sum(len(d["messages"]) for d in made)
+        assert e.deadline_misses == sum(d["deadline_missed"] for d in made)
+        unsafe = [any(r["safe"]) and not d["safe"] for r, d in zip(mine, made, strict=True)]
+        assert e.success == (not any(unsafe) and e.delay_s <= 1.01)
+        assert (e.failure == "") == e.success
+        assert (e.failure in ("collision", "time_out", "off_road")) == any(unsafe)
+
+
+def test_the_manifest_says_how_to_run_it_again(small_path: Path, tmp_path: Path) -> None:
+    """Whatever the folder is called, a shell reads the command as it was meant."""
+    out = tmp_path / "a run; rm -rf $HOME 'quoted'"
+    done = run(spec_of(load(small_path, limit=2), limit=2), out)
+    words = shlex.split(done.manifest["command"])
+    assert words[:2] == ["harness", "eval"]
+    options = dict(zip(words[2::2], words[3::2], strict=True))
+    assert options["--out"] == str(out)
+    assert options["--limit"] == "2"
+    assert (done.manifest["limit"], done.manifest["dataset"]["episodes"]) == (2, 2)
+
+
+def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(small: Dataset, tmp_path: Path) -> None:
+    (tmp_path / "proxy").mkdir()
+    (tmp_path / "proxy" / "config.json").write_text("{}")
+    spec = spec_of(small, str(tmp_path / "proxy"))
+    assert f"--model {tmp_path / 'proxy'} " in spec.command(Path("out"))

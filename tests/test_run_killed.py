@@ -1,0 +1,148 @@
+"""A run killed at any moment and resumed has the bytes of one that never was."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from evaluating import FILES, run, spec_of
+
+from harness.backends.registry import open_backend
+from harness.dataset.load import Dataset
+from harness.errors import UserError
+from harness.files import alone
+from harness.run.asking import ask_all
+from harness.run.evaluate import evaluate
+
+RESULT = {*FILES, "run.json"}
+
+
+@pytest.fixture(scope="module")
+def killed(small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("killed")
+    script = Path(__file__).with_name("killed_run.py")
+    subprocess.run([sys.executable, str(script), str(small_path), str(folder)], check=True)
+    return folder
+
+
+def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(
+    killed: Path, small: Dataset
+) -> None:
+    outs = sorted(killed.glob("at-*"), key=lambda p: int(p.name[3:]))
+    assert len(outs) > 20
+    begun = [out for out in outs if not (out / "run.json").exists()]
+    assert 10 < len(begun) < len(outs), "kills before the end, and while the work is cleared away"
+    _all_become_whole(outs, killed, small)
+
+
+def test_killed_at_any_time_and_resumed_it_is_the_same_run(killed: Path, small: Dataset) -> None:
+    _all_become_whole(sorted(killed.glob("after-*")), killed, small)
+
+
+def _all_become_whole(outs: list[Path], killed: Path, small: Dataset) -> None:
+    spec = spec_of(small)
+    for out in outs:
+        done = run(spec, out, resume=True)
+        for file in FILES:
+            assert (out / file).read_bytes() == (killed / "whole" / file).read_bytes(), f"{out.name} {file}"
+        assert {p.name for p in out.iterdir()} == RESULT, out.name
+        assert done.manifest["seeds"] == [0, 1]
+
+
+def unfinished(spec, out: Path, kept: bytes) -> Path:
+    """A run whose process was killed when it had these answers."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(done: int) -> None:
+        raise Killed
+
+    with pytest.raises(Killed):
+        evaluate(spec, out, False, die)
+    (out / ".work" / "answers.jsonl").write_bytes(kept)
+    return out
+
+
+@pytest.fixture
+def answers(small: Dataset, tmp_path: Path) -> bytes:
+    """All answers of a run, as they are kept while it goes on."""
+    spec = spec_of(small)
+    ask_all(spec, open_backend(spec.card), tmp_path / "answers.jsonl", lambda done: None)
+    return (tmp_path / "answers.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize("torn", [1, 5, 300, 20_000])
+def test_a_torn_last_line_is_dropped_and_asked_again(
+    torn: int, answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    whole = tmp_path / "whole"
+    run(spec_of(small), whole)
+    out = unfinished(spec_of(small), tmp_path / "torn", answers[:-torn])
+    run(spec_of(small), out, resume=True)
+    for file in FILES:
+        assert (out / file).read_bytes() == (whole / file).read_bytes()
+
+
+def test_answers_that_are_all_there_are_not_asked_for_again(
+    answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    """One answer is altered by hand: it stays as it was kept."""
+    marked = answers.replace(b'\\"IDLE\\"', b'\\"idle\\"', 1)
+    assert marked != answers
+    out = unfinished(spec_of(small), tmp_path / "run", marked)
+    run(spec_of(small), out, resume=True)
+    assert b'\\"idle\\"' in (out / "rows.jsonl").read_bytes()
+
+
+def test_damaged_answers_are_one_line(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+    out = unfinished(spec_of(small), tmp_path / "run", b"[1\n" + answers)
+    with pytest.raises(UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"):
+        run(spec_of(small), out, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"seeds": (0, 2)}, "seeds"),
+        ({"batch_size": 3}, "batch_size"),
+        ({"prompt": "v1"}, "prompt"),
+        ({"model": "cruise"}, "model"),
+        ({"points": ()}, "conditions"),
+        ({"limit": 4}, "limit"),
+        ({"prompt": "v1", "seeds": (7,)}, "prompt, seeds"),
+    ],
+)
+@pytest.mark.parametrize("finished", [True, False])
+def test_other_settings_are_refused_by_name_and_change_nothing(
+    finished: bool, other, named: str, answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    if finished:
+        run(spec_of(small), out)
+    else:
+        unfinished(spec_of(small), out, answers[:5000])
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    with pytest.raises(UserError, match=f"was begun with another {named}; repeat its settings"):
+        run(spec_of(small, **other), out, resume=True)
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_resuming_a_finished_run_asks_and_writes_nothing(small: Dataset, tmp_path: Path) -> None:
+    first = run(spec_of(small), tmp_path / "run")
+    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()}
+    again = run(spec_of(small), tmp_path / "run", resume=True)
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()} == before
+    assert again.manifest == first.manifest
+    assert again.summary.equals(first.summary)
+
+
+def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+    out = unfinished(spec_of(small), tmp_path / "run", answers[:5000])
+    with (
+        alone(out / ".work" / "lock"),
+        pytest.raises(UserError, match=r"is being written by another process; wait for it"),
+    ):
+        run(spec_of(small), out, resume=True)
+    assert (out / ".work" / "answers.jsonl").read_bytes() == answers[:5000]
+    run(spec_of(small), out, resume=True)

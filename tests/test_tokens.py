@@ -1,0 +1,100 @@
+"""Counting tokens: the tokenizer that is given, the one beside the weights, or none and said so."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.cards import resolve
+from harness.errors import UserError
+from harness.tokens import counter, tokenizer
+
+MESSAGES = ({"role": "system", "content": "ab"}, {"role": "user", "content": "ba 17"})
+
+
+def refused(source: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        tokenizer(source)
+    message = str(caught.value)
+    assert message.isprintable(), message
+    return message
+
+
+@pytest.mark.parametrize("name", ["absent.gguf", "absent", "with\nline.json"])
+def test_no_file_is_one_line_that_says_what_to_give(name: str, tmp_path: Path) -> None:
+    message = refused(tmp_path / name)
+    assert message.startswith("no tokenizer at ")
+    assert message.endswith("give a tokenizer.json, its folder, or a GGUF file")
+
+
+def test_a_folder_without_one_is_one_line(tmp_path: Path) -> None:
+    assert refused(tmp_path).startswith("no tokenizer at ")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"[1", b"\xff\x00", b"GGUF", b"GGUF\x03\x00\x00\x00" + b"\xff" * 64]
+)
+@pytest.mark.parametrize("name", ["t.gguf", "tokenizer.json"])
+def test_a_file_that_is_something_else_is_one_line(name: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert "is no readable tokenizer: " in refused(tmp_path / name)
+
+
+def gguf(file: Path, pre: str = "qwen2", **left_out: bool) -> Path:
+    """A GGUF file with a vocabulary of bytes and one merge."""
+    from gguf import GGUFWriter
+    from tokenizers.pre_tokenizers import ByteLevel
+
+    tokens = [*sorted(ByteLevel.alphabet()), "ab", "<|im_end|>"]
+    writer = GGUFWriter(file, "qwen2")
+    writer.add_tokenizer_pre(pre)
+    writer.add_token_list(tokens)
+    writer.add_token_types([1] * (len(tokens) - 1) + [3])
+    if not left_out.get("merges"):
+        writer.add_token_merges(["a b"])
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.close()
+    return file
+
+
+def test_a_gguf_file_is_read_as_its_model_reads_it(tmp_path: Path) -> None:
+    """`a b` is merged, digits stand alone, and a special token is one."""
+    made = tokenizer(gguf(tmp_path / "tiny.gguf"))
+    assert made.encode("ab17<|im_end|>").tokens == ["ab", "1", "7", "<|im_end|>"]
+    text = 'Überholt: {"SLOWER":0.70}\n\t17 m/s 🚗'
+    assert made.decode(made.encode(text).ids) == text
+
+
+def test_a_gguf_file_of_another_kind_or_without_merges_is_one_line(tmp_path: Path) -> None:
+    message = refused(gguf(tmp_path / "llama.gguf", pre="llama-bpe"))
+    assert message.endswith("has the pre-tokeniser llama-bpe; only qwen2 can be read")
+    assert "is no readable tokenizer" in refused(gguf(tmp_path / "bare.gguf", merges=True))
+
+
+def tokenizer_json(folder: Path) -> Path:
+    from tokenizers import Tokenizer, models, pre_tokenizers
+
+    folder.mkdir()
+    made = Tokenizer(models.WordLevel({"ab": 0, "ba": 1, "17": 2, "?": 3}, unk_token="?"))
+    made.pre_tokenizer = pre_tokenizers.Whitespace()
+    made.save(str(folder / "tokenizer.json"))
+    return folder
+
+
+def test_messages_are_counted_with_a_tokenizer_json_or_its_folder(tmp_path: Path) -> None:
+    folder = tokenizer_json(tmp_path / "model")
+    for source in (folder, folder / "tokenizer.json"):
+        count = counter(source)
+        assert count is not None
+        assert count(MESSAGES) == 3
+
+
+def test_the_tokenizer_beside_the_weights_counts_where_none_is_given(tmp_path: Path) -> None:
+    folder = tokenizer_json(tmp_path / "model")
+    (folder / "config.json").write_text(json.dumps({}))
+    count: Any = counter(None, resolve(str(folder)))
+    assert count(MESSAGES) == 3
+    assert counter(None, resolve("proxy")) is None
+    assert counter(None) is None
