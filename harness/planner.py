@@ -7,6 +7,7 @@ cannot see, which is what makes occlusion cost something.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -33,7 +34,7 @@ DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
 def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
     """The planner's meta-action for a scene graph."""
     left = parameters.decisions - graph["step"]
-    sequences = list(product(actions, repeat=min(HORIZON, left)))
+    sequences = tuple(product(actions, repeat=min(HORIZON, left)))
     ego = graph["ego"]
     travelled = rollouts(sequences, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
     gap = np.full(len(sequences), np.inf)
@@ -50,10 +51,16 @@ def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Paramet
     return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
 
 
+# Every viewer of a scene is told the ego's speed, so they plan on one set of rollouts.
+@lru_cache(maxsize=64)
 def rollouts(
-    sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+    sequences: tuple[tuple[str, ...], ...],
+    speed_mps: float,
+    target_mps: float,
+    left: int,
+    parameters: Parameters,
 ) -> Array:
-    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
+    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S); read-only.
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
     present speed, IDLE keeps the target. `left` is how many decisions there still are.
@@ -78,6 +85,7 @@ def rollouts(
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[:, k] = gone
+    travelled.flags.writeable = False
     return travelled
 
 
