@@ -34,9 +34,8 @@ DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
 def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
     """The planner's meta-action for a scene graph."""
     left = parameters.decisions - graph["step"]
-    sequences = tuple(product(actions, repeat=min(HORIZON, left)))
     ego = graph["ego"]
-    travelled = rollouts(sequences, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
+    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
     gap = np.full(len(sequences), np.inf)
     for conflict in graph["conflicts"]:
         gap = np.minimum(gap, least_gap(travelled, conflict))
@@ -51,16 +50,22 @@ def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Paramet
     return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
 
 
-# Every viewer of a scene is told the ego's speed, so they plan on one set of rollouts.
+# Every viewer of a scene is told the ego's speed, so they share one set of rollouts.
 @lru_cache(maxsize=64)
+def _all_rollouts(
+    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+) -> tuple[list[tuple[str, ...]], Array]:
+    """Every sequence that is played through, and its rollout. Shared: not to be written to."""
+    sequences = list(product(actions, repeat=min(HORIZON, left)))
+    travelled = rollouts(sequences, speed_mps, target_mps, left, parameters)
+    travelled.flags.writeable = False
+    return sequences, travelled
+
+
 def rollouts(
-    sequences: tuple[tuple[str, ...], ...],
-    speed_mps: float,
-    target_mps: float,
-    left: int,
-    parameters: Parameters,
+    sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
 ) -> Array:
-    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S); read-only.
+    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
     present speed, IDLE keeps the target. `left` is how many decisions there still are.
@@ -85,7 +90,6 @@ def rollouts(
         gone = gone + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[:, k] = gone
-    travelled.flags.writeable = False
     return travelled
 
 
