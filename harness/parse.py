@@ -105,7 +105,7 @@ def parse(
         if failure.status is Status.TRUNCATED_REASONING:
             thought = text.strip()
         return Parsed(failure.status, mass=failure.mass, reasoning=thought or None, detail=failure.detail)
-    repairs = tuple(repair for repair in Repair if repair in answer.repairs)
+    repairs = tuple(repair for repair in Repair if repair in answer.repairs) if answer.repairs else ()
     return Parsed(
         Status.RECOVERED if repairs else Status.STRICT,
         repairs,

@@ -7,6 +7,7 @@ cannot see, which is what makes occlusion cost something.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -33,9 +34,8 @@ DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
 def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
     """The planner's meta-action for a scene graph."""
     left = parameters.decisions - graph["step"]
-    sequences = list(product(actions, repeat=min(HORIZON, left)))
     ego = graph["ego"]
-    travelled = rollouts(sequences, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
+    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
     gap = np.full(len(sequences), np.inf)
     for conflict in graph["conflicts"]:
         gap = np.minimum(gap, least_gap(travelled, conflict))
@@ -48,6 +48,18 @@ def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Paramet
     # Among equals the calmest: IDLE before FASTER before SLOWER, compared decision by decision.
     calm = {"IDLE": 0, "FASTER": 1, "SLOWER": 2}
     return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
+
+
+# Every viewer of a scene is told the ego's speed, so they share one set of rollouts.
+@lru_cache(maxsize=64)
+def _all_rollouts(
+    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+) -> tuple[list[tuple[str, ...]], Array]:
+    """Every sequence that is played through, and its rollout. Shared: not to be written to."""
+    sequences = list(product(actions, repeat=min(HORIZON, left)))
+    travelled = rollouts(sequences, speed_mps, target_mps, left, parameters)
+    travelled.flags.writeable = False
+    return sequences, travelled
 
 
 def rollouts(

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import StrictUndefined, Template, TemplateSyntaxError
+from jinja2.runtime import LoopContext
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from harness.errors import UserError, printable, unknown
@@ -23,6 +24,20 @@ Graph = Mapping[str, Any]
 ROLES = ("ego", "helper")
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
 ANSWERS = ("distribution", "recommendation")
+LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
+
+
+class Sandbox(ImmutableSandboxedEnvironment):
+    """What a template may do. `graph.ego` is the member of that name: no method of a mapping hides it."""
+
+    def getattr(self, obj: Any, attribute: str) -> Any:
+        """The member, or what the sandbox allows."""
+        # These are nearly all that a template reads, and plain data needs none of the sandbox's checks.
+        if type(obj) is dict and attribute in obj:
+            return obj[attribute]
+        if type(obj) is LoopContext and attribute in LOOP:
+            return getattr(obj, attribute)
+        return super().getattr(obj, attribute)
 
 
 @dataclass(frozen=True)
@@ -58,7 +73,7 @@ class Prompt:
 
     @cached_property
     def _templates(self) -> dict[str, Template]:
-        environment = ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=False)
+        environment = Sandbox(undefined=StrictUndefined, keep_trailing_newline=False)
         compiled = {}
         for role, text in self.texts.items():
             try:
@@ -91,8 +106,9 @@ class Prompt:
         }
         template = self._templates[graph["role"]]
         try:
+            shared = template.new_context(context)
             return tuple(
-                {"role": part, "content": "".join(template.blocks[part](template.new_context(context)))}
+                {"role": part, "content": "".join(template.blocks[part](shared))}
                 for part in ("system", "user")
             )
         except Exception as error:  # a template is its author's program and may fail in any way

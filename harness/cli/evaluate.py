@@ -66,12 +66,13 @@ def evaluate(
 
 def _run(spec: "Spec", out: Path, resume: bool, as_json: bool) -> None:
     from harness.cli.progress import bar
-    from harness.report.page import write_report
     from harness.run.asking import request_count
     from harness.run.evaluate import evaluate as evaluate_run
 
     with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
         done = evaluate_run(spec, out, resume, progress)
+    from harness.report.page import write_report  # draws with matplotlib, which no answer waits for
+
     page = write_report(out)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from harness.dataset.verify import file_problems, read_manifest, records
 from harness.errors import UserError, printable, unknown
+from harness.memory import uncollected
 from harness.resources import folder
 from harness.scene import WorldState
 
@@ -104,6 +105,7 @@ def find(name: str) -> Path:
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
 
 
+@uncollected()
 def load(path: Path, limit: int | None = None) -> Dataset:
     """Read and verify a dataset; with `limit`, keep its first episodes only.
 

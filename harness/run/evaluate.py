@@ -7,20 +7,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from harness.backends.registry import open_backend
 from harness.errors import UserError, printable
 from harness.files import alone, canonical_json, digest, write_whole
+from harness.memory import uncollected
 from harness.run import record
-from harness.run.asking import ask_all
+from harness.run.asking import Answer, ask_all
 from harness.run.intents import intents
-from harness.run.scoring import allowance_s, score, table
+from harness.run.scoring import allowance_s, draw, score, table
 from harness.run.spec import FORMAT, Spec, versions
 from harness.run.summary import summary
 from harness.run.timing import inference_s, measure
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 WORK = ".work"
 CONFIG = "config.json"  # what the run was begun with; its work counts only once this is there
@@ -32,7 +34,7 @@ class Evaluated:
 
     out: Path
     manifest: dict[str, Any]
-    summary: pd.DataFrame
+    summary: "pd.DataFrame"
 
 
 def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None]) -> Evaluated:
@@ -55,34 +57,46 @@ def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None
     with _begun(spec, out, identity) as work:
         latency = measure(spec, backend, work / "latency.json")
         by_id = ask_all(spec, backend, work / "answers.jsonl", progress)
-
-        known, laid = intents(spec, by_id), table(spec)
-        seconds = inference_s(latency, known.answers)
-        runs = [
-            score(spec, laid, known, seconds, point, seed) for point in spec.points for seed in spec.seeds
-        ]
-        result = summary(spec, laid, known, runs)
-        manifest = {
-            "format": FORMAT,
-            "name": out.name,
-            "created": json.loads((work / CONFIG).read_text())["created"],
-            "command": spec.command(out),
-            **spec.settings(),
-            "identity": identity,
-            "latency": latency,
-            "delay_allowance_s": allowance_s(spec),
-            "versions": versions(),
-        }
-        manifest["dataset"]["path"] = str(spec.dataset.path)
-        write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs)))
-        write_whole(out / "episodes.csv", record.episodes(spec, laid, runs).to_csv(index=False))
-        write_whole(out / "summary.csv", result.to_csv(index=False))
-        write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+        created = json.loads((work / CONFIG).read_text())["created"]
+        done = _scored(spec, out, by_id, {"created": created, "identity": identity, "latency": latency})
     _tidy(out)
+    return done
+
+
+@uncollected()
+def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, Any]) -> Evaluated:
+    """Score the answers and write the run's files; `begun` is what its manifest says of its beginning."""
+    known, laid = intents(spec, by_id), table(spec)
+    seconds = inference_s(begun["latency"], known.answers)
+    drawn = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
+    runs = [
+        score(spec, laid, known, seconds, point, seed, drawn[seed])
+        for point in spec.points
+        for seed in spec.seeds
+    ]
+    result = summary(spec, laid, known, runs)
+    manifest = {
+        "format": FORMAT,
+        "name": out.name,
+        "created": begun["created"],
+        "command": spec.command(out),
+        **spec.settings(),
+        "identity": begun["identity"],
+        "latency": begun["latency"],
+        "delay_allowance_s": allowance_s(spec),
+        "versions": versions(),
+    }
+    manifest["dataset"]["path"] = str(spec.dataset.path)
+    write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs)))
+    write_whole(out / "episodes.csv", record.episodes(spec, laid, runs).to_csv(index=False))
+    write_whole(out / "summary.csv", result.to_csv(index=False))
+    write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     return Evaluated(out, manifest, result)
 
 
 def _finished(spec: Spec, out: Path) -> Evaluated:
+    import pandas as pd
+
     try:
         manifest = json.loads((out / "run.json").read_text())
         _same(spec.settings(), manifest, out)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import Bools, Floats
-from harness.dataset.load import Scene
 from harness.files import canonical_json
 from harness.parse import Parsed, parse
 from harness.run.asking import Answer
@@ -51,16 +50,18 @@ def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
     distance, reach = np.full((len(scenes), width), np.nan), np.full((len(scenes), width - 1), np.nan)
     bits = np.zeros((len(scenes), width - 1))
     for i, scene in enumerate(scenes):
-        ego = scene.state.ego
+        at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
         for j, viewer in enumerate(scene.viewers):
             distance[i, j] = scene.record["distance_m"][viewer]
             said = parsed[i][j]
             if said and said.intent is not None:
                 p[i, j] = said.intent
-            if j:
-                v = scene.state.vehicle(viewer)
-                reach[i, j - 1] = np.hypot(v.x_m - ego.x_m, v.y_m - ego.y_m)
-                bits[i, j - 1] = payload_bits(scene, viewer, said) if said else 0
+            if j == 0:
+                ego_x_m, ego_y_m = at[viewer]
+            else:
+                x_m, y_m = at[viewer]
+                reach[i, j - 1] = np.hypot(x_m - ego_x_m, y_m - ego_y_m)
+                bits[i, j - 1] = payload_bits(viewer, at[viewer], said) if said else 0
     valid = ~np.isnan(p[:, 1:]).any(axis=-1)
     return Intents(answers, parsed, p[:, 0], p[:, 1:], valid, distance, reach, bits)
 
@@ -76,12 +77,11 @@ def _parsed(spec: Spec, answer: Answer, role: str) -> Parsed:
     )
 
 
-def payload_bits(scene: Scene, viewer: str, said: Parsed) -> int:
+def payload_bits(viewer: str, xy_m: tuple[float, float], said: Parsed) -> int:
     """Size of the message a helper sends: its id, position, intent, evidence and risk, as compact JSON."""
-    v = scene.state.vehicle(viewer)
     message = {
         "from": viewer,
-        "xy_m": [round(v.x_m, 1), round(v.y_m, 1)],
+        "xy_m": [round(x, 1) for x in xy_m],
         "intent": said.intent and [round(x, 2) for x in said.intent],
         "says": said.message,
     }

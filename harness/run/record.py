@@ -1,12 +1,11 @@
 """The record of a run: a row a decision with every raw text, and a row an episode."""
 
+import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
-from harness.dataset.load import Scene
 from harness.files import canonical_json
 from harness.metrics import known_mean
 from harness.parse import Parsed
@@ -15,11 +14,16 @@ from harness.run.intents import Intents
 from harness.run.scoring import Scored, Table
 from harness.run.spec import Spec
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def rows(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> Iterator[str]:
     """Lines of `rows.jsonl`: a decision point, its answers, and what each condition and seed made of it."""
-    tables = [_decisions(run, spec.dataset.scenes, spec.dataset.actions) for run in runs]
-    for i, scene in enumerate(spec.dataset.scenes):
+    scenes = spec.dataset.scenes
+    helpers = [scene.viewers[1:] for scene in scenes]
+    tables = [_decisions(run, helpers, spec.dataset.actions) for run in runs]
+    for i, (scene, *made) in enumerate(zip(scenes, *tables, strict=True)):
         yield canonical_json({
             "scene": scene.id,
             "episode": scene.record["episode"],
@@ -33,7 +37,7 @@ def rows(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> Ite
             },
             "safe": laid.safe[i].tolist(),
             "delay_s": [_number(d) for d in laid.delay_s[i].tolist()],
-            "decisions": [table[i] for table in tables],
+            "decisions": made,
         }) + "\n"  # fmt: skip
 
 
@@ -51,37 +55,45 @@ def _answer(answer: Answer, parsed: Parsed, role: str) -> dict[str, Any]:
     }
 
 
-def _decisions(run: Scored, scenes: Sequence[Scene], actions: tuple[str, ...]) -> list[dict[str, Any]]:
+def _decisions(
+    run: Scored, helpers: Sequence[tuple[str, ...]], actions: tuple[str, ...]
+) -> Iterator[dict[str, Any]]:
     """One condition and seed, a mapping a decision."""
     c = run.coordination
     # Lists first: taking numbers out of arrays one by one is most of what a row would cost.
-    entropy, triggered, failed = c.entropy_nats.round(6).tolist(), c.triggered.tolist(), c.own_failed.tolist()
-    asked, delivered, on_time = c.asked.tolist(), c.delivered.tolist(), c.on_time.tolist()
-    arrival_ms, weights = (c.arrival_s * 1000).round(3).tolist(), c.weights.round(6).tolist()
-    fused, action = c.fused.round(6).tolist(), c.action.tolist()
-    latency_ms, missed = (c.latency_s * 1000).round(3).tolist(), c.deadline_missed.tolist()
-    timed, safe, delay_s = (~np.isnan(c.latency_s)).tolist(), run.safe.tolist(), run.delay_s.tolist()
-    made = []
-    for i, scene in enumerate(scenes):
+    replies = zip(
+        c.asked.tolist(), helpers, c.delivered.tolist(), c.on_time.tolist(),
+        (c.arrival_s * 1000).round(3).tolist(), c.weights.round(6).tolist(), strict=True,
+    )  # fmt: skip
+    decisions = zip(
+        c.entropy_nats.round(6).tolist(), c.triggered.tolist(), c.own_failed.tolist(),
+        c.fused.round(6).tolist(), c.action.tolist(), (c.latency_s * 1000).round(3).tolist(),
+        c.deadline_missed.tolist(), run.safe.tolist(), run.delay_s.tolist(), strict=True,
+    )  # fmt: skip
+    for (asked, viewers, *reply, weights), decision in zip(replies, decisions, strict=True):
+        entropy, triggered, failed, fused, action, latency_ms, missed, safe, delay_s = decision
         messages = [
             {
-                "from": viewer, "delivered": delivered[i][j], "on_time": on_time[i][j],
-                "arrival_ms": _number(arrival_ms[i][j]), "weight": weights[i][j + 1],
+                "arrival_ms": _number(arrival_ms), "delivered": delivered, "from": viewer,
+                "on_time": on_time, "weight": weight,
             }
-            for j, viewer in enumerate(scene.viewers[1:]) if asked[i][j]
-        ]  # fmt: skip
-        made.append({
-            "condition": run.point.name, "seed": run.seed, "entropy_nats": entropy[i],
-            "triggered": triggered[i], "messages": messages, "own_weight": weights[i][0],
-            "own_failed": failed[i], "fused": fused[i], "action": actions[action[i]],
-            "latency_ms": _number(latency_ms[i]), "deadline_missed": missed[i] if timed[i] else None,
-            "safe": safe[i], "delay_s": _number(delay_s[i]),
-        })  # fmt: skip
-    return made
+            for viewer, was_asked, delivered, on_time, arrival_ms, weight
+            in zip(viewers, asked, *reply, weights[1:], strict=False) if was_asked
+        ] if triggered else []  # fmt: skip
+        # Members stand in the order in which they are written, which spares sorting them.
+        yield {
+            "action": actions[action], "condition": run.point.name,
+            "deadline_missed": None if math.isnan(latency_ms) else missed, "delay_s": _number(delay_s),
+            "entropy_nats": entropy, "fused": fused, "latency_ms": _number(latency_ms),
+            "messages": messages, "own_failed": failed, "own_weight": weights[0], "safe": safe,
+            "seed": run.seed, "triggered": triggered,
+        }  # fmt: skip
 
 
-def episodes(spec: Spec, laid: Table, runs: Sequence[Scored]) -> pd.DataFrame:
+def episodes(spec: Spec, laid: Table, runs: Sequence[Scored]) -> "pd.DataFrame":
     """The table of `episodes.csv`."""
+    import pandas as pd
+
     scenes = spec.dataset.scenes
     first = [scenes[row[0]].record for row in laid.index]
     frames = []
@@ -120,4 +132,4 @@ def _failures(spec: Spec, laid: Table, run: Scored) -> list[str]:
 
 def _number(value: float) -> float | None:
     """JSON has no NaN and no infinity: unknown and never are null."""
-    return value if np.isfinite(value) else None
+    return value if math.isfinite(value) else None

@@ -80,15 +80,22 @@ def table(spec: Spec) -> Table:
 
 
 def score(
-    spec: Spec, laid: Table, known: Intents, inference_s: Floats, point: OperatingPoint, seed: int
+    spec: Spec,
+    laid: Table,
+    known: Intents,
+    inference_s: Floats,
+    point: OperatingPoint,
+    seed: int,
+    drawn: Luck,
 ) -> Scored:
     """Coordinate every decision at one operating point with one seed's luck, and look up what comes of it.
 
     `inference_s` is (n, 1+H), the ego first. Where the ego's is unknown (NaN), so is the decision's latency.
+    `drawn` is the luck of that seed, for every point the same.
     """
     result = coordinate(
         point, known.own, known.helpers, known.valid, known.distance_m, known.range_m,
-        known.payload_bits, np.nan_to_num(inference_s), draw(laid, seed, known.valid.shape),
+        known.payload_bits, np.nan_to_num(inference_s), drawn,
     )  # fmt: skip
     result = replace(result, latency_s=np.where(np.isnan(inference_s[:, 0]), np.nan, result.latency_s))
     rows = np.arange(len(result.action))

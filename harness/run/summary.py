@@ -9,16 +9,18 @@ answers the model gave.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from harness.arrays import Floats
 from harness.metrics import Estimate, episode_interval, known_mean, rate_interval, seed_interval
 from harness.run.intents import Intents
 from harness.run.scoring import Scored, Table, statuses
 from harness.run.spec import Spec
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 COLUMNS = (
     "model", "prompt", "condition", "metric", "value", "ci_low", "ci_high", "n", "n_excluded", "interval",
@@ -28,8 +30,10 @@ BASELINE = "single-local"
 YES_OR_NO = ("success_rate", "unsafe_rate", "late_rate")  # what an episode has or has not
 
 
-def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> pd.DataFrame:
+def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> "pd.DataFrame":
     """The long table of `summary.csv`."""
+    import pandas as pd
+
     rows = [
         {
             "model": spec.card.name, "prompt": spec.prompt.version, "condition": condition, "metric": metric,

@@ -1,0 +1,68 @@
+"""CPU seconds of `coordinate` for 100 000 decisions, by operating point.
+
+The limit is drawing the random numbers that such decisions need, with NumPy.
+
+    python benchmarks/coordinate.py [--decisions 100000] [--repeats 5]
+"""
+
+import argparse
+import json
+import statistics
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from harness.coordination import Luck, coordinate
+from harness.operating_point import POINTS
+
+AIM_S = 1.0
+HELPERS, ACTIONS = 3, 3
+
+
+def main() -> None:
+    """Print the medians as a table and as one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--decisions", type=int, default=100_000)
+    arguments.add_argument("--repeats", type=int, default=5)
+    given = arguments.parse_args()
+    n = given.decisions
+
+    case = scenes(np.random.default_rng(0), n)
+    found: dict[str, list[float]] = {name: [] for name in ("limit", *POINTS)}
+    for repeat in range(given.repeats):
+        generator = np.random.default_rng(repeat)
+        start = process_time()
+        luck = Luck(generator.random((n, HELPERS, 2)), generator.random((n, HELPERS)))
+        found["limit"].append(process_time() - start)
+        for name, point in POINTS.items():
+            start = process_time()
+            coordinate(point, **case, luck=luck)
+            found[name].append(process_time() - start)
+    medians = {name: statistics.median(values) for name, values in found.items()}
+    print(f"CPU seconds for {n} decisions of {HELPERS} helpers, median of {given.repeats}; aim {AIM_S}")
+    for name, median_s in medians.items():
+        print(f"  {name:<14}{median_s:8.4f}   {median_s / medians['limit']:6.1f} of the limit")
+    print(json.dumps({"decisions": n, "repeats": given.repeats, "cpu_s": medians}))
+
+
+def scenes(generator: np.random.Generator, n: int) -> dict[str, Any]:
+    """Made-up intents, distances and sizes of `n` decisions, as `coordinate` takes them.
+
+    One answer in twenty fails; half of the egos are unsure enough to ask.
+    """
+    own = generator.dirichlet(np.ones(ACTIONS), n)
+    own[generator.random(n) < 0.05] = np.nan
+    return {
+        "own": own,
+        "helpers": generator.dirichlet(np.ones(ACTIONS), (n, HELPERS)),
+        "valid": generator.random((n, HELPERS)) < 0.95,
+        "distance_m": generator.uniform(0.0, 80.0, (n, 1 + HELPERS)),
+        "range_m": generator.uniform(5.0, 120.0, (n, HELPERS)),
+        "payload_bits": generator.uniform(800.0, 2400.0, (n, HELPERS)),
+        "infer_s": generator.uniform(0.1, 0.15, (n, 1 + HELPERS)),
+    }
+
+
+if __name__ == "__main__":
+    main()

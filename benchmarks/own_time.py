@@ -1,0 +1,180 @@
+"""The harness's own CPU time for a decision: the slope of an evaluation between two sizes.
+
+A decision is a scene: one ego answer and up to three helper answers, scored under three conditions and five
+seeds. Own time is the process's CPU time less what `backend.complete` takes. Loading the dataset is apart,
+since it is done once.
+
+    python benchmarks/own_time.py [DATASET] [--sizes 1000 5000] [--repeats 3] [--prompt v2]
+"""
+
+import argparse
+import copy
+import hashlib
+import json
+import statistics
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+from typing import Any
+from unittest.mock import patch
+
+from harness import cards, prompts
+from harness.backends.proxy import Proxy
+from harness.dataset import load
+from harness.files import canonical_json
+from harness.operating_point import POINTS
+from harness.prompts import Prompt
+from harness.run import asking, evaluate, intents, record
+from harness.run.spec import Spec
+
+AIM_MS = 0.3
+# Functions whose time makes up a part; `complete` is the backend's own and no part of the harness.
+PARTS: dict[str, list[tuple[Any, str]]] = {
+    "proxy": [(Proxy, "complete")],
+    "prompt": [(Prompt, "render")],
+    "parse": [(intents, "parse")],
+    "coordinate": [(evaluate, "score")],
+    "record": [(asking, "_answer"), (asking, "canonical_json"), (record, "rows"), (record, "episodes"),
+               (evaluate, "summary"), (evaluate, "write_whole")],
+}  # fmt: skip
+LIMIT = "limit"
+
+
+def main() -> None:
+    """Print the slopes as a table and as one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("dataset", nargs="?", default=load.DEFAULT)
+    arguments.add_argument("--sizes", nargs=2, type=int, default=[1000, 5000])
+    arguments.add_argument("--repeats", type=int, default=3)
+    arguments.add_argument("--prompt", default="v2")
+    given = arguments.parse_args()
+
+    load.load(load.find(given.dataset), limit=1)  # pays for imports
+    start = process_time()
+    dataset = load.load(load.find(given.dataset))
+    loading_ms = (process_time() - start) * 1000 / len(dataset.scenes)
+    specs = [
+        Spec(cards.resolve("proxy"), prompts.load(given.prompt), replicated(dataset, size),
+             tuple(POINTS.values()), tuple(range(5)))
+        for size in given.sizes
+    ]  # fmt: skip
+    run(specs[0], ["proxy"])  # pays for imports and compiled templates
+    requests = asking.request_count(specs[1]) / len(specs[1].dataset.scenes)
+    # Clocks around every call take time too, so the total comes from runs with the proxy's alone.
+    total = slopes(specs, ["proxy"], given.repeats)
+    parts = slopes(specs, list(PARTS), given.repeats)
+    own_ms = total["own"]
+    shown = {part: parts[part] for part in (*PARTS, "other") if part != "proxy"}
+    result = {
+        "sizes": given.sizes, "repeats": given.repeats, "requests_per_decision": round(requests, 3),
+        "own_ms": own_ms, "own_ms_per_request": own_ms / requests, "limit_ms": total[LIMIT],
+        "own_over_limit": own_ms / total[LIMIT], "proxy_ms": total["proxy"], "parts_ms": shown,
+        "loading_ms": loading_ms,
+    }  # fmt: skip
+    small, large = given.sizes
+    print(f"CPU ms a decision, slope {small} to {large}, median of {given.repeats}; parts with their clocks")
+    for part, ms in shown.items():
+        print(f"  {part:<12}{ms:8.3f}")
+    print(f"own           {own_ms:8.3f}   aim {AIM_MS}; {own_ms / requests:.3f} a request")
+    print(f"limit         {total[LIMIT]:8.3f}   own is {own_ms / total[LIMIT]:.2f} of it")
+    print(f"proxy         {total['proxy']:8.3f}")
+    print(f"loading       {loading_ms:8.3f}")
+    print(json.dumps(result))
+
+
+def replicated(dataset: load.Dataset, size: int) -> load.Dataset:
+    """The first `size` decisions of the dataset repeated, each repeat with other episodes and prompts.
+
+    The ego's distance to the zone, which every prompt states, differs by a decimetre a repeat, so that no
+    cache can profit from one.
+    """
+    episodes = 1 + max(scene.record["episode"] for scene in dataset.scenes)
+    scenes = []
+    for number in range(size):
+        again, position = divmod(number, len(dataset.scenes))
+        record_ = copy.deepcopy(dataset.scenes[position].record)
+        record_["episode"] += again * episodes
+        record_["episode_seed"] += again * episodes
+        record_["scene"] = f"{record_['episode']:05}-{record_['step']}"
+        for graph in record_["graphs"].values():
+            graph["ego"]["zone_m"] = round(graph["ego"]["zone_m"] + again / 10, 1)
+        scenes.append(load.Scene(record_))
+    return replace(dataset, scenes=tuple(scenes))
+
+
+def slopes(specs: list[Spec], parts: list[str], repeats: int) -> dict[str, float]:
+    """Milliseconds a decision more costs, by part: median over repeats of the slope between two sizes."""
+    found: dict[str, list[float]] = {}
+    for _ in range(repeats):
+        small, large = (run(spec, parts) for spec in specs)
+        more = len(specs[1].dataset.scenes) - len(specs[0].dataset.scenes)
+        for part in large:
+            found.setdefault(part, []).append((large[part] - small[part]) * 1000 / more)
+    return {part: statistics.median(values) for part, values in found.items()}
+
+
+def run(spec: Spec, parts: list[str]) -> dict[str, float]:
+    """CPU seconds of one evaluation: its parts, all its own time, and the limit for its record."""
+    fresh = replace(spec, dataset=replace(spec.dataset, scenes=tuple(map(again, spec.dataset.scenes))))
+    with tempfile.TemporaryDirectory() as folder:
+        spent: Counter[str] = Counter()
+        with ExitStack() as clocks:
+            for part in parts:
+                for owner, name in PARTS[part]:
+                    clocks.enter_context(clocked(owner, name, spent, part))
+            start = process_time()
+            out = evaluate.evaluate(fresh, Path(folder) / "run", False, lambda done: None).out
+            whole = process_time() - start
+        own = whole - spent["proxy"]
+        other = whole - sum(spent.values())
+        limit = limit_s(fresh, (out / "rows.jsonl").read_text().splitlines())
+    return {**spent, "other": other, "own": own, LIMIT: limit}
+
+
+def again(scene: load.Scene) -> load.Scene:
+    """The same scene with nothing remembered from another run."""
+    return load.Scene(scene.record)
+
+
+def limit_s(spec: Spec, rows: list[str]) -> float:
+    """CPU seconds of what no harness with this record can leave out, done with the standard library alone.
+
+    Every prompt hashed, every answer decoded as JSON, every row encoded as JSON; rendering, scoring and
+    bookkeeping for nothing.
+    """
+    messages = [request.messages for request in asking.requests(spec, spec.dataset.scenes)]
+    decoded = [json.loads(row) for row in rows]
+    start = process_time()
+    for message in messages:
+        hashlib.sha256(canonical_json(message).encode()).hexdigest()
+    for row in decoded:
+        for answer in row["answers"].values():
+            json.loads(answer["raw"][answer["raw"].index("{") :])
+    for row in decoded:
+        canonical_json(row)
+    return process_time() - start
+
+
+@contextmanager
+def clocked(owner: Any, name: str, spent: Counter[str], part: str) -> Iterator[None]:
+    """While open, the CPU time of calls of `owner.name` goes to a part. A generator is run out at once."""
+    function: Callable[..., Any] = getattr(owner, name)
+
+    def timed(*args: Any, **kwargs: Any) -> Any:
+        start = process_time()
+        result = function(*args, **kwargs)
+        if isinstance(result, Iterator):
+            result = iter(list(result))
+        spent[part] += process_time() - start
+        return result
+
+    with patch.object(owner, name, timed):
+        yield
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""CPU seconds from the start of a process to the first `complete`, and for `harness --help`.
+
+    python benchmarks/startup.py [DATASET] [--repeats 5]
+
+The limit is what a process with these libraries cannot do without: the interpreter, and imports of NumPy,
+Jinja2 and typer.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from harness.dataset import load
+
+AIMS_S = {"help": 0.15, "first_call": 0.7}
+
+# Each ends by printing the CPU seconds of its own process; CPU time starts with the process.
+HELP = """
+import sys, time
+from harness.cli import main
+sys.argv = ["harness", "--help"]
+try:
+    main()
+finally:
+    print(time.process_time())
+"""
+FIRST_CALL = """
+import os, sys, time
+from harness.backends.proxy import Proxy
+from harness.cli import main
+
+def complete(self, requests):
+    print(time.process_time(), flush=True)
+    os._exit(0)
+
+Proxy.complete = complete
+sys.argv = ["harness", "eval", "--model", "proxy", *sys.argv[1:]]
+main()
+"""
+LIMIT = "import time, numpy, jinja2.sandbox, typer; print(time.process_time())"
+
+
+def main() -> None:
+    """Print the medians as a table and as one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("dataset", nargs="?", default=load.DEFAULT)
+    arguments.add_argument("--repeats", type=int, default=5)
+    given = arguments.parse_args()
+    dataset = str(load.find(given.dataset).resolve())
+
+    found: dict[str, list[float]] = {"help": [], "first_call": [], "first_call_one_episode": [], "limit": []}
+    for _ in range(given.repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            run, short = (
+                ["--dataset", dataset, "--out", str(Path(folder) / name), *options]
+                for name, options in (("all", []), ("one", ["--limit", "1"]))
+            )
+            found["help"].append(cpu_s(HELP))
+            found["first_call"].append(cpu_s(FIRST_CALL, *run))
+            found["first_call_one_episode"].append(cpu_s(FIRST_CALL, *short))
+            found["limit"].append(cpu_s(LIMIT))
+    medians = {name: statistics.median(values) for name, values in found.items()}
+    for name, median_s in medians.items():
+        aim = f"   aim {AIMS_S[name]}" if name in AIMS_S else ""
+        print(f"{name:<24}{median_s:7.3f} s{aim}")
+    ratio = medians["first_call"] / medians["limit"]
+    print(f"to the first call is {ratio:.2f} of the limit; medians of {given.repeats}")
+    print(json.dumps({**medians, "first_call_over_limit": ratio, "repeats": given.repeats}))
+
+
+def cpu_s(program: str, *arguments: str) -> float:
+    """What a program prints last, run in a new process."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True
+    )
+    return float(done.stdout.splitlines()[-1])
+
+
+if __name__ == "__main__":
+    main()

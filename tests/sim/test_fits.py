@@ -1,0 +1,77 @@
+"""The quick yes to a record is never a yes that JSON Schema would not give."""
+
+import copy
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from harness.dataset.fits import compiled, fits_record
+from harness.dataset.load import Dataset
+from harness.dataset.schema import record_validator
+
+LEAF = (
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.sampled_from(["v1", "left"])
+)
+ANY_JSON = st.recursive(
+    LEAF,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["id", "v1", "x"]), inner),
+    max_leaves=6,
+)  # fmt: skip
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The path of every member and item, however deep."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [p for key, inner in pairs for p in ((*path, key), *places(inner, (*path, key)))]
+
+
+def test_it_says_yes_to_every_frozen_record(small: Dataset):
+    assert all(map(fits_record(small.actions), (scene.record for scene in small.scenes)))
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_where_it_says_yes_to_a_changed_record_so_does_json_schema(small: Dataset, data: st.DataObject):
+    record = copy.deepcopy(data.draw(st.sampled_from(small.scenes)).record)
+    *way, last = data.draw(st.sampled_from(places(record)))
+    holder = record
+    for key in way:
+        holder = holder[key]
+    change = data.draw(st.sampled_from(["value", "missing", "extra"]))
+    if change == "missing":
+        del holder[last]
+    elif change == "extra" and isinstance(holder, dict):
+        holder["unknown"] = data.draw(ANY_JSON)
+    else:
+        holder[last] = data.draw(ANY_JSON)
+    if fits_record(small.actions)(record):
+        assert record_validator(small.actions).is_valid(record)
+
+
+@pytest.mark.parametrize(
+    ("schema", "good", "bad"),
+    [
+        ({"type": "integer", "minimum": 0}, 0, -1),
+        ({"type": "integer"}, 1, True),
+        ({"type": ["number", "null"], "maximum": 1}, None, 2.5),
+        ({"enum": ["left", None]}, None, False),
+        ({"type": "string", "pattern": "^v[1-9]$"}, "v1", "v0"),
+        ({"type": "array", "items": {"type": "string"}, "minItems": 1}, ["a"], []),
+        ({"anyOf": [{"type": "null"}, {"type": "string"}]}, None, 1),
+        ({"type": "object", "propertyNames": {"pattern": "^v"}, "additionalProperties": {"type": "number"}},
+         {"v1": 1.5}, {"v1": "1.5"}),
+        ({"type": "object", "properties": {"a": {}}, "required": ["a"], "additionalProperties": False},
+         {"a": 1}, {"a": 1, "b": 2}),
+        ({"type": "object", "properties": {"a": {}}, "required": ["a"]}, {"a": 1, "b": 2}, {"b": 2}),
+    ],
+)  # fmt: skip
+def test_each_keyword_means_what_it_means_in_json_schema(schema, good, bad):
+    assert compiled(schema)(good)
+    assert not compiled(schema)(bad)
+
+
+def test_a_keyword_that_it_does_not_know_is_an_error():
+    with pytest.raises(KeyError, match="uniqueItems"):
+        compiled({"type": "array", "uniqueItems": True})
