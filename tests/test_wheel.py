@@ -32,7 +32,9 @@ def harness(installed: Path, cwd: Path, *arguments: str) -> subprocess.Completed
 
 
 @pytest.mark.slow
-def test_an_installed_wheel_evaluates_and_reports_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
+def test_an_installed_wheel_evaluates_and_reports_outside_the_checkout(
+    installed: Path, tmp_path: Path
+) -> None:
     done = harness(installed, tmp_path, "eval", "--limit", "2", "--json")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)

@@ -1,5 +1,6 @@
 """JSON Schemas of a frozen dataset: published beside it, enforced when it is built and checked."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
@@ -165,3 +166,23 @@ def record_validator(actions: tuple[str, ...]) -> Any:
     whole = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     strict: Any = extend(Draft202012Validator, type_checker=whole)  # type: ignore[no-untyped-call]
     return strict(record_schema(actions))
+
+
+@lru_cache(maxsize=8)
+def fits_record(actions: tuple[str, ...]) -> Callable[[Any], bool]:
+    """A quick yes to valid records, compiled by fastjsonschema, some ten times as fast as jsonschema.
+
+    What it says no to, jsonschema looks at: that decides, and says what is wrong and where.
+    """
+    from fastjsonschema import JsonSchemaValueException, compile
+
+    validate = compile(record_schema(actions), use_default=False)
+
+    def fits(record: Any) -> bool:
+        try:
+            validate(record)
+        except JsonSchemaValueException:
+            return False
+        return True
+
+    return fits

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness.dataset.fits import fits_record
-from harness.dataset.schema import manifest_schema, record_validator
+from harness.dataset.schema import fits_record, manifest_schema, record_validator
 from harness.errors import UserError, printable
 from harness.files import sha256_bytes, sha256_file
 from harness.road import crossings

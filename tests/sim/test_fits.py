@@ -3,13 +3,11 @@
 import copy
 from typing import Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.dataset.fits import compiled, fits_record
 from harness.dataset.load import Dataset
-from harness.dataset.schema import record_validator
+from harness.dataset.schema import fits_record, record_validator
 
 LEAF = (
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.sampled_from(["v1", "left"])
@@ -48,30 +46,3 @@ def test_where_it_says_yes_to_a_changed_record_so_does_json_schema(small: Datase
         holder[last] = data.draw(ANY_JSON)
     if fits_record(small.actions)(record):
         assert record_validator(small.actions).is_valid(record)
-
-
-@pytest.mark.parametrize(
-    ("schema", "good", "bad"),
-    [
-        ({"type": "integer", "minimum": 0}, 0, -1),
-        ({"type": "integer"}, 1, True),
-        ({"type": ["number", "null"], "maximum": 1}, None, 2.5),
-        ({"enum": ["left", None]}, None, False),
-        ({"type": "string", "pattern": "^v[1-9]$"}, "v1", "v0"),
-        ({"type": "array", "items": {"type": "string"}, "minItems": 1}, ["a"], []),
-        ({"anyOf": [{"type": "null"}, {"type": "string"}]}, None, 1),
-        ({"type": "object", "propertyNames": {"pattern": "^v"}, "additionalProperties": {"type": "number"}},
-         {"v1": 1.5}, {"v1": "1.5"}),
-        ({"type": "object", "properties": {"a": {}}, "required": ["a"], "additionalProperties": False},
-         {"a": 1}, {"a": 1, "b": 2}),
-        ({"type": "object", "properties": {"a": {}}, "required": ["a"]}, {"a": 1, "b": 2}, {"b": 2}),
-    ],
-)  # fmt: skip
-def test_each_keyword_means_what_it_means_in_json_schema(schema, good, bad):
-    assert compiled(schema)(good)
-    assert not compiled(schema)(bad)
-
-
-def test_a_keyword_that_it_does_not_know_is_an_error():
-    with pytest.raises(KeyError, match="uniqueItems"):
-        compiled({"type": "array", "uniqueItems": True})
