@@ -125,7 +125,7 @@ def test_a_truncated_dataset_is_refused(harness: Harness, broken: Path, keep: in
     data = (broken / "scenes.jsonl").read_bytes()
     (broken / "scenes.jsonl").write_bytes(data[:keep])
     line = one_line(harness("eval", "--dataset", broken))
-    assert "scenes.jsonl has changed (sha256 differs from manifest.json)" in line
+    assert "scenes.jsonl: changed, its sha256 is not the manifest's" in line
 
 
 @pytest.mark.parametrize("name", ["scenes.jsonl", "scene.schema.json", "manifest.schema.json", "README.md"])
@@ -134,7 +134,9 @@ def test_one_changed_byte_is_noticed_in_any_file(harness: Harness, broken: Path,
     data[len(data) // 2] ^= 1
     (broken / name).write_bytes(data)
     for command in (["eval"], ["prompt", "check", "v2"]):
-        assert f"{name} has changed (sha256 differs" in one_line(harness(*command, "--dataset", broken))
+        assert f"{name}: changed, its sha256 is not the manifest's" in one_line(
+            harness(*command, "--dataset", broken)
+        )
 
 
 def test_a_manifest_that_is_none_is_one_line(harness: Harness, broken: Path) -> None:

@@ -10,8 +10,6 @@ import pytest
 
 from harness import cli
 
-pytest.importorskip("harness.report.page", reason="needs the report")
-
 Said = tuple[int, str, str]
 
 
@@ -36,7 +34,7 @@ def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said],
     folder = Path("reports/proxy-v2-small")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    for part in ("success % [95 % CI]", "single-local", "v2x", "6g", "n = 2 episodes, 2 channel seeds"):
+    for part in ("success % [95 % CI]", "single-local", "v2x", "6g", "n = 2 episodes × 2 channel seeds"):
         assert part in out
     assert out.splitlines()[-1] == f"wrote {folder / 'report.html'}"
     assert {p.name for p in folder.iterdir()} >= {

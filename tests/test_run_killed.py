@@ -11,7 +11,7 @@ from harness.backends.registry import open_backend
 from harness.dataset.load import Dataset
 from harness.errors import UserError
 from harness.files import alone
-from harness.run.asking import ask_all
+from harness.run.asking import ask_all, read_kept
 from harness.run.evaluate import evaluate
 
 RESULT = {*FILES, "run.json"}
@@ -82,6 +82,15 @@ def test_a_torn_last_line_is_dropped_and_asked_again(
     run(spec_of(small), out, resume=True)
     for file in FILES:
         assert (out / file).read_bytes() == (whole / file).read_bytes()
+
+
+def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+    """Killed twice: the answers of the second try stand on lines of their own."""
+    kept, spec = tmp_path / "answers.jsonl", spec_of(small)
+    kept.write_bytes(answers[:5000])
+    again = ask_all(spec, open_backend(spec.card), kept, lambda done: None)
+    assert read_kept(kept) == again
+    assert len(again) == 4 * 24
 
 
 def test_answers_that_are_all_there_are_not_asked_for_again(

@@ -99,7 +99,7 @@ def find(name: str) -> Path:
     """Folder of a dataset given by path or by the name of a shipped one."""
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         return Path(name)
-    known = [p.name for p in folder("datasets").iterdir() if (p / "manifest.json").is_file()]
+    known = [manifest.parent.name for manifest in folder("datasets").glob("*/manifest.json")]
     if name in known:
         return folder("datasets") / name
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
