@@ -14,9 +14,7 @@ from sample_run import write_run
 from typer.testing import CliRunner
 
 from harness.cli.report import command
-from harness.dataset.load import load
 from harness.errors import UserError
-from harness.files import sha256_file
 from harness.report.folder import Score, read
 from harness.report.page import visible, write_report
 from harness.report.words import headline, latency_source
@@ -130,23 +128,15 @@ PAYLOADS = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "{{ 7
 
 
 def test_nothing_that_a_model_a_prompt_or_a_file_says_becomes_markup(dataset, tmp_path, page):
-    """Payloads in completions, messages, the model's name, a scene's id and the prompts stay text."""
+    """Payloads in completions, messages, the model's name and the prompts stay text."""
     payload = "".join(PAYLOADS)
-    hostile = tmp_path / "data"
-    shutil.copytree(dataset.path, hostile)
-    lines = [json.loads(line) for line in (hostile / "scenes.jsonl").read_text().splitlines()]
-    lines[0]["scene"] = payload
-    (hostile / "scenes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    manifest = json.loads((hostile / "manifest.json").read_text())
-    manifest["files"]["scenes.jsonl"] = sha256_file(hostile / "scenes.jsonl")
-    (hostile / "manifest.json").write_text(json.dumps(manifest))
 
     def change(scene, viewer, answer):
         if answer["role"] == "helper" and answer["message"]:
             answer["message"]["evidence"] = payload
         return answer | {"raw": payload, "detail": payload, "error": payload}
 
-    run = write_run(tmp_path / "run", load(hostile), model=payload, change=change)
+    run = write_run(tmp_path / "run", dataset, model=payload, change=change)
     out = write_report(run, prompts=lambda scene, viewer: [{"role": payload, "content": payload}] * 2)
     found = Page(out.read_text())
     assert "script" not in found.tags

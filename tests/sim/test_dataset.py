@@ -22,7 +22,7 @@ from harness.live import finish
 from harness.perception.graph import scene_graph
 from harness.world import World
 
-FIRST_SEED = 6
+FIRST_SEED = 178
 
 
 def contents(folder):
@@ -111,8 +111,8 @@ def test_outcomes_in_a_record_are_what_its_thawed_state_comes_to(small):
 
 
 def test_the_outcome_table_of_a_known_episode(small):
-    """Seed 9: a danger from the right that a cruising ego would meet 4.6 s after the start."""
-    tables = [s.record["outcomes"] for s in small.scenes if s.record["episode_seed"] == 9]
+    """Seed 181: a danger from the right that a cruising ego would hit 4.8 s after the start."""
+    tables = [s.record["outcomes"] for s in small.scenes if s.record["episode_seed"] == 181]
     results = [{a: table[a]["result"] for a in small.actions} for table in tables]
     harmless = dict.fromkeys(small.actions, "cleared")
     assert results == [
@@ -120,12 +120,12 @@ def test_the_outcome_table_of_a_known_episode(small):
         harmless,
         harmless,  # there is still a second to wait and see
         {"SLOWER": "cleared", "IDLE": "collision", "FASTER": "collision"},
-        harmless,  # having slowed, the ego is behind the danger
+        {"SLOWER": "cleared", "IDLE": "cleared", "FASTER": "collision"},  # not yet behind the danger
         {"SLOWER": "time_out", "IDLE": "cleared", "FASTER": "cleared"},  # nobody speeds up after the last one
     ]
     hit = tables[3]["IDLE"]
     assert (hit["time_s"], hit["partner"], hit["fault"]) == (
-        4.58,
+        5.0,
         small.scenes[18].record["danger"]["vehicle"],
         "ego",
     )
@@ -138,7 +138,7 @@ def test_delays_are_against_the_best_safe_action_and_nan_where_unsafe(small):
     best = np.nanmin(delay_s[safe.any(axis=1)], axis=1)
     assert (best == 0.0).all()
     harmless = [
-        n for n, s in enumerate(small.scenes) if s.record["episode_seed"] == 7 and s.record["step"] == 0
+        n for n, s in enumerate(small.scenes) if s.record["episode_seed"] == 179 and s.record["step"] == 0
     ]
     slower, idle, _ = delay_s[harmless[0]]
     assert idle == 0.0
@@ -172,7 +172,7 @@ def test_one_driver_leads_until_the_guard_acts_and_then_full_view_does(small):
     ],
 )
 def test_a_share_of_one_is_always_and_of_none_is_never(behaviour, reasons):
-    records = freeze(7, 0, behaviour)  # no danger: there the guard only stops a late SLOWER
+    records = freeze(179, 0, behaviour)  # no danger: there the guard only stops a late SLOWER
     assert {record["behaviour"]["reason"] for record in records} <= reasons
     assert records[0]["behaviour"]["reason"] in reasons - {"guard"}
 
@@ -299,7 +299,7 @@ HOSTILE = {
     "a section too few": at("snapshot", "sections", value=[0]),
     "a section too far": at("snapshot", "sections", 0, value=3),
     "another step": at("state", "step", value=2),
-    "another seed": at("state", "episode_seed", value=8),
+    "another seed": at("state", "episode_seed", value=180),
     "another scene's id": at("scene", value="00003-3"),
     "a node that is not there": at("graphs", "v1", "nodes", 0, "id", value="v8"),
     "a conflict on a path that merges": at(

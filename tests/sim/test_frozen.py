@@ -124,8 +124,8 @@ def test_the_full_view_driver_is_never_unsafe_where_it_can_be_helped(small):
 
 
 def test_frozen_success_is_judged_by_episode(small):
-    # Dangers from the left, none, left, right, oncoming, oncoming: cruising is right once in six.
-    assert frozen_success(small, "cruise").tolist() == [False, True, False, False, False, False]
+    # Dangers from the left, none, left, right, left, oncoming: cruising is ahead of the first and the last.
+    assert frozen_success(small, "cruise").tolist() == [True, True, False, False, False, True]
     assert not frozen_success(small, "brake").any()
 
 

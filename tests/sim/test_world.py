@@ -77,8 +77,8 @@ def test_one_decision_lasts_one_second_of_fifty_frames():
 
 
 def test_an_unhindered_cruise_clears_when_the_distance_is_covered():
-    start = World.start(7).state().ego.y_m
-    outcome = drive("cruise", 7)
+    start = World.start(NO_DANGER).state().ego.y_m
+    outcome = drive("cruise", NO_DANGER)
     frames = np.ceil((start + 11.0 + P.cleared_m) / 14.0 * P.simulation_hz)
     assert (outcome.result, outcome.time_s) == ("cleared", pytest.approx(frames / P.simulation_hz))
 
