@@ -15,7 +15,7 @@ from harness.operating_point import POINTS, OperatingPoint
 from harness.run.asking import ask_all
 from harness.run.evaluate import Evaluated, evaluate
 from harness.run.intents import Intents, intents
-from harness.run.scoring import Scored, Table, score, table
+from harness.run.scoring import Scored, Table, draw, score, table
 from harness.run.spec import Spec
 
 FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
@@ -89,7 +89,7 @@ def scored(
 ) -> tuple[Table, Scored]:
     laid = table(spec)
     seconds = np.full((len(known.own), 1 + known.valid.shape[1]), infer_s)
-    return laid, score(spec, laid, known, seconds, point, seed)
+    return laid, score(spec, laid, known, seconds, point, seed, draw(laid, seed, known.valid.shape))
 
 
 def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:

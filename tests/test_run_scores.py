@@ -17,7 +17,7 @@ from harness.backends.base import Completion
 from harness.dataset.load import Dataset
 from harness.operating_point import OperatingPoint
 from harness.run import record
-from harness.run.scoring import score, statuses, table
+from harness.run.scoring import draw, score, statuses, table
 from harness.run.summary import COLUMNS, summary
 from harness.run.timing import inference_s
 
@@ -274,7 +274,8 @@ def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path)
     seconds = inference_s({"inference_s": None}, known.answers)
     assert np.isnan(seconds[:, 0]).all()
     laid = table(spec)
-    runs = [score(spec, laid, known, seconds, point, 0) for point in spec.points]
+    drawn = draw(laid, 0, known.valid.shape)
+    runs = [score(spec, laid, known, seconds, point, 0, drawn) for point in spec.points]
     told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
     for metric in ("latency_proxy_ms", "deadline_miss_rate"):
         row = told.loc[("single-local", metric, "episodes")]
