@@ -57,6 +57,7 @@ class Card:
         privileged: sees the truth behind the occlusion: an upper reference, never a contestant.
         licence: SPDX id of the weights.
         max_new_tokens: most tokens of an answer, where the model needs another bound than its prompt's.
+        thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Card:
     privileged: bool = False
     licence: str | None = None
     max_new_tokens: int | None = None
+    thinking_tokens: int = 2048
 
 
 _CARD_KEYS: Mapping[str, type] = {
@@ -85,6 +87,7 @@ _CARD_KEYS: Mapping[str, type] = {
     "privileged": bool,
     "licence": str,
     "max_new_tokens": int,
+    "thinking_tokens": int,
 }
 _LATENCY_KEYS: Mapping[str, type] = {"source": str, "inference_s": float, "basis": str}
 _CHOICES = {
@@ -172,7 +175,7 @@ def _card(name: str, table: Mapping[str, Any], where: str) -> Card:
         raise UserError(f'{where} [latency]: inference_s goes with source = "card", and only with it')
     if seconds is not None and not 0 <= seconds < float("inf"):
         raise UserError(f"{where} [latency]: inference_s = {seconds}; allowed: seconds, 0 or more")
-    for key in ("context_tokens", "max_new_tokens"):
+    for key in ("context_tokens", "max_new_tokens", "thinking_tokens"):
         if table.get(key, 1) < 1:
             raise UserError(f"{where}: {key} = {table[key]}; allowed: 1 or more")
     if (table["engine"] == "transformers") != ("weights" in table):

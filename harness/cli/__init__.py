@@ -45,7 +45,8 @@ def main() -> None:
             print(message)
             sys.exit(2)
         path = context.command_path if context else "harness"
-        _fail(f"{printable(message, 300)} (see {path} --help)")
+        typed = printable(" ".join(["harness", *sys.argv[1:]]))
+        _fail(f"{printable(message, 300)} in `{typed}`; see `{path} --help`")
 
 
 def _fail(message: str, code: int = 2) -> None:

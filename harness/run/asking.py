@@ -24,6 +24,12 @@ def request_count(spec: Spec) -> int:
     return sum(1 if spec.card.engine == "driver" else len(scene.viewers) for scene in spec.dataset.scenes)
 
 
+def most_tokens(spec: Spec, role: Role) -> int:
+    """Most tokens that an answer may have, its thought included where the model is asked to think."""
+    answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
+    return answer + (spec.card.thinking_tokens if spec.thinking else 0)
+
+
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
     for scene in scenes:
@@ -36,7 +42,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 role=role,
                 messages=spec.prompt.render(graph, spec.dataset.actions),
                 actions=spec.dataset.actions,
-                max_tokens=spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role],
+                max_tokens=most_tokens(spec, role),
                 answer=spec.prompt.helper_answer,
                 thinking=spec.thinking,
                 view=graph,

@@ -55,7 +55,7 @@ def _estimates(
         metrics = {name: np.stack([m[name] for m in by_seed]) for name in by_seed[0]}
         by_condition[point.name] = metrics
         for name, values in metrics.items():  # (seeds, episodes)
-            yield point.name, name, seed_interval(known_mean(values, axis=1)), "seed means"
+            yield point.name, name, _over_seeds(name, values), "seed means"
             yield point.name, name, _over_episodes(name, values), "episodes"
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
@@ -104,6 +104,11 @@ def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
     }
 
 
+def _over_seeds(name: str, values: Floats) -> Estimate:
+    """Interval over seeds of a metric's values (seeds, episodes)."""
+    return _in_range(name, seed_interval(known_mean(values, axis=1)))
+
+
 def _over_episodes(name: str, values: Floats) -> Estimate:
     """Interval over episodes of a metric's values (seeds, episodes)."""
     each = known_mean(values, axis=0)
@@ -111,7 +116,11 @@ def _over_episodes(name: str, values: Floats) -> Estimate:
     # Student's t would give 0 of 20 episodes an interval of no width.
     if name in YES_OR_NO and np.isin(settled, (0.0, 1.0)).all():
         return rate_interval(each)
-    found = episode_interval(each)
-    if name in YES_OR_NO:  # a share of episodes ends at 0 and at 1, Student's t does not know that
-        return replace(found, low=max(found.low, 0.0), high=min(found.high, 1.0))
-    return found
+    return _in_range(name, episode_interval(each))
+
+
+def _in_range(name: str, e: Estimate) -> Estimate:
+    """A share ends at 0 and at 1, which Student's t does not know."""
+    if not name.endswith(("_rate", "_loss")):
+        return e
+    return replace(e, low=float(np.maximum(e.low, 0.0)), high=float(np.minimum(e.high, 1.0)))
