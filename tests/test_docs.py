@@ -1,0 +1,24 @@
+"""What the documents list is what the program has."""
+
+from pathlib import Path
+
+import pytest
+
+from harness.parse import Repair, Status
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("member", [*Status, *Repair], ids=str)
+def test_every_status_and_repair_is_documented_with_its_meaning(member: Status | Repair) -> None:
+    assert f"| `{member.value}` | {member.meaning} |" in (ROOT / "docs/answers.md").read_text()
+
+
+def test_the_readme_names_every_command() -> None:
+    from typer.main import get_command
+
+    from harness.cli import app
+
+    readme = (ROOT / "README.md").read_text()
+    for name in get_command(app).commands:  # type: ignore[attr-defined]
+        assert f"`harness {name}" in readme
