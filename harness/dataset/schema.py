@@ -157,6 +157,13 @@ def manifest_schema() -> Schema:
     }
 
 
+def manifest_validator() -> Any:
+    """Validator of a manifest, which says what is wrong."""
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(manifest_schema())
+
+
 @lru_cache(maxsize=8)
 def record_validator(actions: tuple[str, ...]) -> Any:
     """Compiled validator of one record; 1.0 is no integer to it."""
@@ -170,18 +177,28 @@ def record_validator(actions: tuple[str, ...]) -> Any:
 
 @lru_cache(maxsize=8)
 def fits_record(actions: tuple[str, ...]) -> Callable[[Any], bool]:
-    """A quick yes to valid records, compiled by fastjsonschema, some ten times as fast as jsonschema.
+    """A quick yes to valid records."""
+    return _quick_yes(record_schema(actions))
+
+
+def fits_manifest(manifest: Any) -> bool:
+    """A quick yes to a valid manifest."""
+    return _quick_yes(manifest_schema())(manifest)
+
+
+def _quick_yes(schema: Schema) -> Callable[[Any], bool]:
+    """A schema compiled by fastjsonschema, some ten times as fast as jsonschema, and sooner loaded.
 
     What it says no to, jsonschema looks at: that decides, and says what is wrong and where. To JSON Schema
     1.0 is an integer; to `record_validator` it is not, so integers are looked at here.
     """
     from fastjsonschema import JsonSchemaValueException, compile
 
-    validate = compile(record_schema(actions), use_default=False)
+    validate = compile(schema, use_default=False)
 
-    def fits(record: Any) -> bool:
+    def fits(value: Any) -> bool:
         try:
-            validate(record)
+            validate(value)
         except JsonSchemaValueException:
             return False
         state, snapshot = record["state"], record["snapshot"]

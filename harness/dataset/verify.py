@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness.dataset.schema import fits_record, manifest_schema, record_validator
+from harness.dataset.schema import fits_manifest, fits_record, manifest_validator, record_validator
 from harness.errors import UserError, printable
 from harness.files import sha256_bytes, sha256_file
 from harness.road import crossings
@@ -13,8 +13,6 @@ from harness.road import crossings
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
     """The manifest, valid by its schema, and its digest."""
-    from jsonschema import Draft202012Validator
-
     file = path / "manifest.json"
     try:
         data = file.read_bytes()
@@ -27,7 +25,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
         raise UserError(
             f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
         ) from None
-    for broken in Draft202012Validator(manifest_schema()).iter_errors(manifest):
+    for broken in () if fits_manifest(manifest) else manifest_validator().iter_errors(manifest):
         raise UserError(
             f"{printable(file)} at {printable(broken.json_path)}: {printable(broken.message)}; "
             "build the dataset again"
@@ -64,7 +62,7 @@ def file_problems(path: Path, manifest: dict[str, Any]) -> Iterator[str]:
 def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[str]]]:
     """Each line's record, and what is wrong with it; a record is good for use only if nothing is."""
     actions = tuple(manifest["actions"])
-    fits, validator = fits_record(actions), record_validator(actions)
+    fits = fits_record(actions)
     before: tuple[int, int] | None = (-1, 0)  # episode and step; None after a line that cannot be read
     with file.open("rb") as lines:
         for number, text in enumerate(lines, 1):
@@ -78,7 +76,8 @@ def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, An
             except (ValueError, RecursionError) as error:
                 yield {}, [f"{where}: no JSON ({printable(error)})"]
                 continue
-            broken = [] if fits(record) else sorted(validator.iter_errors(record), key=lambda e: e.json_path)
+            wrong = () if fits(record) else record_validator(actions).iter_errors(record)
+            broken = sorted(wrong, key=lambda e: e.json_path)
             problems = [f"{where} at {printable(e.json_path)}: {printable(e.message)}" for e in broken[:3]]
             if not broken:
                 problems = [f"{where}: {what}" for what in _contradictions(record)]
