@@ -1,6 +1,7 @@
 """Reading a frozen dataset: what has not the digest and the form that were stated for it is not used."""
 
 import os
+import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.dataset.verify import file_problems, read_manifest, records
+from harness.dataset.verify import file_problems, read_manifest, records, released
 from harness.errors import UserError, printable, unknown
 from harness.memory import uncollected
 from harness.resources import folder
@@ -105,9 +106,18 @@ def find(name: str) -> Path:
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
 
 
+def released_digests() -> set[str]:
+    """Digests of the manifests of released datasets, `datasets/released.toml`."""
+    pins = folder("datasets") / "released.toml"
+    return set(tomllib.loads(pins.read_text()).values()) if pins.is_file() else set()
+
+
 @uncollected()
 def load(path: Path, limit: int | None = None) -> Dataset:
     """Read and verify a dataset; with `limit`, keep its first episodes only.
+
+    Every file has the digest its manifest states. The decision points of a released dataset are then what
+    they were when its manifest was pinned; any other's are checked one by one.
 
     Raises:
         UserError: a file is missing, changed or broken.
@@ -116,7 +126,8 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     scenes: list[Scene] = []
     for problem in file_problems(path, manifest):
         raise _unusable(path, problem)
-    for record, problems in records(path / "scenes.jsonl", manifest):
+    read = released if digest in released_digests() else records
+    for record, problems in read(path / "scenes.jsonl", manifest):
         if problems:
             raise _unusable(path, problems[0])
         if limit is not None and record["episode"] >= limit:

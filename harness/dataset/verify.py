@@ -87,6 +87,13 @@ def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, An
             yield record, problems
 
 
+def released(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[str]]]:
+    """Each line's record of a file known by its digest, in the form of `records`."""
+    with file.open("rb") as lines:
+        for text in lines:
+            yield json.loads(text), []
+
+
 def _parsed(text: bytes) -> Any:
     """JSON without NaN and Infinity. Raises ValueError, or RecursionError where it is nested too deeply."""
 

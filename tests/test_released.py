@@ -1,0 +1,24 @@
+"""What is released is pinned, and is what it was."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from harness import prompts
+from harness.dataset.verify import check
+from harness.files import sha256_file
+
+ROOT = Path(__file__).parent.parent
+DATASETS = tomllib.loads((ROOT / "datasets/released.toml").read_text())
+
+
+@pytest.mark.parametrize("name", [p.parent.name for p in (ROOT / "datasets").glob("*/manifest.json")])
+def test_a_shipped_dataset_is_sound_and_has_the_digest_it_was_released_with(name: str) -> None:
+    assert sha256_file(ROOT / "datasets" / name / "manifest.json") == DATASETS[name]
+    assert check(ROOT / "datasets" / name) == []
+
+
+@pytest.mark.parametrize("version", prompts.names())
+def test_a_shipped_prompt_is_released(version: str) -> None:
+    assert prompts.load(version).released
