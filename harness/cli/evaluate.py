@@ -71,9 +71,9 @@ def _run(spec: "Spec", out: Path, resume: bool, as_json: bool) -> None:
 
     with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
         done = evaluate_run(spec, out, resume, progress)
-    from harness.report.page import write_report  # draws with matplotlib, which no answer waits for
+    from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
-    page = write_report(out)
+    page = write(out, None, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
         return

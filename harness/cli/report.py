@@ -11,6 +11,13 @@ def command(
     out: Annotated[Path | None, typer.Option(help="File to write.", show_default="RUN/report.html")] = None,
 ) -> None:
     """Write a run's report: one HTML file that needs no network."""
-    from harness.report.page import write_report
+    typer.echo(f"wrote {write(run, out)}")
 
-    typer.echo(f"wrote {write_report(run, out)}")
+
+def write(run: Path, out: Path | None, quiet: bool = False) -> Path:
+    """Write a run's report, with a progress bar; returns the file."""
+    from harness.cli.progress import bar
+    from harness.report.page import DECISIONS, write_report
+
+    with bar("drawing decisions", DECISIONS, quiet) as progress:
+        return write_report(run, out, progress=progress)

@@ -29,7 +29,12 @@ TEMPLATES = Path(__file__).parent / "templates"
 Prompts = Callable[[Scene, str], Sequence[Mapping[str, str]]]
 
 
-def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = None) -> Path:
+def write_report(
+    run: Path,
+    out: Path | None = None,
+    prompts: Prompts | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Path:
     """Write a run's report.
 
     Args:
@@ -37,6 +42,7 @@ def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = N
         out: file to replace; None for `report.html` in the run's folder.
         prompts: gives the chat messages that a viewer was sent in a scene; None renders the run's own
             prompt version, where it is here and unchanged.
+        progress: called with the number of decisions just drawn, `DECISIONS` at most in all.
 
     Returns:
         The file written.
@@ -48,7 +54,7 @@ def write_report(run: Path, out: Path | None = None, prompts: Prompts | None = N
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
     found = read(run)
-    write_whole(out, render(found, prompts or prompts_of(found)))
+    write_whole(out, render(found, prompts or prompts_of(found), progress))
     return out
 
 
@@ -63,7 +69,7 @@ def prompts_of(run: Run) -> Prompts | None:
     return lambda scene, viewer: prompt.render(scene.record["graphs"][viewer], actions)
 
 
-def render(run: Run, prompts: Prompts | None = None) -> str:
+def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -> str:
     """The page."""
     scenes = {scene.id: scene for scene in dataset_of(run).scenes}
     picks = pick(run.rows, DECISIONS)
@@ -73,6 +79,10 @@ def render(run: Run, prompts: Prompts | None = None) -> str:
                 f"{printable(run.path / 'rows.jsonl')} has scene {printable(chosen.row['scene'])!r}, "
                 "which its dataset has not; run `harness eval` again"
             )
+    decisions = []
+    for chosen in picks:
+        decisions.append(_decision(chosen, scenes[chosen.row["scene"]], run, prompts))
+        progress(1)
     chart = figures.success_latency(run)
     by_verdict = _count(run.rows, "verdict")
     return _environment().get_template("page.html.j2").render(
@@ -87,7 +97,7 @@ def render(run: Run, prompts: Prompts | None = None) -> str:
         chart=chart and _uri(chart),
         statuses=_count(run.rows, "status"),
         verdicts=_uri(figures.verdicts(by_verdict)),
-        decisions=[_decision(chosen, scenes[chosen.row["scene"]], run, prompts) for chosen in picks],
+        decisions=decisions,
     )  # fmt: skip
 
 
