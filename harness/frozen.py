@@ -11,6 +11,7 @@ than the allowance is a forced failure. `harness dataset rank` holds the two aga
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +53,58 @@ def judge(safe: Bools, delay_s: Floats, avoidable: Bools, allowance_s: float) ->
     total = np.sum(np.where(avoidable & safe, np.nan_to_num(delay_s), 0.0), axis=-1)
     late = ~unsafe & (total > allowance_s + ROUNDING_S)
     return Verdict(~unsafe & ~late, unsafe, late, total)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A dataset's scenes laid out as episodes by steps, so that arrays can be judged.
+
+    Attributes:
+        index: (E, S) position of each decision among the scenes; -1 pads shorter episodes.
+        episodes: (E,) episode numbers.
+        seeds: (E,) layout seeds.
+        safe: (n, A) whether an action is safe.
+        delay_s: (n, A) its delay; NaN where it is not.
+        allowance_s: delay that an episode is forgiven.
+    """
+
+    index: Ints
+    episodes: Ints
+    seeds: Ints
+    safe: Bools
+    delay_s: Floats
+    allowance_s: float
+
+    def by_episode(self, values: Any, fill: Any = np.nan) -> Any:
+        """Values (n, ...) as (E, S, ...), `fill` where an episode has no such step."""
+        there = self.index >= 0
+        laid = values[np.maximum(self.index, 0)]
+        return np.where(there.reshape(there.shape + (1,) * (laid.ndim - 2)), laid, fill)
+
+
+def table(dataset: Dataset) -> Table:
+    """Lay a dataset's scenes out as episodes."""
+    places: dict[int, list[int]] = {}
+    for position, scene in enumerate(dataset.scenes):
+        places.setdefault(scene.record["episode"], []).append(position)
+    index = np.full((len(places), max(map(len, places.values()))), -1)
+    for row, positions in enumerate(places.values()):
+        index[row, : len(positions)] = positions
+    safe, delay_s = dataset.outcome_arrays()
+    seeds = [dataset.scenes[p[0]].record["episode_seed"] for p in places.values()]
+    allowance_s = float(dataset.manifest["parameters"]["delay_allowance_s"])
+    return Table(index, np.array(list(places)), np.array(seeds), safe, delay_s, allowance_s)
+
+
+def judge_choices(laid: Table, chosen: Ints) -> Verdict:
+    """What becomes of the episodes if action `chosen` (n,) is taken in each scene."""
+    rows = np.arange(len(chosen))
+    return judge(
+        laid.by_episode(laid.safe[rows, chosen], fill=True),
+        laid.by_episode(laid.delay_s[rows, chosen]),
+        laid.by_episode(laid.safe.any(axis=-1), fill=False),
+        laid.allowance_s,
+    )
 
 
 def driver_choices(dataset: Dataset, driver: str) -> Ints:

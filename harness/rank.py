@@ -11,7 +11,7 @@ from harness.dataset.build import settings
 from harness.dataset.load import Dataset
 from harness.drivers import DRIVERS
 from harness.errors import UserError, printable
-from harness.frozen import driver_choices, judge
+from harness.frozen import driver_choices, judge_choices, table
 from harness.live import drive_all
 from harness.metrics import Estimate, paired_difference, rate_interval
 from harness.workers import spread
@@ -56,20 +56,7 @@ def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dic
 
 def frozen_success(dataset: Dataset, driver: str) -> Bools:
     """Success of each frozen episode if a reference driver takes its decisions, `(E,)`."""
-    scenes = np.arange(len(dataset.scenes))
-    chosen = driver_choices(dataset, driver)
-    safe, delay_s = dataset.outcome_arrays()
-    row = np.unique([s.record["episode"] for s in dataset.scenes], return_inverse=True)[1]
-    step = np.array([s.record["step"] for s in dataset.scenes])
-
-    shape = (row.max() + 1, step.max() + 1)
-    taken_safe, avoidable = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    taken_delay_s = np.zeros(shape)
-    taken_safe[row, step] = safe[scenes, chosen]
-    taken_delay_s[row, step] = delay_s[scenes, chosen]
-    avoidable[row, step] = safe.any(axis=1)
-    allowance_s = dataset.manifest["parameters"]["delay_allowance_s"]
-    return judge(taken_safe, taken_delay_s, avoidable, allowance_s).success
+    return judge_choices(table(dataset), driver_choices(dataset, driver)).success
 
 
 def ranks_agree(standings: dict[str, Standing]) -> bool:

@@ -11,11 +11,12 @@ import numpy as np
 from harness import cards, prompts
 from harness.backends.base import Backend, Completion, Request
 from harness.dataset.load import Dataset
+from harness.frozen import Table, table
 from harness.operating_point import POINTS, OperatingPoint
 from harness.run.asking import ask_all
 from harness.run.evaluate import Evaluated, evaluate
 from harness.run.intents import Intents, intents
-from harness.run.scoring import Scored, Table, draw, score, table
+from harness.run.scoring import Scored, draw, score
 from harness.run.spec import Spec
 
 FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
@@ -87,9 +88,9 @@ def ask(spec: Spec, backend: Backend, folder: Path) -> Intents:
 def scored(
     spec: Spec, known: Intents, point: OperatingPoint, seed: int = 0, infer_s: float = 0.1
 ) -> tuple[Table, Scored]:
-    laid = table(spec)
+    laid = table(spec.dataset)
     seconds = np.full((len(known.own), 1 + known.valid.shape[1]), infer_s)
-    return laid, score(spec, laid, known, seconds, point, seed, draw(laid, seed, known.valid.shape))
+    return laid, score(laid, known, seconds, point, seed, draw(laid, seed, known.valid.shape))
 
 
 def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:

@@ -15,9 +15,10 @@ from scipy import stats
 
 from harness.backends.base import Completion
 from harness.dataset.load import Dataset
+from harness.frozen import table
 from harness.operating_point import OperatingPoint
 from harness.run import record
-from harness.run.scoring import draw, score, statuses, table
+from harness.run.scoring import draw, score, statuses
 from harness.run.summary import COLUMNS, summary
 from harness.run.timing import inference_s
 
@@ -274,9 +275,9 @@ def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path)
     known = ask(spec, Scripted({**SAID, **lines}), tmp_path)
     seconds = inference_s({"inference_s": None}, known.answers)
     assert np.isnan(seconds[:, 0]).all()
-    laid = table(spec)
+    laid = table(spec.dataset)
     drawn = draw(laid, 0, known.valid.shape)
-    runs = [score(spec, laid, known, seconds, point, 0, drawn) for point in spec.points]
+    runs = [score(laid, known, seconds, point, 0, drawn) for point in spec.points]
     told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
     for metric in ("latency_proxy_ms", "deadline_miss_rate"):
         row = told.loc[("single-local", metric, "episodes")]

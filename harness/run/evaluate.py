@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 from harness.backends.registry import open_backend
 from harness.errors import UserError, printable
 from harness.files import alone, canonical_json, digest, write_whole
+from harness.frozen import table
 from harness.memory import uncollected
 from harness.run import record
 from harness.run.asking import Answer, ask_all
 from harness.run.intents import intents
-from harness.run.scoring import allowance_s, draw, score, table
+from harness.run.scoring import draw, score
 from harness.run.spec import FORMAT, Spec, versions
 from harness.run.summary import summary
 from harness.run.timing import inference_s, measure
@@ -66,13 +67,11 @@ def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None
 @uncollected()
 def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, Any]) -> Evaluated:
     """Score the answers and write the run's files; `begun` is what its manifest says of its beginning."""
-    known, laid = intents(spec, by_id), table(spec)
+    known, laid = intents(spec, by_id), table(spec.dataset)
     seconds = inference_s(begun["latency"], known.answers)
     drawn = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
     runs = [
-        score(spec, laid, known, seconds, point, seed, drawn[seed])
-        for point in spec.points
-        for seed in spec.seeds
+        score(laid, known, seconds, point, seed, drawn[seed]) for point in spec.points for seed in spec.seeds
     ]
     result = summary(spec, laid, known, runs)
     manifest = {
@@ -83,7 +82,7 @@ def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, An
         **spec.settings(),
         "identity": begun["identity"],
         "latency": begun["latency"],
-        "delay_allowance_s": allowance_s(spec),
+        "delay_allowance_s": laid.allowance_s,
         "versions": versions(),
     }
     manifest["dataset"]["path"] = str(spec.dataset.path)

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.files import canonical_json
+from harness.frozen import Table
 from harness.metrics import known_mean
 from harness.parse import Parsed
 from harness.run.asking import Answer
 from harness.run.intents import Intents
-from harness.run.scoring import Scored, Table
+from harness.run.scoring import Scored
 from harness.run.spec import Spec
 
 if TYPE_CHECKING:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.arrays import Floats
+from harness.frozen import Table
 from harness.metrics import Estimate, episode_interval, known_mean, rate_interval, seed_interval
 from harness.run.intents import Intents
-from harness.run.scoring import Scored, Table, statuses
+from harness.run.scoring import Scored, statuses
 from harness.run.spec import Spec
 
 if TYPE_CHECKING:
