@@ -41,8 +41,11 @@ def show(
     scenario = scenarios.get(name)
     parameters = _parameters(scenario)
     if as_json:
+        from harness.answer_schema import ROLES, answer_schema
+
         described = {"name": name, "description": scenario.__doc__, "actions": scenario.ACTIONS}
-        typer.echo(json.dumps({**described, "parameters": parameters}, indent=1))
+        schemas = {role: answer_schema(role, scenario.ACTIONS, name) for role in ROLES}
+        typer.echo(json.dumps({**described, "parameters": parameters, "answer_schema": schemas}, indent=1))
         return
     typer.echo(f"{scenario.__doc__}\nactions: {', '.join(scenario.ACTIONS)}\n")
     for parameter, of in parameters.items():

@@ -16,8 +16,6 @@ from harness.memory import uncollected
 from harness.resources import folder
 from harness.scene import WorldState
 
-DEFAULT = "occluded-intersection-v1"
-
 
 @dataclass(frozen=True)
 class Scene:

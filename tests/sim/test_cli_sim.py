@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 
+import jsonschema
 import pytest
 
 from harness.cli import main
@@ -46,6 +47,15 @@ def test_every_parameter_is_shown_with_value_and_meaning(harness):
     assert shown["parameters"]["time_limit_s"]["value"] == 10.0
     assert shown["parameters"]["corner_m"]["value"] == [8.0, 18.0]
     assert all(p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values())
+
+
+def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
+    schemas = json.loads(harness("scenario", "show", NAME, "--json")[1])["answer_schema"]
+    one = {"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}
+    jsonschema.validate(one, schemas["ego"])
+    jsonschema.validate({"evidence": "v6 from left", "risk": "high", **one}, schemas["helper"])
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(one, schemas["helper"])
 
 
 def test_a_scenario_check_states_rates_intervals_and_n(harness):
