@@ -17,10 +17,9 @@ import numpy as np
 
 from harness.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset
-from harness.drivers import choose
+from harness.drivers import PRIVILEGED, choose
+from harness.outcome import ROUNDING_S
 from harness.perception.graph import truth_graph
-
-ROUNDING_S = 0.01  # half a frame
 
 
 @dataclass(frozen=True)
@@ -113,6 +112,6 @@ def driver_choices(dataset: Dataset, driver: str) -> Ints:
     chosen = []
     for scene in dataset.scenes:
         graph = scene.record["graphs"][scene.state.ego.id]
-        truth = truth_graph(scene.state) if driver == "full-view" else None
+        truth = truth_graph(scene.state) if driver == PRIVILEGED else None
         chosen.append(actions.index(choose(driver, graph, truth, actions)))
     return np.array(chosen)

@@ -12,6 +12,8 @@ from harness.scene import VehicleState
 
 Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]
 
+ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
+
 # Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
 PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
             "own": {"straight": 1, "left": 0}, "oncoming": {"straight": 1, "left": 0}}  # fmt: skip
@@ -55,8 +57,7 @@ class Outcome:
         """The same outcome, `late` where the ego cleared too long after the full-view `reference`."""
         if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
             return self
-        # Frames are 20 ms apart: half of one keeps rounding out of the comparison.
-        late = self.time_s - reference.time_s > parameters.delay_allowance_s + 0.01
+        late = self.time_s - reference.time_s > parameters.delay_allowance_s + ROUNDING_S
         return replace(self, result="late") if late else self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":

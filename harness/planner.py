@@ -12,14 +12,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from harness.arrays import Floats
 from harness.road import crossings, paths
 from harness.scenarios.occluded_intersection import Parameters
 from harness.scene import SIZES_M
-
-Array = NDArray[np.float64]
-
 
 HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
 LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
@@ -54,7 +51,7 @@ def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Paramet
 @lru_cache(maxsize=64)
 def _all_rollouts(
     actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, parameters: Parameters
-) -> tuple[list[tuple[str, ...]], Array]:
+) -> tuple[list[tuple[str, ...]], Floats]:
     """Every sequence that is played through, and its rollout. Shared: not to be written to."""
     sequences = list(product(actions, repeat=min(HORIZON, left)))
     travelled = rollouts(sequences, speed_mps, target_mps, left, parameters)
@@ -64,7 +61,7 @@ def _all_rollouts(
 
 def rollouts(
     sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
-) -> Array:
+) -> Floats:
     """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
@@ -93,7 +90,7 @@ def rollouts(
     return travelled
 
 
-def least_gap(travelled: Array, conflict: Mapping[str, Any]) -> Array:
+def least_gap(travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
     """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
     key = (conflict["sector"], conflict["route"])
     mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely import LineString, intersection
+
+from harness.arrays import Floats
 
 LANE_WIDTH_M = 4.0
 JUNCTION_M = 11.0  # from the centre to where approach lanes end
@@ -23,8 +24,6 @@ APPROACHES = ("own", "left", "oncoming", "right")  # south, west, north, east: h
 SECTORS = ("left", "right", "oncoming")  # where danger can come from
 ROUTES = ("straight", "left")
 EXITS = {"own": "exit-own", "left": "exit-left", "oncoming": "exit-ahead", "right": "exit-right"}
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -41,15 +40,15 @@ class Path:
 
     approach: str
     route: str
-    points: Array
-    arc_m: Array
+    points: Floats
+    arc_m: Floats
     junction_m: tuple[float, float]
 
     @cached_property
-    def headings_rad(self) -> Array:
+    def headings_rad(self) -> Floats:
         """(n,) direction of travel."""
         along = np.gradient(self.points, axis=0)
-        heading: Array = np.arctan2(along[:, 1], along[:, 0])
+        heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
 
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
@@ -94,7 +93,7 @@ def paths() -> dict[tuple[str, str], Path]:
     return built
 
 
-def _southern(route: str) -> Array:
+def _southern(route: str) -> Floats:
     """Points of a path that starts on the south arm."""
     half, end = LANE_WIDTH_M / 2, JUNCTION_M + ARM_M
     count = int(ARM_M / STEP_M)

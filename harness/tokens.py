@@ -1,6 +1,6 @@
 """Counting tokens as a model counts them: with its own tokenizer."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -81,3 +81,9 @@ def counter(
         return None
     loaded = tokenizer(source)
     return lambda messages: sum(len(loaded.encode(m["content"]).ids) for m in messages)
+
+
+def spread_of(counts: Sequence[int]) -> dict[str, float]:
+    """`n`, `least`, `mean` and `most` of some counts of tokens."""
+    mean = round(sum(counts) / len(counts), 1)
+    return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

@@ -84,13 +84,8 @@ def _rounded(intent: dict[str, float]) -> dict[str, float]:
 
 def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> dict[str, Any]:
     best = max(intent, key=intent.__getitem__)
-    risk = (
-        "high"
-        if best == "SLOWER"
-        else "medium"
-        if intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
-        else "low"
-    )
+    unsure = intent["SLOWER"] > (LEAST_DOUBT + MOST_DOUBT) / 2
+    risk = "high" if best == "SLOWER" else "medium" if unsure else "low"
     message: dict[str, Any] = {"evidence": _reason(view), "risk": risk}
     if form == "recommendation":
         return {**message, "recommended_maneuver": best, "confidence": intent[best]}

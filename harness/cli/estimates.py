@@ -17,8 +17,12 @@ def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
 
 def shown(estimate: "Estimate", scale: float = 100.0) -> str:
     """`89.0 [81.4, 93.7]`: a share in percent, or with another scale."""
-    value, low, high = (f"{scale * v:.1f}" for v in (estimate.value, estimate.low, estimate.high))
-    return f"{value} [{low}, {high}]"
+    return interval(estimate.value, estimate.low, estimate.high, scale)
+
+
+def interval(value: float, low: float, high: float, scale: float) -> str:
+    """`value [low, high]`, one decimal."""
+    return f"{scale * value:.1f} [{scale * low:.1f}, {scale * high:.1f}]"
 
 
 def in_range(option: str, value: int, least: int, most: int) -> None:

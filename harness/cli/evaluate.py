@@ -128,6 +128,8 @@ def _table(done: "Evaluated") -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from harness.cli.estimates import interval
+
     console = Console(width=80, markup=False, highlight=False)
     rows = done.summary[done.summary.interval != "seed means"]
     figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
@@ -138,12 +140,11 @@ def _table(done: "Evaluated") -> None:
     for point in done.manifest["conditions"]:
         name = point["name"]
 
-        def cell(metric: str, scale: float = 1.0, interval: bool = False, name: str = name) -> str:
+        def cell(metric: str, scale: float = 1.0, ends: bool = False, name: str = name) -> str:
             r = figures.get((name, metric))
             if r is None or _unknown(r.value):
                 return "-"
-            shown = f"{r.value * scale:.1f}"
-            return f"{shown} [{r.ci_low * scale:.1f}, {r.ci_high * scale:.1f}]" if interval else shown
+            return interval(r.value, r.ci_low, r.ci_high, scale) if ends else f"{r.value * scale:.1f}"
 
         table.add_row(
             name,
@@ -173,7 +174,7 @@ def _table(done: "Evaluated") -> None:
 
 def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:
     from harness.run.asking import requests
-    from harness.tokens import counter
+    from harness.tokens import counter, spread_of
 
     count = counter(tokenizer, spec.card)
     sizes: dict[str, list[int]] = {}
@@ -182,10 +183,7 @@ def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:
         asked += 1
         if count:
             sizes.setdefault(request.role, []).append(count(request.messages))
-    stats = {
-        role: {"n": len(n), "least": min(n), "mean": round(sum(n) / len(n), 1), "most": max(n)}
-        for role, n in sizes.items()
-    }
+    stats = {role: spread_of(n) for role, n in sizes.items()}
     if as_json:
         typer.echo(
             json.dumps({**spec.settings(), "requests": asked, "prompt_tokens": stats or None}, indent=1)

@@ -75,7 +75,7 @@ def check(
     """Render every scene for every viewer; with a tokenizer, count tokens against the budget."""
     from harness import prompts
     from harness.dataset import load
-    from harness.tokens import counter
+    from harness.tokens import counter, spread_of
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     count = counter(tokenizer)
@@ -90,10 +90,7 @@ def check(
                 sizes[graph["role"]].append(n)
                 if not least <= n <= most:
                     outside.append({"scene": scene.id, "viewer": v, "tokens": n})
-    stats = {
-        role: {"n": len(n), "least": min(n), "mean": round(sum(n) / len(n), 1), "most": max(n)}
-        for role, n in sizes.items() if n
-    }  # fmt: skip
+    stats = {role: spread_of(n) for role, n in sizes.items() if n}
     if as_json:
         typer.echo(
             json.dumps({"version": version, "budget": [least, most], "tokens": stats, "outside": outside})

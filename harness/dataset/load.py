@@ -124,8 +124,8 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     scenes: list[Scene] = []
     for problem in file_problems(path, manifest):
         raise _unusable(path, problem)
-    read = released if digest in released_digests() else records
-    for record, problems in read(path / "scenes.jsonl", manifest):
+    file = path / "scenes.jsonl"
+    for record, problems in released(file) if digest in released_digests() else records(file, manifest):
         if problems:
             raise _unusable(path, problems[0])
         if limit is not None and record["episode"] >= limit:

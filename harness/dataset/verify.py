@@ -87,7 +87,7 @@ def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, An
             yield record, problems
 
 
-def released(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[str]]]:
+def released(file: Path) -> Iterator[tuple[dict[str, Any], list[str]]]:
     """Each line's record of a file known by its digest, in the form of `records`."""
     with file.open("rb") as lines:
         for text in lines:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.arrays import Floats
 from harness.scene import VehicleState, WorldState
-
-Array = NDArray[np.float64]
 
 RAYS = 1440  # a quarter of a degree apart
 
@@ -22,19 +21,19 @@ class Sweep:
         hits: id of a vehicle or building to the indices of the rays that end on it.
     """
 
-    bearing_rad: Array
-    range_m: Array
+    bearing_rad: Floats
+    range_m: Floats
     hits: dict[str, NDArray[np.intp]]
 
 
-def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Array]:
+def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats]:
     """Ids and corners (n, 4, 2) of everything that stops a ray, the viewer itself left out."""
     solid = [v for v in state.vehicles if v.id != viewer.id]
     ids = [v.id for v in solid] + [b.id for b in state.buildings]
     return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
 
 
-def first_hits(origin: Array, targets: Array, corners: Array) -> tuple[Array, NDArray[np.intp]]:
+def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Where rays first meet a surface.
 
     Args:
@@ -68,7 +67,7 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     return Sweep(bearing, distance, {name: rays for name, rays in hits.items() if len(rays)})
 
 
-def blocked_by(state: WorldState, viewer: VehicleState, points: Array) -> list[str | None]:
+def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
     """For each of the points (k, 2) the id of what stands in its line of sight, None where it is seen."""
     ids, corners = surfaces(state, viewer)
     origin = np.array([viewer.x_m, viewer.y_m])

@@ -28,9 +28,9 @@ def decisions_of(row: Row) -> list[dict[str, Any]]:
 def pick(rows: Sequence[Row], n: int) -> list[Pick]:
     """Choose up to n rows, kept in their order; the same rows always give the same choice.
 
-    Up to a quarter each are: an episode's first action that is unsafe where
-    another was safe; conditions that act differently; answers
-    that were recovered or failed. The rest is spread evenly. Where one kind is scarce, the sample is larger.
+    Up to a quarter each are: an episode's first action that is unsafe where another was safe; conditions
+    that act differently; answers that were recovered or failed. The rest is spread evenly. Where one kind is
+    scarce, the sample is larger.
     """
     episodes: set[int] = set()
     kinds: dict[str, list[int]] = {FAILURE: [], DISAGREEMENT: [], ANSWER: [], SAMPLE: list(range(len(rows)))}

@@ -9,8 +9,8 @@ from typing import Any
 
 from harness.dataset.load import Dataset, find, load
 from harness.errors import UserError, printable
+from harness.run.spec import FORMAT
 
-FORMAT = "swarmdrive-run/1"
 NEEDED = ("model", "prompt", "dataset", "actions", "conditions", "seeds", "latency")
 NEEDED_IN_ROW = ("scene", "episode", "answers", "safe", "delay_s", "decisions")
 

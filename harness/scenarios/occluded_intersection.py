@@ -122,6 +122,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         danger = SECTORS[drawn]
 
     start = between("ego_start", p.ego_start_m)
+    # The centroid of the conflict zone lies 1.46 m before the ego's farthest conflict point.
     ego_arc = crossings()["right", "straight"].ego_arc_m - 1.46 - start
     offset = between("danger_offset", p.danger_offset_s)
 
