@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 Role = Literal["ego", "helper"]
+AnswerMode = Literal["json", "constrained", "readout"]
 FinishReason = Literal["stop", "length", "error"]
 
 
@@ -21,7 +22,10 @@ class Request:
         messages: chat messages, `{"role": "system" | "user", "content": text}`.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
-        answer: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
+        form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
+        answer: how the answer is had. `json`: the model writes freely. `constrained`: it fills in numbers and
+            choices of a fixed text. `readout`: the messages ask for one letter (see `harness.readout`), whose
+            probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
@@ -33,7 +37,8 @@ class Request:
     messages: tuple[Mapping[str, str], ...]
     actions: tuple[str, ...]
     max_tokens: int
-    answer: str = "distribution"
+    form: str = "distribution"
+    answer: AnswerMode = "json"
     thinking: bool = False
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
@@ -53,6 +58,9 @@ class Completion:
             a batch's wall time is nobody's latency.
         batch_size: how many requests went through the engine together.
         error: the engine's message when finish_reason is `error`.
+        label_mass: probability on the letters together, of a `readout`; None otherwise.
+        retries: attempts that failed before this one; their time is in `seconds`.
+        cached: it comes from the cache, so it has no seconds.
     """
 
     request_id: str
@@ -63,6 +71,9 @@ class Completion:
     seconds: float | None
     batch_size: int
     error: str | None = None
+    label_mass: float | None = None
+    retries: int = 0
+    cached: bool = False
 
 
 class Backend(Protocol):

@@ -12,6 +12,7 @@ from harness.backends.base import Completion, Request
 from harness.cards import Card
 from harness.files import canonical_json
 from harness.planner import plan
+from harness.rounding import rounded
 
 VERSION = "proxy/1"
 
@@ -49,8 +50,8 @@ def answer(request: Request) -> str:
     if request.role == "ego":
         body: dict[str, Any] = {"action_distribution": intent}
     else:
-        body = _message(request.view, intent, request.answer)
-    if request.answer == "recommendation":
+        body = _message(request.view, intent, request.form)
+    if request.form == "recommendation":
         return f"{_reason(request.view)} {canonical_json(body)}"  # such a prompt asks for its reasons first
     return canonical_json(body)
 
@@ -70,16 +71,7 @@ def distribution(view: Mapping[str, Any], actions: tuple[str, ...]) -> dict[str,
         shares = {a: rest / len(others) for a in others}
     else:
         shares[planned] = rest - sum(shares.values())
-    return _rounded({a: shares.get(a, braking) for a in actions})
-
-
-def _rounded(intent: dict[str, float]) -> dict[str, float]:
-    """Two decimals that sum to 1: the last hundredths go where rounding took most."""
-    floor = {a: int(p * 100 + 1e-9) for a, p in intent.items()}
-    short = 100 - sum(floor.values())
-    for a in sorted(intent, key=lambda a: floor[a] - intent[a] * 100)[:short]:
-        floor[a] += 1
-    return {a: n / 100 for a, n in floor.items()}
+    return dict(zip(actions, rounded([shares.get(a, braking) for a in actions]), strict=True))
 
 
 def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> dict[str, Any]:

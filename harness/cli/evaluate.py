@@ -4,13 +4,14 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
     from harness.run.evaluate import Evaluated
     from harness.run.spec import Spec
 
@@ -27,6 +28,7 @@ def evaluate(
     seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
     limit: int | None = typer.Option(None, help="Only the dataset's first so many episodes."),
     thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
+    answer: str = typer.Option("json", help="json: free text; constrained: to the schema; readout: letters."),
     batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
     device: str | None = typer.Option(None, help="cpu or cuda."),
     dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
@@ -54,6 +56,7 @@ def evaluate(
         seeds=parse_seeds(seeds),
         limit=limit,
         thinking=thinking,
+        answer=cast("AnswerMode", answer),
         batch_size=batch_size,
         device=device,
         dtype=dtype,
@@ -101,7 +104,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 def default_out(spec: "Spec", resume: bool) -> Path:
     """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
     safe = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.card.name).strip(".-") or "model"
-    base = Path("reports") / f"{safe}-{spec.prompt.version}-{spec.dataset.name}"
+    mode = "" if spec.answer == "json" else f"-{spec.answer}"
+    base = Path("reports") / f"{safe}-{spec.prompt.version}{mode}-{spec.dataset.name}"
     found, number = base, 1
     last = base
     while found.exists():
@@ -156,7 +160,8 @@ def _table(done: "Evaluated") -> None:
         )
     m = done.manifest
     console.print(
-        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['dataset']['name']}"
+        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · "
+        f"{m['dataset']['name']}"
     )
     console.print(table)
     n = m["dataset"]["episodes"]

@@ -3,11 +3,12 @@
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
 
+from harness import readout
 from harness.backends.base import Backend, Completion, Request, Role
 from harness.dataset.load import Scene
 from harness.errors import UserError, printable
@@ -40,14 +41,20 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
             yield Request(
                 id=f"{scene.id}/{viewer}",
                 role=role,
-                messages=spec.prompt.render(graph, spec.dataset.actions),
+                messages=_messages(spec, graph),
                 actions=spec.dataset.actions,
                 max_tokens=most_tokens(spec, role),
-                answer=spec.prompt.helper_answer,
+                form=spec.prompt.helper_answer,
+                answer=spec.answer,
                 thinking=spec.thinking,
                 view=graph,
                 truth=truth,
             )
+
+
+def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
+    rendered = spec.prompt.render(graph, spec.dataset.actions)
+    return readout.asked(rendered, spec.dataset.actions) if spec.answer == "readout" else rendered
 
 
 def ask_all(spec: Spec, backend: Backend, kept: Path, progress: Callable[[int], None]) -> dict[str, Answer]:
@@ -94,6 +101,9 @@ def _answer(request: Request, completion: Completion) -> Answer:
         "completion_tokens": completion.completion_tokens,
         "seconds": completion.seconds,
         "batch_size": completion.batch_size,
+        "label_mass": completion.label_mass,
+        "retries": completion.retries,
+        "cached": completion.cached,
         "prompt_sha256": digest(request.messages),
     }
 

@@ -69,7 +69,9 @@ def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
 def _parsed(spec: Spec, answer: Answer, role: str) -> Parsed:
     return parse(
         answer["raw"],
-        role=role,
+        role="ego"
+        if spec.answer == "readout"
+        else role,  # a read-out is a bare distribution, whoever gives it
         actions=spec.dataset.actions,
         thinking=spec.thinking,
         finish_reason=answer["finish_reason"],

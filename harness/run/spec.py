@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from harness import __version__
+from harness.backends.base import AnswerMode
 from harness.cards import Card, load, names
 from harness.dataset.load import Dataset
-from harness.errors import UserError, printable
+from harness.errors import UserError, printable, unknown
 from harness.operating_point import OperatingPoint
 from harness.prompts import Prompt
 
@@ -30,6 +31,7 @@ class Spec:
         seeds: seeds of the channel's luck.
         limit: how many episodes of the dataset were taken; None for all.
         thinking: whether the model is asked to think first.
+        answer: how answers are had: free `json`, `constrained` to the schema, or the `readout` of letters.
         batch_size: most requests that go through the engine together.
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
@@ -42,6 +44,7 @@ class Spec:
     seeds: tuple[int, ...]
     limit: int | None = None
     thinking: bool = False
+    answer: AnswerMode = "json"
     batch_size: int = 8
     device: str | None = None
     dtype: str | None = None
@@ -57,6 +60,17 @@ class Spec:
             raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
+        if self.answer not in get_args(AnswerMode):
+            raise unknown("answer mode", self.answer, get_args(AnswerMode))
+        if self.answer != "json" and self.card.engine in ("proxy", "driver"):
+            raise UserError(
+                f"--answer {self.answer}: {printable(self.card.name)} is no language model; use json"
+            )
+        if self.answer != "json" and self.thinking:
+            raise UserError(
+                f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
+                "which only json leaves room for"
+            )
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and self.card.engine != "transformers":
                 raise UserError(
@@ -77,6 +91,7 @@ class Spec:
             "seeds": list(self.seeds),
             "limit": self.limit,
             "thinking": self.thinking,
+            "answer": self.answer,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
         }  # fmt: skip
@@ -86,7 +101,8 @@ class Spec:
         options = [
             ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
             ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
-            *(("--condition", point.name) for point in self.points), ("--batch-size", self.batch_size),
+            *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
+            ("--batch-size", self.batch_size),
             ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]

@@ -1,0 +1,59 @@
+"""What a language model's engine can do: go forward over tokens, and say which comes next.
+
+The ways of answering are written once, on top of this; an engine knows nothing of JSON, letters or roles.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from harness.arrays import Floats
+from harness.backends.chat import Chat
+
+
+class Session(Protocol):
+    """n sequences that go forward together, each with a distribution over its next token."""
+
+    def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        """Most likely next token of each sequence: of the tokens listed for it, or of all where None.
+
+        The lowest id wins a tie.
+        """
+        ...
+
+    def log_probs(self, tokens: Sequence[int]) -> Floats:
+        """Natural log-probabilities of some tokens as the next one, of the whole vocabulary, (n, len)."""
+        ...
+
+    def advance(self, chunks: Sequence[Sequence[int]]) -> None:
+        """Append tokens to each sequence. An empty chunk leaves a sequence and its distribution alone."""
+        ...
+
+    def keep(self, places: Sequence[int]) -> None:
+        """Go on with these sequences only, in this order: n becomes len(places)."""
+        ...
+
+    def close(self) -> None:
+        """Give the memory back."""
+        ...
+
+
+class Engine(Protocol):
+    """A loaded model.
+
+    Attributes:
+        chat: its tokenizer and chat template.
+        context_tokens: most tokens of one sequence.
+        stops: token ids that end an answer, sorted.
+    """
+
+    chat: Chat
+    context_tokens: int
+    stops: Sequence[int]
+
+    def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
+        """Read some prompts, none of them empty; what they begin with in common is computed once."""
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the answers, as JSON: engine, versions, weights, settings."""
+        ...
