@@ -1,170 +1,83 @@
 """From a frozen dataset to a small model, in stages that a kill does not undo."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-import torch
-
-from harness import readout
-from harness.arrays import Floats
 from harness.dataset.load import Dataset
-from harness.distill.answers import answer
-from harness.distill.examples import Question, alone, kl_nats, split, with_messages
-from harness.distill.model import new_model
-from harness.distill.text import END, PAD, chat, save_tokenizer, train_tokenizer
-from harness.distill.train import Plan, Sample, read_out, run_stage, save
-from harness.files import write_whole
+from harness.distill.card import model_card
+from harness.distill.student import Progress, Student
+from harness.distill.text import save_tokenizer
+from harness.distill.train import STAGES, Plan
+from harness.errors import UserError, printable
+from harness.files import canonical_json, write_whole
+from harness.gguf_export import export
 from harness.prompts import Prompt
-
-REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
-BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be
-HELD_OUT = 0.05  # episodes that are not trained on, a share of all
-
-Progress = Callable[[str, int, float], None]
-T = TypeVar("T")
-
-
-class Distilling:
-    """One run: the dataset as questions, the tokenizer, and the model as it grows."""
-
-    def __init__(
-        self, dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, work: Path, device: str
-    ) -> None:
-        self.plan, self.work, self.prompts, self.actions = plan, work, prompts, dataset.actions
-        work.mkdir(parents=True, exist_ok=True)
-        episodes = len({s.record["episode"] for s in dataset.scenes})
-        self.data, self.held_out = split(dataset, max(1, round(episodes * HELD_OUT)))
-        self.questions = list(alone(self.data, prompts))
-        self.tokenizer = self._tokenizer()
-        self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(self.actions)]
-        end, pad = (self.tokenizer.token_to_id(t) for t in (END, PAD))
-        self.model = new_model(self.tokenizer.get_vocab_size(), end, pad, plan.seed).to(device)
-        self._shared: dict[str, Any] = {}
-
-    def reading(self, questions: Sequence[Question]) -> list[Sample]:
-        """Samples that end where one letter is asked for."""
-        return [self._sample(readout.asked(q.messages, self.actions), "", q.label) for q in questions]
-
-    def writing(self, questions: Sequence[Question], intents: Floats) -> list[Sample]:
-        """Samples whose answer states a distribution."""
-        bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
-        return [
-            self._sample(q.messages, answer(q.prompt, q.graph, p, self.actions, bare=bool(b)) + END, None)
-            for q, p, b in zip(questions, intents, bare, strict=True)
-        ]
-
-    def heard(self, reading: Sequence[Sample]) -> list[Question]:
-        """The ego's questions with messages, in some of the scenes; `reading` is of `self.questions`."""
-        most = self.plan.samples["messages"] // (4 * len(self.prompts))
-        data = replace(self.data, scenes=tuple(self.some(self.data.scenes, most)))
-        ids = {scene.id for scene in data.scenes}
-        spoke = [
-            (q.key, sample)
-            for q, sample in zip(self.questions, reading, strict=True)
-            if q.graph["role"] == "helper" and q.key.split("/")[0] in ids
-        ]
-        intents = self.read([sample for _, sample in spoke])
-        return list(with_messages(data, self.prompts, dict(zip((k for k, _ in spoke), intents, strict=True))))
-
-    def some(self, items: Sequence[T], most: int) -> list[T]:
-        """At most so many of them, drawn by the plan's seed, in their order."""
-        places = np.random.default_rng(self.plan.seed).permutation(len(items))[:most]
-        return [items[i] for i in sorted(places)]
-
-    def stage(self, name: str, samples: Sequence[Sample], progress: Progress) -> list[tuple[int, float]]:
-        """Train one stage, or take it over where it is done already. Returns its curve."""
-        done = self.work / f"{name}.pt"
-        if done.is_file():
-            state = torch.load(done, weights_only=True)
-            self.model.load_state_dict(state["model"])
-            return [tuple(point) for point in state["curve"]]
-        going = self.work / f"{name}.going.pt"
-        curve = run_stage(
-            self.model, samples, self.letters, self.plan.samples[name], self.plan,
-            lambda n, loss: progress(name, n, loss), going,
-        )  # fmt: skip
-        save({"model": self.model.state_dict(), "curve": curve}, done)
-        going.unlink(missing_ok=True)
-        return curve
-
-    def read(self, samples: Sequence[Sample]) -> Floats:
-        """Read-outs of some samples, (n, A)."""
-        p: Floats = read_out(self.model, samples, self.letters)
-        return p
-
-    def _sample(self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None) -> Sample:
-        system, rest = chat(messages)
-        if system not in self._shared:
-            self._shared[system] = self._encode(system)
-        head, asked = self._shared[system], self._encode(rest)
-        ids = np.concatenate([head, asked, self._encode(said)])
-        return Sample(ids, len(head), system, len(head) + len(asked), target)
-
-    def _encode(self, text: str) -> Any:
-        return np.array(self.tokenizer.encode(text).ids, dtype=np.int32)
-
-    def _tokenizer(self) -> Any:
-        from tokenizers import Tokenizer
-
-        file = self.work / "tokenizer.json"
-        if not file.is_file():
-            some = self.questions[:: max(1, len(self.questions) // 5000)]
-            texts = ["".join(chat(readout.asked(q.messages, self.actions))) for q in some]
-            texts += [answer(q.prompt, q.graph, q.label, self.actions) for q in some]
-            train_tokenizer(texts).save(str(file))
-        return Tokenizer.from_file(str(file))
 
 
 def distill(
     dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, out: Path, progress: Progress, device: str
 ) -> dict[str, Any]:
-    """Train a model on a dataset and write checkpoint, tokenizer, GGUF and model card to `out`.
+    """Train a model on a dataset and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
     Stages that an earlier, killed call finished are taken over, and one it had begun goes on.
 
+    Args:
+        dataset: what it learns from.
+        prompts: versions that it learns to read.
+        plan: how long.
+        out: folder to make; its name is the model's.
+        progress: called with the stage, the sequences seen in it and the loss.
+        device: `cpu` or `cuda`.
+
     Returns:
         What the model card states: data, plan, curves, and the KL of the read-out on held-out episodes.
+
+    Raises:
+        UserError: the folder holds something else.
     """
-    run = Distilling(dataset, prompts, plan, out / ".work", device)
-    curves = {}
-    reading = run.reading(run.questions)
-    curves["alone"] = run.stage("alone", reading, progress)
-
-    heard = run.heard(reading)
-    hearing = run.reading(heard)
-    rehearsed = run.some(reading, len(hearing))
-    curves["messages"] = run.stage("messages", hearing + rehearsed, progress)
-
-    asked = list(zip(run.questions + heard, reading + hearing, strict=True))
-    spoken = run.some(asked[: len(reading)], plan.samples["answers"] // 3)
-    spoken += run.some(asked[len(reading) :], plan.samples["answers"] // 6)
-    intents = run.read([sample for _, sample in spoken])
-    texts = run.writing([question for question, _ in spoken], intents)
-    rehearsed = run.some(reading + hearing, int(REHEARSED * len(texts)))
-    curves["answers"] = run.stage("answers", texts + rehearsed, progress)
-
-    run.model.eval()
-    run.model.save_pretrained(out)
-    save_tokenizer(run.tokenizer, out)
-    apart = list(alone(run.held_out, prompts))
-    labels = np.stack([q.label for q in apart])
-    read = run.read(run.reading(apart))
+    work = _begin(out, {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)})
+    student = Student(dataset, prompts, plan, work, device)
+    curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
         "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest["seed"],
-                    "episodes": dataset.manifest["episodes"], "scenes": len(dataset.scenes),
-                    "held_out_scenes": len(run.held_out.scenes)},
+                    "episodes": dataset.manifest["episodes"], "scenes": len(dataset.scenes)},
         "prompts": {p.version: p.sha256 for p in prompts},
         "plan": asdict(plan),
-        "parameters": sum(p.numel() for p in run.model.parameters()),
-        "vocabulary": run.tokenizer.get_vocab_size(),
+        "parameters": sum(p.numel() for p in student.model.parameters()),
+        "vocabulary": student.tokenizer.get_vocab_size(),
+        "held_out": student.held_out_kl(),
         "curves": curves,
-        "held_out_kl_nats": kl_nats(labels, read),
-        "held_out_kl_of_the_mean_nats": kl_nats(labels, np.broadcast_to(labels.mean(axis=0), labels.shape)),
-        "held_out_questions": len(apart),
     }  # fmt: skip
+    student.model.eval()
+    student.model.save_pretrained(out)
+    save_tokenizer(student.tokenizer, out)
+    export(out, out / f"{out.absolute().name}-f16.gguf")
+    write_whole(out / "README.md", model_card(out.absolute().name, facts))
     write_whole(out / "training.json", json.dumps(facts, indent=1) + "\n")
+    shutil.rmtree(work)
     return facts
+
+
+def _begin(out: Path, settings: dict[str, Any]) -> Path:
+    """The working folder, new or the one that a killed call with the same settings left."""
+    shown, work = printable(out), out / ".work"
+    kept = work / "settings.json"
+    if kept.is_file():
+        if json.loads(kept.read_text()) != json.loads(canonical_json(settings)):
+            raise UserError(
+                f"--out {shown} was begun with another dataset, prompt, seed or samples; repeat those, "
+                "or delete it"
+            )
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"--out {shown} exists; choose a new folder")
+    try:
+        write_whole(kept, canonical_json(settings))
+    except OSError as error:
+        raise UserError(
+            f"--out {shown} cannot be written ({error.strerror}); choose another folder"
+        ) from None
+    return work

@@ -1,4 +1,4 @@
-"""The embedded model's own language: a small BPE tokenizer with ChatML, of what it reads and writes."""
+"""The embedded model's own language: a small BPE tokenizer with ChatML."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
