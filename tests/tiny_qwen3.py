@@ -1,4 +1,4 @@
-"""A real Qwen3 small enough for a test: random weights, a small BPE that splits as Qwen2's, a thinking switch.
+"""A real Qwen3 small enough for a test: random weights, a BPE that splits as Qwen2's, a thinking switch.
 
 Nothing is downloaded. The weights are random, so tests speak of plumbing, never of what is said.
 """
