@@ -1,11 +1,13 @@
 """The backend of every language model that runs in this process, whatever its engine."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 from harness.backends.base import Completion, Request
-from harness.backends.transformers_engine import TransformersEngine
+from harness.backends.decoding import Answer, Decoding
+from harness.backends.engine import Engine
 from harness.errors import printable
 
 
@@ -26,28 +28,32 @@ class LanguageModel:
         batch_size: most requests that go through the engine together.
     """
 
-    def __init__(self, engine: TransformersEngine, batch_size: int) -> None:
+    def __init__(self, engine: Engine, batch_size: int) -> None:
         self.engine = engine
         self.chat = engine.chat
         self.batch_size = batch_size
+        self._decoding = Decoding(engine)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in the same order.
 
-        `completion_tokens` counts what was generated, the stop token included, padding not. Requests of
-        like length share a batch. A batch that fails is asked again, one request at a time.
+        `completion_tokens` counts what was written, the stop token and fixed tokens included, padding not.
+        A batch that fails is asked again, one request at a time.
+
+        Raises:
+            UserError: the tokenizer or `max_tokens` leaves no room for the way of answering, or the template
+                refuses the messages.
         """
         done: dict[int, Completion] = {}
         fitting = []
         for position, request in enumerate(requests):
             ids = self.chat.encode(self.chat.render(request.messages, thinking=request.thinking))
-            if len(ids) + request.max_tokens > self.engine.context_tokens:
-                done[position] = _failed(request, len(ids), self._overflow(len(ids), request.max_tokens))
+            room = self._decoding.room(request)
+            if len(ids) + room > self.engine.context_tokens:
+                done[position] = _failed(request, len(ids), self._overflow(len(ids), room))
             else:
                 fitting.append(_Prompt(position, request, ids))
-        fitting.sort(key=lambda p: (p.request.max_tokens, len(p.ids)), reverse=True)
-        for start in range(0, len(fitting), self.batch_size):
-            batch = fitting[start : start + self.batch_size]
+        for batch in self._batches(fitting):
             for prompt, completion in zip(batch, self._answer(batch), strict=True):
                 done[prompt.position] = completion
         return [done[position] for position in range(len(requests))]
@@ -56,55 +62,59 @@ class LanguageModel:
         """What decides the answers: the engine's."""
         return self.engine.identity()
 
-    def _overflow(self, prompt_tokens: int, max_tokens: int) -> str:
+    def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:
+        """Prompts that are answered alike, begin alike (a role has one system prompt) and are as long."""
+
+        def kind(p: _Prompt) -> tuple[str, str, int, int]:
+            return p.request.answer, p.request.role, p.request.max_tokens, len(p.ids)
+
+        for _, same in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
+            alike = list(same)
+            for start in range(0, len(alike), self.batch_size):
+                yield alike[start : start + self.batch_size]
+
+    def _overflow(self, prompt_tokens: int, room: int) -> str:
         return (
-            f"context overflow: {prompt_tokens + max_tokens} tokens > {self.engine.context_tokens} "
-            f"({prompt_tokens} in the prompt, {max_tokens} for the answer)"
+            f"context overflow: {prompt_tokens + room} tokens > {self.engine.context_tokens} "
+            f"({prompt_tokens} in the prompt, {room} for the answer)"
         )
 
     def _answer(self, batch: list[_Prompt]) -> list[Completion]:
         answered = self._try(batch)
         if isinstance(answered, list):
             return answered
-        # Out here the failed batch's tensors are gone, so the retry has the whole memory.
-        self.engine.free()
+        # Out here nothing of the failed batch is alive, so that an engine can free its memory.
         completions = []
         for prompt in batch:
             alone = self._try([prompt])
-            if isinstance(alone, list):
-                completions += alone
-            else:
-                completions.append(_failed(prompt.request, len(prompt.ids), alone))
-                self.engine.free()
+            completions += (
+                alone if isinstance(alone, list) else [_failed(prompt.request, len(prompt.ids), alone)]
+            )
         return completions
 
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
         """Completions of a batch, or the engine's message."""
         try:
             start_s = time.perf_counter()
-            generated = self.engine.generate([p.ids for p in batch], max(p.request.max_tokens for p in batch))
+            answers = self._decoding.answer([p.request for p in batch], [p.ids for p in batch])
             seconds = time.perf_counter() - start_s
         except Exception as error:  # an engine may fail in any way; what it says is data
             return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
         alone = seconds if len(batch) == 1 else None
-        return [
-            self._completion(p, tokens, alone, len(batch)) for p, tokens in zip(batch, generated, strict=True)
-        ]
+        return [_completion(p, answer, alone, len(batch)) for p, answer in zip(batch, answers, strict=True)]
 
-    def _completion(
-        self, prompt: _Prompt, tokens: list[int], seconds: float | None, batch_size: int
-    ) -> Completion:
-        tokens = tokens[: prompt.request.max_tokens]
-        end = next((i for i, token in enumerate(tokens) if token in self.engine.stops), None)
-        return Completion(
-            request_id=prompt.request.id,
-            text=self.chat.decode(tokens[:end]),
-            prompt_tokens=len(prompt.ids),
-            completion_tokens=len(tokens) if end is None else end + 1,
-            finish_reason="length" if end is None else "stop",
-            seconds=seconds,
-            batch_size=batch_size,
-        )
+
+def _completion(prompt: _Prompt, answer: Answer, seconds: float | None, batch_size: int) -> Completion:
+    return Completion(
+        request_id=prompt.request.id,
+        text=answer.text,
+        prompt_tokens=len(prompt.ids),
+        completion_tokens=answer.tokens,
+        finish_reason=answer.finish_reason,
+        seconds=seconds,
+        batch_size=batch_size,
+        label_mass=answer.label_mass,
+    )
 
 
 def _failed(request: Request, prompt_tokens: int, error: str) -> Completion:

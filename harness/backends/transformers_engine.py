@@ -1,30 +1,28 @@
 """Hugging Face transformers as an engine: any causal language model, on CPU or CUDA."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 from harness.backends import checkpoint
 from harness.backends.chat import Chat
+from harness.backends.engine import Session
+from harness.backends.language_model import LanguageModel
 from harness.cards import Card, Dtype
 from harness.errors import UserError, printable
 from harness.files import sha256_bytes
 
-if TYPE_CHECKING:
-    from harness.backends.language_model import LanguageModel
-
 
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
-) -> "LanguageModel":
+) -> LanguageModel:
     """Find and load a card's weights.
 
     Raises:
         UserError: a package, the device, the weights or the chat template is missing, or files do not load.
     """
-    from harness.backends.language_model import LanguageModel
-
     if package := checkpoint.missing_package():
         raise UserError(
             f"model {card.name!r} needs {package}, which is not installed; "
@@ -54,10 +52,17 @@ def _device(asked: str | None) -> str:
 
 
 class TransformersEngine:
-    """A loaded model with its tokenizer."""
+    """A loaded model with its tokenizer.
+
+    Attributes:
+        chat: its tokenizer and chat template.
+        context_tokens: the card's bound, else the checkpoint's own.
+        stops: token ids that end an answer, sorted.
+        model: the transformers model.
+    """
 
     def __init__(self, card: Card, where: Path, loaded: checkpoint.Loaded) -> None:
-        from transformers import GenerationConfig
+        from harness.backends.transformers_session import Reader
 
         self.card = card
         self.where = where
@@ -69,12 +74,12 @@ class TransformersEngine:
         listed = self.model.generation_config.eos_token_id or []
         # A chat model's turn may end with a token that its generation config does not list.
         ends = {*(listed if isinstance(listed, list) else [listed]), loaded.tokenizer.eos_token_id}
-        self.stops = sorted(ends - {None})
-        self._pad = loaded.tokenizer.pad_token_id or 0  # masked, so any token does
-        # In place of the checkpoint's own, whose sampling defaults would be merged in.
-        self.model.generation_config = GenerationConfig(
-            do_sample=False, eos_token_id=self.stops or None, pad_token_id=self._pad
-        )
+        self.stops: Sequence[int] = sorted(ends - {None})
+        self._reader = Reader(self.model)
+
+    def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
+        """Read some prompts. What they begin with in common, or earlier prompts did, is computed once."""
+        return self._reader.begin(prompts)
 
     def identity(self) -> dict[str, Any]:
         """What decides the answers: a hub checkpoint is named by its commit, any other by its files."""
@@ -94,27 +99,3 @@ class TransformersEngine:
     @cached_property
     def _files_sha256(self) -> str:
         return checkpoint.files_sha256(self.where)
-
-    def generate(self, prompts: list[list[int]], max_new_tokens: int) -> list[list[int]]:
-        """What follows each prompt, decoded greedily together."""
-        import torch
-
-        width = max(map(len, prompts))
-        ids = torch.full((len(prompts), width), self._pad)
-        mask = torch.zeros_like(ids)
-        for row, prompt in enumerate(prompts):
-            ids[row, width - len(prompt) :] = torch.tensor(prompt)
-            mask[row, width - len(prompt) :] = 1
-        device = self.model.device
-        out = self.model.generate(
-            input_ids=ids.to(device), attention_mask=mask.to(device), max_new_tokens=max_new_tokens
-        )
-        tokens: list[list[int]] = out[:, width:].tolist()
-        return tokens
-
-    def free(self) -> None:
-        """Give memory back after a failure."""
-        import torch
-
-        if self.model.device.type == "cuda":
-            torch.cuda.empty_cache()
