@@ -10,7 +10,7 @@ _OPEN: dict[Engine, str] = {
     "proxy": "harness.backends.proxy:open",
     "driver": "harness.backends.driver:open",
     "replay": "harness.backends.replay:open",
-    "transformers": "harness.backends.transformers_backend:open",
+    "transformers": "harness.backends.transformers_engine:open",
 }
 
 
