@@ -112,7 +112,7 @@ class Decoding:
         skeleton = self._skeletons[key]
         if skeleton.most_tokens > request.max_tokens:
             raise UserError(
-                f"model {printable(self._chat.name)!r}: a constrained answer of a {request.role} takes "
+                f"model {printable(self._chat.name)!r}: a constrained {request.role} answer takes "
                 f"{skeleton.most_tokens} tokens, and {request.max_tokens} are allowed; raise max_new_tokens"
             )
         return skeleton

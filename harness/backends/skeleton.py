@@ -72,7 +72,12 @@ def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
 
 
 class Ask(NamedTuple):
-    """A decision: tokens to append first, the last decision's among them, and the sorted tokens to choose from."""
+    """A decision of a walk.
+
+    Attributes:
+        forced: tokens to append before it is made, the last decision's among them.
+        among: tokens to choose from, sorted.
+    """
 
     forced: list[int]
     among: list[int]

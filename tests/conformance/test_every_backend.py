@@ -4,12 +4,13 @@ import json
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from evaluating import run, spec_of
 
 from harness import cards
-from harness.backends.base import Backend, Request
+from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.registry import missing, open_backend
 from harness.dataset.load import load
 from harness.run.asking import requests
@@ -27,12 +28,17 @@ def model_free() -> list[str]:
     return [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
 
 
-ENGINES = [*model_free(), "replay", "transformers"]
+LANGUAGE_MODELS = ("transformers",)
+ENGINES = [
+    *((name, "json") for name in (*model_free(), "replay")),
+    *((engine, answer) for engine in LANGUAGE_MODELS for answer in get_args(AnswerMode)),
+]
 
 
-@pytest.fixture(scope="module", params=ENGINES)
+@pytest.fixture(scope="module", params=ENGINES, ids="-".join)
 def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    folder, model = tmp_path_factory.mktemp("conformance"), request.param
+    folder = tmp_path_factory.mktemp("conformance")
+    model, answer = request.param
     data = load(small_path, limit=1)
     if model == "replay":
         run(spec_of(data, seeds=(0,)), folder / "run")
@@ -43,16 +49,34 @@ def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pyt
         import tiny_qwen3
 
         model = str(tiny_qwen3.build(folder / "tiny", context_tokens=2048))
-    spec = spec_of(data, model)
-    asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in requests(spec, data.scenes[:5])]
+    spec = spec_of(data, model, answer=answer)
+    asked = list(requests(spec, data.scenes[:5]))
+    if answer == "json":  # the others take what they take
+        asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
     device = "cpu" if spec.card.engine == "transformers" else None
     return Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", "transformers"}
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", *LANGUAGE_MODELS}
     assert tried == set(cards.Engine.__args__)
     assert all(missing(cards.load(name)) is None for name in model_free())
+
+
+def same(one: list[Completion], other: list[Completion]) -> None:
+    """Equal texts; a read-out's numbers as far as they do not depend on how float32 is summed up."""
+    for a, b in zip(one, other, strict=True):
+        if a.label_mass is None:
+            assert a.text == b.text
+        else:
+            p, q = (json.loads(c.text)["action_distribution"] for c in (a, b))
+            assert p == pytest.approx(q, abs=1e-5)
+
+
+def test_a_read_out_and_only_a_read_out_says_how_much_was_on_its_letters(case: Case) -> None:
+    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+        assert (c.label_mass is not None) == (r.answer == "readout")
+        assert c.label_mass is None or 0 < c.label_mass <= 1
 
 
 def test_there_is_one_completion_a_request_in_the_order_asked(case: Case) -> None:
@@ -82,10 +106,10 @@ def test_an_engine_that_has_tokens_keeps_to_the_most_that_is_allowed(case: Case)
 
 
 def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) -> None:
-    first = [c.text for c in case.backend.complete(case.asked)]
-    assert [c.text for c in case.backend.complete(case.asked)] == first
-    assert [case.backend.complete([r])[0].text for r in case.asked] == first
-    assert [c.text for c in case.backend.complete(case.asked[::-1])] == first[::-1]
+    first = case.backend.complete(case.asked)
+    same(case.backend.complete(case.asked), first)
+    same([case.backend.complete([r])[0] for r in case.asked], first)
+    same(case.backend.complete(case.asked[::-1]), first[::-1])
 
 
 def test_its_identity_is_json_and_stays_the_same(case: Case) -> None:

@@ -1,0 +1,251 @@
+"""The three ways of answering, held to naive forwards of a real tiny Qwen3: uncached, unbatched, whole."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("transformers", reason="needs the transformers extra")
+
+import tiny_qwen3
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness import readout
+from harness.backends.base import AnswerMode, Completion, Request
+from harness.backends.decoding import Decoding
+from harness.backends.language_model import LanguageModel
+from harness.backends.registry import open_backend
+from harness.backends.transformers_engine import TransformersEngine
+from harness.cards import resolve
+from harness.errors import UserError
+from harness.parse import parse
+from harness.rounding import rounded
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+LANES = ("LANE_LEFT", "IDLE", "LANE_RIGHT")
+MODES: tuple[AnswerMode, ...] = ("json", "constrained", "readout")
+
+
+@pytest.fixture(scope="module")
+def backend(tmp_path_factory: pytest.TempPathFactory) -> LanguageModel:
+    folder = tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny-qwen3")
+    opened = open_backend(resolve(str(folder)), batch_size=4, device="cpu")
+    assert isinstance(opened, LanguageModel)
+    return opened
+
+
+def ask(
+    i: int, answer: AnswerMode = "json", role: Any = "ego", actions: tuple[str, ...] = ACTIONS, **options: Any
+) -> Request:
+    """Scene i, asked by a viewer of some role; helpers have another system prompt."""
+    messages: Any = (
+        {"role": "system", "content": f"You are the {role} and drive with care at every crossing."},
+        {"role": "user", "content": f"Scene {i * 'x'}: truck {i * 7} m"},
+    )
+    if answer == "readout":
+        messages = readout.asked(messages, actions)
+    options = {"max_tokens": 12 if answer == "json" else 80, **options}
+    return Request(f"s{i}/{role}", role, messages, actions, answer=answer, **options)
+
+
+def engine_of(backend: LanguageModel) -> TransformersEngine:
+    assert isinstance(backend.engine, TransformersEngine)
+    return backend.engine
+
+
+def prompt_of(backend: LanguageModel, request: Request) -> list[int]:
+    return backend.chat.encode(backend.chat.render(request.messages, thinking=request.thinking))
+
+
+def naive(backend: LanguageModel, ids: Sequence[int]) -> Any:
+    """Logits of the next token, by one forward over everything."""
+    with torch.inference_mode():
+        return engine_of(backend).model(torch.tensor([list(ids)])).logits[0, -1]
+
+
+def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> str:
+    """Which of some texts that are one token each is the likeliest to come next."""
+    tokens = [token for text in texts for token in backend.chat.encode(text)]
+    assert len(tokens) == len(texts)
+    return texts[int(naive(backend, ids)[tokens].argmax())]
+
+
+# -- json ---------------------------------------------------------------------------------------------
+
+
+def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
+    from transformers import GenerationConfig
+
+    engine = engine_of(backend)
+    engine.model.generation_config = config = GenerationConfig(
+        do_sample=False, eos_token_id=list(engine.stops), pad_token_id=0, max_new_tokens=24
+    )
+    requests = [ask(i, max_tokens=24) for i in range(12)]
+    lengths = set()
+    for request, completion in zip(requests, backend.complete(requests), strict=True):
+        ids = torch.tensor([prompt_of(backend, request)])
+        out = engine.model.generate(ids, attention_mask=torch.ones_like(ids), generation_config=config)
+        said = out[0, ids.shape[1] :].tolist()
+        stopped = said[-1] in engine.stops
+        assert completion.text == backend.chat.decode(said[:-1] if stopped else said)
+        assert completion.completion_tokens == len(said)
+        assert completion.finish_reason == ("stop" if stopped else "length")
+        lengths.add(len(said))
+    assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
+
+
+# -- constrained --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("i", [0, 3, 8])
+def test_each_digit_is_the_likeliest_of_ten(backend: LanguageModel, i: int) -> None:
+    request = ask(i, "constrained")
+    ids = prompt_of(backend, request)
+    digits: list[int] = []
+    written = 0
+    for opening in ('{"action_distribution":{"SLOWER":0.', ',"IDLE":0.', ',"FASTER":0.'):
+        ids += backend.chat.encode(opening)
+        two = ""
+        for _ in range(2):
+            two += best(backend, ids, "0123456789")
+            ids += backend.chat.encode(two[-1])
+        digits.append(int(two))
+        written += len(backend.chat.encode(opening)) + 2
+    said = rounded([d / sum(digits) for d in digits])
+    [completion] = backend.complete([request])
+    assert json.loads(completion.text) == {"action_distribution": dict(zip(ACTIONS, said, strict=True))}
+    assert completion.completion_tokens == written + len(backend.chat.encode("}}"))
+    assert completion.finish_reason == "stop"
+
+
+def test_a_lane_is_chosen_where_the_lanes_part(backend: LanguageModel) -> None:
+    """By hand: which label begins best, and only then which lane."""
+    left, _, right = (backend.chat.encode(label) for label in LANES)
+    shared = next(i for i, (a, b) in enumerate(zip(left, right, strict=False)) if a != b)
+    assert shared > 0, "labels that share no token would show nothing"
+    lanes = set()
+    for i in range(12):
+        request = ask(i, "constrained", "helper", LANES, form="recommendation")
+        ids = prompt_of(backend, request)
+        ids += backend.chat.encode('{"evidence":"","risk":"')
+        starts = [backend.chat.encode(risk)[0] for risk in ("low", "medium", "high")]
+        risk = ("low", "medium", "high")[int(naive(backend, ids)[starts].argmax())]
+        ids += backend.chat.encode(risk + '","recommended_maneuver":"')
+        idle = backend.chat.encode("IDLE")[0]
+        logits = naive(backend, ids)
+        maneuver = "IDLE"
+        if logits[left[0]] > logits[idle]:
+            logits = naive(backend, ids + left[:shared])
+            maneuver = "LANE_LEFT" if logits[left[shared]] > logits[right[shared]] else "LANE_RIGHT"
+        [completion] = backend.complete([request])
+        said = json.loads(completion.text)
+        assert (said["risk"], said["recommended_maneuver"], said["evidence"]) == (risk, maneuver, "")
+        lanes.add(maneuver)
+    assert len(lanes) > 1
+
+
+def test_an_answer_that_does_not_fit_its_bound_is_the_users_to_know(backend: LanguageModel) -> None:
+    fits = backend.complete([ask(1, "constrained", max_tokens=25)])[0]
+    assert fits.completion_tokens == 25
+    with pytest.raises(UserError, match=r"constrained ego answer takes 25 tokens, and 24 are allowed; raise"):
+        backend.complete([ask(1, "constrained", max_tokens=24)])
+
+
+# -- readout ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("i", [0, 3, 8])
+def test_the_letters_probabilities_are_the_answer(backend: LanguageModel, i: int) -> None:
+    request = ask(i, "readout")
+    letters = [backend.chat.encode(letter)[0] for letter in "ABC"]
+    p = naive(backend, prompt_of(backend, request)).double().softmax(-1)[letters]
+    [completion] = backend.complete([request])
+    said = json.loads(completion.text)["action_distribution"]
+    assert [said[a] for a in ACTIONS] == pytest.approx((p / p.sum()).tolist(), abs=1e-5)
+    assert completion.label_mass == pytest.approx(float(p.sum()), rel=1e-4)
+    assert (completion.completion_tokens, completion.finish_reason) == (1, "stop")
+
+
+def test_scenes_with_more_and_fewer_actions_are_read_out_together(backend: LanguageModel) -> None:
+    few, many = ask(2, "readout"), ask(2, "readout", actions=("SLOWER", "IDLE", "FASTER", *LANES[::2]))
+    together = backend.complete([few, many])
+    assert [c.batch_size for c in together] == [2, 2]
+    same([backend.complete([r])[0] for r in (few, many)], together)
+    assert [len(json.loads(c.text)["action_distribution"]) for c in together] == [3, 5]
+
+
+def test_a_read_out_needs_room_for_one_token(backend: LanguageModel) -> None:
+    request = ask(4, "readout")
+    tokens = len(prompt_of(backend, request))
+    context = engine_of(backend).context_tokens
+    try:
+        engine_of(backend).context_tokens = tokens + 1
+        assert backend.complete([request])[0].error is None
+        engine_of(backend).context_tokens = tokens
+        assert f"{tokens + 1} tokens > {tokens}" in str(backend.complete([request])[0].error)
+    finally:
+        engine_of(backend).context_tokens = context
+
+
+@pytest.mark.parametrize("encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))])
+def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
+    engine: Any = SimpleNamespace(chat=SimpleNamespace(name="odd", encode=encode))
+    with pytest.raises(UserError, match=r"'odd'.* no single token for each of the letters ABC; use --answer"):
+        Decoding(engine).room(ask(0, "readout"))
+
+
+# -- all of them --------------------------------------------------------------------------------------
+
+
+def same(one: Sequence[Completion], other: Sequence[Completion]) -> None:
+    """Equal but for company: a read-out's numbers may differ by what float32 rounds."""
+    for a, b in zip(one, other, strict=True):
+        alone = {"batch_size": 1, "seconds": None, "text": "", "label_mass": None}
+        assert replace(a, **alone) == replace(b, **alone)
+        if a.label_mass is None:
+            assert a.text == b.text
+        else:
+            assert b.label_mass == pytest.approx(a.label_mass, rel=1e-4)
+            p, q = (json.loads(c.text)["action_distribution"] for c in (a, b))
+            assert p == pytest.approx(q, abs=1e-5)
+
+
+REQUESTS = st.builds(
+    ask,
+    st.integers(0, 12),
+    st.sampled_from(MODES),
+    st.sampled_from(["ego", "helper"]),
+    st.sampled_from([ACTIONS, LANES]),
+    form=st.sampled_from(["distribution", "recommendation"]),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(REQUESTS, max_size=7))
+def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
+    together = backend.complete(requests)
+    same([backend.complete([request])[0] for request in requests], together)
+
+
+@settings(max_examples=15, deadline=None)
+@given(REQUESTS.filter(lambda r: r.answer != "json"))
+def test_an_answer_that_is_not_free_text_is_always_strict(backend: LanguageModel, request: Request) -> None:
+    [completion] = backend.complete([request])
+    role = "ego" if request.answer == "readout" else request.role
+    parsed = parse(completion.text, role=role, actions=request.actions)
+    assert parsed.verdict == "strict", parsed.detail
+    if parsed.mass is not None:
+        assert math.isclose(parsed.mass, 1, abs_tol=1e-6)
+    assert (completion.label_mass is not None) == (request.answer == "readout")
+
+
+def test_requests_that_are_answered_alike_share_a_batch(backend: LanguageModel) -> None:
+    requests = [ask(i, mode) for i in range(3) for mode in MODES]
+    assert [c.batch_size for c in backend.complete(requests)] == [3] * 9

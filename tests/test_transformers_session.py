@@ -1,0 +1,247 @@
+"""Sequences that go forward together say what each says alone, read whole and uncached."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("transformers", reason="needs the transformers extra")
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3ForCausalLM
+
+from harness.backends import prefixes
+from harness.backends.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
+from harness.backends.transformers_session import Reader
+
+SHAPE: dict[str, Any] = {
+    "vocab_size": 64, "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,
+    "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 8, "max_position_embeddings": 256,
+    "initializer_range": 0.6,
+}  # fmt: skip
+EVERY = list(range(64))
+tokens = st.integers(0, 63)
+
+
+def full_attention() -> Any:
+    torch.manual_seed(0)
+    return Qwen3ForCausalLM(Qwen3Config(**SHAPE)).eval()
+
+
+def sliding_window() -> Any:
+    torch.manual_seed(0)
+    layers = ["sliding_attention", "full_attention"]
+    return Gemma3ForCausalLM(Gemma3TextConfig(**SHAPE, sliding_window=6, layer_types=layers)).eval()
+
+
+@pytest.fixture(scope="module", params=[full_attention, sliding_window], ids=lambda f: f.__name__)
+def model(request: pytest.FixtureRequest) -> Any:
+    return request.param()
+
+
+@pytest.fixture(scope="module")
+def qwen() -> Any:
+    return full_attention()
+
+
+def naive(model: Any, sequences: Sequence[Sequence[int]]) -> Any:
+    """Log-probabilities of every token as the next one, each sequence by one forward."""
+    with torch.inference_mode():
+        rows = [model(torch.tensor([list(ids)])).logits[0, -1] for ids in sequences]
+    return torch.stack(rows).double().log_softmax(-1).numpy()
+
+
+@contextmanager
+def widths(model: Any) -> Iterator[list[tuple[int, int]]]:
+    """Rows and columns of every forward in the block."""
+    seen: list[tuple[int, int]] = []
+
+    def look(_: Any, args: Any, options: Any) -> None:
+        seen.append(tuple(options["input_ids"].shape))
+
+    hook = model.register_forward_pre_hook(look, with_kwargs=True)
+    try:
+        yield seen
+    finally:
+        hook.remove()
+
+
+# -- a session ----------------------------------------------------------------------------------------
+
+
+@given(
+    st.lists(tokens, max_size=20),
+    st.lists(st.lists(tokens, min_size=1, max_size=12), min_size=1, max_size=4),
+    st.data(),
+)
+def test_any_way_of_going_forward_ends_where_one_forward_does(
+    model: Any, shared: list[int], ends: list[list[int]], data: st.DataObject
+) -> None:
+    sequences = [[*shared, *end] for end in ends]
+    with closing(Reader(model).begin(sequences)) as session:
+        for _ in range(data.draw(st.integers(0, 3))):
+            if data.draw(st.booleans()):
+                places = data.draw(st.lists(st.sampled_from(range(len(sequences))), min_size=1, unique=True))
+                session.keep(places)
+                sequences = [sequences[place] for place in places]
+            chunks = [data.draw(st.lists(tokens, max_size=4)) for _ in sequences]
+            session.advance(chunks)
+            sequences = [[*ids, *chunk] for ids, chunk in zip(sequences, chunks, strict=True)]
+        expected = naive(model, sequences)
+        np.testing.assert_allclose(session.log_probs(EVERY), expected, atol=1e-4)
+        assert session.argmax([None] * len(sequences)) == expected.argmax(-1).tolist()
+
+
+def test_an_empty_chunk_leaves_a_sequence_to_the_last_bit(model: Any) -> None:
+    with closing(Reader(model).begin([[1, 2, 3], [4, 5]])) as session:
+        before = session.log_probs(EVERY)
+        session.advance([[], [6, 7, 8]])
+        after = session.log_probs(EVERY)
+        session.advance([[], []])
+        assert (after[0] == before[0]).all()
+        assert (after[1] != before[1]).any()
+        assert (session.log_probs(EVERY) == after).all()
+
+
+def test_the_likeliest_is_looked_for_among_what_is_listed_and_the_lowest_wins_a_tie(model: Any) -> None:
+    with closing(Reader(model).begin([[1, 2], [1, 2], [1, 2]])) as session:
+        order = session.log_probs(EVERY)[0].argsort()[::-1].tolist()
+        assert session.argmax([None, order[3:6], [order[9]]]) == [order[0], order[3], order[9]]
+    even = full_attention()
+    with torch.no_grad():
+        even.lm_head.weight.zero_()
+    with closing(Reader(even).begin([[1], [1]])) as session:
+        assert session.argmax([None, [7, 5, 9]]) == [0, 5]
+
+
+def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
+    with closing(Reader(model).begin([[1, 2, 3]])) as session:
+        whole = session.log_probs(EVERY)
+        assert np.exp(whole).sum() == pytest.approx(1)
+        assert session.log_probs([9, 2, 9]).tolist() == whole[:, [9, 2, 9]].tolist()
+        assert whole.dtype == np.float64
+
+
+def test_only_full_attention_is_padded() -> None:
+    """A window that counts tokens would count the pads: such a model reads its prompts one by one."""
+    for make, together in ((full_attention, True), (sliding_window, False)):
+        reader = Reader(make())
+        assert reader.together == together
+
+
+def test_bfloat16_goes_forward_too(qwen: Any) -> None:
+    half = full_attention().to(torch.bfloat16)
+    with closing(Reader(half).begin([[1, 2, 3], [4]])) as session:
+        session.advance([[5], [6, 7]])
+        # Eight bits of a mantissa, through two layers of large random weights.
+        np.testing.assert_allclose(
+            np.exp(session.log_probs(EVERY)), np.exp(naive(qwen, [[1, 2, 3, 5], [4, 6, 7]])), atol=0.1
+        )
+
+
+# -- what prompts begin with in common ----------------------------------------------------------------
+
+SYSTEM = [(7 * i) % 64 for i in range(40)]
+
+
+def test_what_a_batch_begins_with_in_common_is_read_once(qwen: Any) -> None:
+    reader = Reader(qwen)
+    with widths(qwen) as seen:
+        reader.begin([[*SYSTEM, 1, 2, 3], [*SYSTEM, 4], [*SYSTEM, 5, 6]])
+        reader.begin([[*SYSTEM, 9, 8], [*SYSTEM, 7]])
+    assert seen == [
+        (1, 40),  # what all begin with
+        (3, 3),
+        (2, 2),  # it is still there
+    ]
+
+
+def test_a_prompt_alone_reads_on_where_the_last_ones_part_from_it(qwen: Any) -> None:
+    reader = Reader(qwen)
+    with widths(qwen) as seen:
+        reader.begin([[*SYSTEM, 1, 2, 3]])
+        reader.begin([[*SYSTEM, 1, 5]])
+        reader.begin([[*SYSTEM, 1, 5]])
+    assert seen == [(1, 43), (1, 1), (1, 1)]
+
+
+def test_a_short_beginning_is_read_again(qwen: Any) -> None:
+    reader = Reader(qwen)
+    short = SYSTEM[: LEAST_TOKENS - 1]
+    with widths(qwen) as seen:
+        reader.begin([[*short, 1], [*short, 2]])
+        reader.begin([[*short, 1], [*short, 2]])
+    assert seen == [(2, LEAST_TOKENS)] * 2
+
+
+def test_a_prompt_that_is_another_ones_beginning_still_has_a_token_of_its_own(qwen: Any) -> None:
+    sequences = [SYSTEM, [*SYSTEM, 3, 4], SYSTEM]
+    for reader in (Reader(qwen), Reader(qwen)):
+        for _ in range(2):
+            with closing(reader.begin(sequences)) as session:
+                np.testing.assert_allclose(session.log_probs(EVERY), naive(qwen, sequences), atol=1e-4)
+
+
+@given(st.lists(st.lists(st.sampled_from([SYSTEM, SYSTEM[::-1], SYSTEM[:20]]), min_size=1, max_size=3),
+                min_size=1, max_size=5), st.data())  # fmt: skip
+def test_what_was_read_before_changes_no_answer(
+    qwen: Any, heads: list[list[list[int]]], data: st.DataObject
+) -> None:
+    """Calls of one reader after another, each against a reader that has read nothing."""
+    reader = Reader(qwen)
+    for batch in heads:
+        prompts = [[*head, *data.draw(st.lists(tokens, min_size=1, max_size=5))] for head in batch]
+        with closing(reader.begin(prompts)) as one, closing(Reader(qwen).begin(prompts)) as other:
+            one.advance([[1]] * len(prompts))  # altering what was kept would show in a later call
+            other.advance([[1]] * len(prompts))
+            np.testing.assert_allclose(one.log_probs(EVERY), other.log_probs(EVERY), atol=1e-4)
+
+
+def test_after_a_failure_nothing_is_kept(qwen: Any) -> None:
+    reader = Reader(qwen)
+    reader.begin([[*SYSTEM, 1]])
+    with pytest.raises(IndexError):
+        reader.begin([[*SYSTEM, 64]])  # a token that the model does not have
+    with widths(qwen) as seen:
+        reader.begin([[*SYSTEM, 2]])
+    assert seen == [(1, 41)]
+
+
+def read(ids: Sequence[int]) -> Prefix:
+    """A beginning whose one layer holds its own tokens as keys and values."""
+    held = torch.tensor(list(ids)).reshape(1, 1, -1, 1)
+    return Prefix(list(ids), [(held, held)])
+
+
+def test_the_oldest_beginnings_leave_and_one_in_use_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prefixes, "MOST_TOKENS", 100)
+    kept = Prefixes()
+    first, second, third = ([n] * 40 for n in (1, 2, 3))
+    kept.keep(read(first))
+    kept.keep(read(second))
+    assert kept.longest([*first, 9]).ids == first  # used: now the second is the oldest
+    kept.keep(read(third))
+    assert [kept.longest(ids).ids for ids in (first, second, third)] == [first, [], third]
+    kept.keep(read([4] * 101))
+    assert [kept.longest(ids).ids for ids in (first, third, [4] * 101)] == [[], [], []]
+
+
+def test_only_the_part_in_common_is_given_back() -> None:
+    kept = Prefixes()
+    kept.keep(read(SYSTEM))
+    found = kept.longest([*SYSTEM[:20], 63, 63])
+    assert found.ids == SYSTEM[:20]
+    assert [t.flatten().tolist() for t in found.layers[0]] == [SYSTEM[:20]] * 2
+
+
+@given(st.lists(st.lists(st.integers(0, 1), max_size=6), min_size=1, max_size=5))
+def test_common_is_the_longest_beginning_of_all(sequences: list[list[int]]) -> None:
+    found = common(sequences)
+    assert all(ids[: len(found)] == found for ids in sequences)
+    longer = {tuple(ids[: len(found) + 1]) for ids in sequences}
+    assert len(longer) > 1 or len(min(longer)) == len(found)
