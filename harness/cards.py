@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from harness import failures, servers
 from harness.errors import UserError, printable, unknown
+from harness.failures import Failures
 from harness.resources import folder
+from harness.servers import Server
 
-Engine = Literal["proxy", "driver", "replay", "transformers"]
+Engine = Literal["proxy", "driver", "replay", "transformers", "openai"]
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
 LatencySource = Literal["card", "measured"]
@@ -49,7 +52,7 @@ class Card:
         description: one line for people.
         latency: time of one answer.
         weights: directory (absolute, or relative to the cards) or hub id; the run's directory for `replay`;
-            None if model-free.
+            the name a server knows the model by for `openai`; None if model-free.
         revision: branch, tag or commit on the hub; None is its default branch.
         dtype: number format of the weights; `auto` is the checkpoint's own.
         context_tokens: most tokens of prompt and answer together; None takes the checkpoint's own.
@@ -58,6 +61,8 @@ class Card:
         licence: SPDX id of the weights.
         max_new_tokens: most tokens of an answer, where the model needs another bound than its prompt's.
         thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
+        server: where an `openai` model is asked; None for other engines.
+        failures: how often the proxy fails on purpose; None if it never does.
     """
 
     name: str
@@ -73,6 +78,8 @@ class Card:
     licence: str | None = None
     max_new_tokens: int | None = None
     thinking_tokens: int = 2048
+    server: Server | None = None
+    failures: Failures | None = None
 
 
 _CARD_KEYS: Mapping[str, type] = {
@@ -88,6 +95,8 @@ _CARD_KEYS: Mapping[str, type] = {
     "licence": str,
     "max_new_tokens": int,
     "thinking_tokens": int,
+    "server": dict,
+    "failures": dict,
 }
 _LATENCY_KEYS: Mapping[str, type] = {"source": str, "inference_s": float, "basis": str}
 _CHOICES = {
@@ -95,6 +104,7 @@ _CHOICES = {
     "dtype": get_args(Dtype),
     "thinking": get_args(Thinking),
     "source": get_args(LatencySource),
+    "kind": servers.KINDS,
 }
 
 
@@ -178,11 +188,48 @@ def _card(name: str, table: Mapping[str, Any], where: str) -> Card:
     for key in ("context_tokens", "max_new_tokens", "thinking_tokens"):
         if table.get(key, 1) < 1:
             raise UserError(f"{where}: {key} = {table[key]}; allowed: 1 or more")
-    if (table["engine"] == "transformers") != ("weights" in table):
-        raise UserError(f'{where}: weights go with engine = "transformers", and only with it')
+    if (table["engine"] in ("transformers", "openai")) != ("weights" in table):
+        raise UserError(f'{where}: weights go with engine = "transformers" or "openai", and only with them')
     if table.get("privileged") and table["engine"] != "driver":
         raise UserError(f'{where}: privileged = true; only engine = "driver" may see the truth')
-    return Card(name=name, **{**table, "latency": Latency(latency["source"], seconds, latency["basis"])})
+    return Card(
+        name=name,
+        **{
+            **table,
+            "latency": Latency(latency["source"], seconds, latency["basis"]),
+            "server": _server(table, f"{where} [server]"),
+            "failures": _failures(table, f"{where} [failures]"),
+        },
+    )
+
+
+def _server(card: Mapping[str, Any], where: str) -> Server | None:
+    table = card.get("server")
+    if (card["engine"] == "openai") != (table is not None):
+        raise UserError(f'{where} goes with engine = "openai", and only with it')
+    if table is None:
+        return None
+    _check(table, where, servers.KEYS, required=("base_url",))
+    server = servers.read(table, where)
+    if card.get("thinking") == "switch" and not server.tells_thinking:
+        raise UserError(
+            f'{where}: thinking = "switch" needs the kind vllm or llama-server, which a request can tell; '
+            "else set it at the server, and here none or always"
+        )
+    return server
+
+
+def _failures(card: Mapping[str, Any], where: str) -> Failures | None:
+    table = card.get("failures")
+    if table is None:
+        return None
+    if card["engine"] != "proxy":
+        raise UserError(f'{where} goes with engine = "proxy", and only with it')
+    _check(table, where, failures.KEYS, required=())
+    read = failures.read(table, where)
+    if read.slow_tail and card["latency"]["source"] != "card":
+        raise UserError(f'{where}: a slow tail goes with a latency whose source = "card"')
+    return read
 
 
 def _check(table: Mapping[str, Any], where: str, keys: Mapping[str, type], required: Collection[str]) -> None:

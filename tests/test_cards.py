@@ -9,7 +9,29 @@ from hypothesis import strategies as st
 
 from harness import cards
 from harness.errors import UserError
+from harness.failures import Failures
+from harness.servers import Server
 
+SERVED = """\
+engine = "openai"
+description = "d"
+weights = "some-model"
+[latency]
+source = "measured"
+basis = "b"
+[server]
+base_url = "https://models.example/v1"
+"""
+FAULTY = """\
+engine = "proxy"
+description = "d"
+[latency]
+source = "card"
+inference_s = 0
+basis = "declared: none"
+[failures]
+nan = 0.5
+"""
 MINIMAL = """\
 engine = "driver"
 description = "d"
@@ -33,7 +55,9 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_shipped_card_loads_under_its_file_name() -> None:
-    assert cards.names() == ["brake", "cruise", "full-view", "local-view", "proxy", "qwen3-4b"]
+    assert cards.names() == [
+        "brake", "cruise", "full-view", "local-view", "openai-example", "proxy", "proxy-faulty", "qwen3-4b",
+    ]  # fmt: skip
     assert [cards.load(name).name for name in cards.names()] == cards.names()
 
 
@@ -89,8 +113,13 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
 def test_a_mistake_in_a_card_is_one_line_that_names_it(
     shelf: Path, change: tuple[str, str], said: list[str]
 ) -> None:
-    broken = MINIMAL.replace(*change)
-    assert broken != MINIMAL
+    refused(shelf, MINIMAL, change, said)
+
+
+def refused(shelf: Path, card: str, change: tuple[str, str], said: list[str]) -> str:
+    """The one line that a card gets once something in it is changed."""
+    broken = card.replace(*change)
+    assert broken != card
     write_card(shelf, broken)
     with pytest.raises(UserError) as caught:
         cards.load("mine")
@@ -98,6 +127,94 @@ def test_a_mistake_in_a_card_is_one_line_that_names_it(
     assert "\n" not in message
     for part in ["mine.toml", *said]:
         assert part in message
+    return message
+
+
+def test_a_served_model_has_a_server_with_defaults_that_are_stated(shelf: Path) -> None:
+    write_card(shelf, SERVED)
+    card = cards.resolve("mine")
+    assert (card.engine, card.weights) == ("openai", "some-model")
+    assert card.server == Server(
+        "https://models.example/v1", "generic", key_env="OPENAI_API_KEY", timeout_s=120.0, retries=3
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[server]\nbase_url", "[server]\nurl"), ["[server]", "'url'", "base_url"]),
+        (('base_url = "https://models.example/v1"', ""), ["[server]", "base_url", "add it"]),
+        (("weights =", "revision ="), ["weights", "openai"]),
+        (("https:", "ftp:"), ["base_url", "http or https", "http://127.0.0.1:8080/v1"]),
+        (("https://models.example", "models.example"), ["base_url", "http or https"]),
+        (("https://models.example", "https://:8080"), ["base_url", "host"]),
+        (("models.example", "models.example:port"), ["base_url", "no URL"]),
+        (("/v1", "/v1#top"), ["base_url", "fragment"]),
+        (("[server]", '[server]\nkind = "vlm"'), ["kind", "vlm", "did you mean 'vllm'"]),
+        (("[server]", "[server]\ntimeout_s = 0"), ["timeout_s = 0", "more than 0"]),
+        (("[server]", "[server]\ntimeout_s = inf"), ["timeout_s = inf", "more than 0"]),
+        (("[server]", "[server]\nretries = -1"), ["retries = -1", "0 to 10"]),
+        (("[server]", "[server]\nretries = true"), ["retries", "int"]),
+        (
+            ("[latency]", 'thinking = "switch"\n[latency]'),
+            ["thinking", "vllm or llama-server", "at the server"],
+        ),
+        (('[server]\nbase_url = "https://models.example/v1"', ""), ["[server]", "openai"]),
+    ],
+)
+def test_a_mistake_about_a_server_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    refused(shelf, SERVED, change, said)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("https://", "https://me:sk-5ecret@"),
+        ("https://", "https://sk-5ecret@"),
+        ("/v1", "/v1?api-key=sk-5ecret"),
+        ("[server]", '[server]\nkey_env = "sk-5ecret"'),
+        ("[server]", '[server]\napi_key = "sk-5ecret"'),
+    ],
+)
+def test_a_secret_in_a_card_is_refused_and_not_repeated(shelf: Path, change: tuple[str, str]) -> None:
+    assert "5ecret" not in refused(shelf, SERVED, change, ["[server]"])
+
+
+def test_a_server_and_failures_go_with_their_engines_only(shelf: Path) -> None:
+    served = ("[latency]", '[server]\nbase_url = "http://a/v1"\n[latency]')
+    refused(shelf, MINIMAL, served, ["[server]", "openai"])
+    refused(shelf, MINIMAL, ("[latency]", "[failures]\nnan = 0.5\n[latency]"), ["[failures]", "proxy"])
+
+
+def test_a_faulty_proxy_is_declared_by_its_shares(shelf: Path) -> None:
+    write_card(shelf, FAULTY)
+    assert cards.resolve("mine").failures == Failures(nan=0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("nan = 0.5", "naan = 0.5"), ["'naan'", "did you mean 'nan'"]),
+        (("nan = 0.5", "nan = 1.5"), ["nan = 1.5", "0 to 1"]),
+        (("nan = 0.5", "nan = -0.5"), ["nan = -0.5", "0 to 1"]),
+        (("nan = 0.5", "nan = nan"), ["nan = nan", "0 to 1"]),
+        (("nan = 0.5", "nan = 0.5\nprose = 0.6"), ["sum to 1.1", "1 at most"]),
+        (("nan = 0.5", "slow_tail = 0.5"), ["slow_tail", "slow_s", "together"]),
+        (("nan = 0.5", "slow_s = 0.5"), ["slow_tail", "slow_s", "together"]),
+        (("nan = 0.5", "slow_s = inf"), ["slow_s = inf", "seconds"]),
+        (
+            ('source = "card"\ninference_s = 0', 'source = "measured"'),
+            ["slow tail", 'source = "card"'],
+        ),
+    ],
+)
+def test_a_mistake_about_failures_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    card = FAULTY.replace("nan = 0.5", "slow_tail = 0.5\nslow_s = 1") if "source" in change[0] else FAULTY
+    refused(shelf, card, change, ["[failures]", *said])
 
 
 def test_a_directory_with_a_config_is_a_transformers_model_named_after_it(tmp_path: Path) -> None:
