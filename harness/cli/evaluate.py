@@ -20,8 +20,9 @@ MOST_SEEDS = 1000
 
 def evaluate(
     model: str = typer.Option(
-        "proxy", help="Model card, checkpoint directory, hub id, or replay:RUN. `harness model list`."
+        "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
     ),
+    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
     dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
     condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
@@ -50,7 +51,7 @@ def evaluate(
     if limit is not None and limit < 1:
         raise UserError(f"--limit {limit}: give 1 or more episodes")
     spec = Spec(
-        card=cards.resolve(model),
+        card=cards.resolve(model, engine),
         prompt=prompts.load(prompt),
         dataset=load.load(load.find(dataset), limit),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
