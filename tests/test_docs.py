@@ -1,9 +1,11 @@
 """What the documents list is what the program has."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from harness.backends.base import AnswerMode
 from harness.parse import Repair, Status
 
 ROOT = Path(__file__).parent.parent
@@ -12,6 +14,11 @@ ROOT = Path(__file__).parent.parent
 @pytest.mark.parametrize("member", [*Status, *Repair], ids=str)
 def test_every_status_and_repair_is_documented_with_its_meaning(member: Status | Repair) -> None:
     assert f"| `{member.value}` | {member.meaning} |" in (ROOT / "docs/answers.md").read_text()
+
+
+@pytest.mark.parametrize("mode", get_args(AnswerMode))
+def test_every_way_of_answering_is_documented(mode: str) -> None:
+    assert f"| `{mode}` |" in (ROOT / "docs/answers.md").read_text()
 
 
 def test_the_readme_names_every_command() -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,7 @@ def test_every_filling_is_a_strict_answer_under_the_schema(
         digits = chosen[-len(actions) :]
         order = sorted(range(len(actions)), key=digits.__getitem__)
         assert parsed.intent is not None
-        for low, high in zip(order, order[1:], strict=False):
+        for low, high in pairwise(order):
             assert parsed.intent[low] <= parsed.intent[high] + 0.01 + 1e-9
 
 

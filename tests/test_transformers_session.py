@@ -166,8 +166,16 @@ def test_a_prompt_alone_reads_on_where_the_last_ones_part_from_it(qwen: Any) -> 
     with widths(qwen) as seen:
         reader.begin([[*SYSTEM, 1, 2, 3]])
         reader.begin([[*SYSTEM, 1, 5]])
-        reader.begin([[*SYSTEM, 1, 5]])
+        reader.begin([[*SYSTEM, 4]])
     assert seen == [(1, 43), (1, 1), (1, 1)]
+
+
+def test_a_prompt_that_is_asked_again_is_read_again_since_its_seconds_are_an_answers(qwen: Any) -> None:
+    reader = Reader(qwen)
+    with widths(qwen) as seen:
+        for end in (1, 1, 2, 1):
+            reader.begin([[*SYSTEM, end]])
+    assert seen == [(1, 41), (1, 41), (1, 1), (1, 1)]
 
 
 def test_a_short_beginning_is_read_again(qwen: Any) -> None:

@@ -30,20 +30,26 @@ class Prefixes:
     def __init__(self) -> None:
         self._kept: list[Prefix] = []
 
-    def longest(self, ids: list[int]) -> Prefix:
-        """The longest beginning of a sequence that was read before; `NOTHING` if that is not worth while."""
-        shared = [len(common([prefix.ids, ids])) for prefix in self._kept]
+    def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
+        """The longest beginning of a sequence that was read before; `NOTHING` if that is not worth while.
+
+        Args:
+            ids: the sequence.
+            but: a whole prompt that does not count, though it was read before.
+        """
+        kept = [prefix for prefix in self._kept if prefix.ids != list(but)]
+        shared = [len(common([prefix.ids, ids])) for prefix in kept]
         most = max(shared, default=0)
         if most < LEAST_TOKENS:
             return NOTHING
-        found = self._kept.pop(shared.index(most))
-        self._kept.append(found)  # the last one used is the last to leave
+        found = kept[shared.index(most)]
+        self.keep(found)  # the last one used is the last to leave
         layers = [(keys[..., :most, :], values[..., :most, :]) for keys, values in found.layers]
         return Prefix(found.ids[:most], layers)
 
     def keep(self, prefix: Prefix) -> None:
         """Remember a beginning, and forget old ones that would be too much with it."""
-        self._kept.append(prefix)
+        self._kept = [*(kept for kept in self._kept if kept.ids != prefix.ids), prefix]
         while sum(len(kept.ids) for kept in self._kept) > MOST_TOKENS:
             del self._kept[0]
 

@@ -47,7 +47,8 @@ class Reader:
             return Apart([Rows(self, NOTHING, [prompt]) for prompt in prompts])
         # Each prompt's last token is left to be read, for what comes after it.
         shared = common([list(prompt[:-1]) for prompt in prompts])
-        prefix = self._prefixes.longest(shared)
+        # A prompt that is asked again, alone, is read again: else its time would be no answer's time.
+        prefix = self._prefixes.longest(shared, but=prompts[0] if len(prompts) == 1 else ())
         if len(prompts) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
             prefix = Prefix(shared, Rows(self, prefix, [shared]).layers())
             self._prefixes.keep(prefix)
