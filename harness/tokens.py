@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.cards import Card
 from harness.errors import UserError, printable
+from harness.resources import folder
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
 QWEN2_SPLIT = (
@@ -62,7 +63,7 @@ def _from_gguf(file: Path) -> Any:
         ]
     )
     built.decoder = decoders.ByteLevel()
-    # Control tokens, and words of the user's such as `<think>`: found whole in a text, whatever is round them.
+    # Control tokens, and words of the user's such as `<think>`: found whole, whatever is round them.
     added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
     built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built
@@ -75,8 +76,9 @@ def counter(
 
     Takes the tokenizer given, else the one that lies with the model's weights; None where there is neither.
     """
-    if source is None and card and card.weights and (Path(card.weights) / "tokenizer.json").is_file():
-        source = Path(card.weights)
+    if source is None and card and card.weights:
+        beside = folder("models") / card.weights
+        source = beside if (beside / "tokenizer.json").is_file() else None
     if source is None:
         return None
     loaded = tokenizer(source)

@@ -9,7 +9,29 @@ from hypothesis import strategies as st
 
 from harness import cards
 from harness.errors import UserError
+from harness.failures import Failures
+from harness.servers import Server
 
+SERVED = """\
+engine = "openai"
+description = "d"
+weights = "some-model"
+[latency]
+source = "measured"
+basis = "b"
+[server]
+base_url = "https://models.example/v1"
+"""
+FAULTY = """\
+engine = "proxy"
+description = "d"
+[latency]
+source = "card"
+inference_s = 0
+basis = "declared: none"
+[failures]
+nan = 0.5
+"""
 MINIMAL = """\
 engine = "driver"
 description = "d"
@@ -33,8 +55,20 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_shipped_card_loads_under_its_file_name() -> None:
-    assert cards.names() == ["brake", "cruise", "full-view", "local-view", "proxy", "qwen3-4b"]
+    assert cards.names() == [
+        "brake", "cruise", "full-view", "gemma-3-1b", "llama-3.2-3b", "local-view", "openai-example",
+        "phi-4-mini", "proxy", "proxy-faulty", "qwen3-0.6b", "qwen3-1.7b", "qwen3-4b", "qwen3-8b",
+        "smollm3-3b",
+    ]  # fmt: skip
     assert [cards.load(name).name for name in cards.names()] == cards.names()
+    assert [cards.load(card.name) for card in cards.load_all()] == cards.load_all()
+
+
+def test_language_models_declare_no_latency_that_was_not_measured() -> None:
+    for card in cards.load_all():
+        if card.engine in (*cards.WEIGHTED, "openai"):
+            assert (card.latency.source, card.latency.inference_s) == ("measured", None), card.name
+            assert card.engine == "openai" or card.licence, card.name
 
 
 def test_only_full_view_sees_the_truth() -> None:
@@ -54,6 +88,104 @@ def test_the_proxy_cites_the_papers_latency_and_the_language_model_declares_none
         "Apache-2.0",
     )
     assert (qwen.latency.source, qwen.latency.inference_s) == ("measured", None)
+
+
+def test_a_card_may_have_weights_for_another_engine() -> None:
+    qwen, q4 = cards.resolve("qwen3-4b"), cards.resolve("qwen3-4b", "llama-cpp")
+    assert (qwen.engine, q4.engine) == ("transformers", "llama-cpp")
+    assert (q4.name, q4.weights, q4.file) == (
+        "qwen3-4b:llama-cpp", "Qwen/Qwen3-4B-GGUF", "Qwen3-4B-Q4_K_M.gguf",
+    )  # fmt: skip
+    assert (q4.quantisation, q4.dtype, qwen.file, qwen.sha256) == ("Q4_K_M", "auto", None, None)
+    assert (q4.thinking, q4.licence, q4.context_tokens) == (qwen.thinking, qwen.licence, qwen.context_tokens)
+    assert cards.resolve("qwen3-4b", "transformers") == cards.resolve("qwen3-4b:transformers") == qwen
+    assert cards.resolve("qwen3-4b:llama-cpp") == cards.resolve("qwen3-4b:llama-cpp", "llama-cpp") == q4
+
+
+@pytest.mark.parametrize(
+    ("text", "engine", "said"),
+    [
+        ("qwen3-4b", "llama", ["engine 'llama'", "did you mean 'llama-cpp'"]),
+        ("qwen3-4b", "openai", ["engine of model qwen3-4b 'openai'", "known: llama-cpp, transformers"]),
+        ("qwen3-4b:openai", None, ["engine of model qwen3-4b 'openai'"]),
+        ("qwen3-4b:llama-cpp", "transformers", ["'qwen3-4b:llama-cpp' runs on llama-cpp"]),
+        ("proxy", "transformers", ["engine of model proxy 'transformers'", "known: proxy"]),
+        ("someone/model", "llama-cpp", ["--engine llama-cpp", "'someone/model' runs on transformers"]),
+    ],
+)
+def test_an_engine_that_a_model_has_not_is_one_line(text: str, engine: str | None, said: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        cards.resolve(text, engine)
+    for part in said:
+        assert part in str(caught.value)
+
+
+TWO_ENGINES = """\
+engine = "transformers"
+description = "d"
+weights = "a/b"
+revision = "v1"
+[latency]
+source = "measured"
+basis = "b"
+[engines.llama-cpp]
+weights = "a/b-GGUF"
+file = "b.gguf"
+"""
+
+
+def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Path) -> None:
+    write_card(shelf, TWO_ENGINES)
+    assert (cards.load("mine").revision, cards.load("mine:llama-cpp").revision) == ("v1", None)
+    assert cards.load("mine").latency == cards.load("mine:llama-cpp").latency
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("llama-cpp", "proxy"), ["engine in", "'proxy'", "known: llama-cpp, openai"]),
+        (("llama-cpp", "transformers"), ["'transformers'", "known: llama-cpp, openai"]),
+        (('file = "b.gguf"', 'dtype = "float32"'), ["[engines.llama-cpp]", "dtype", "transformers"]),
+        (('file = "b.gguf"', "licence = 'MIT'"), ["[engines.llama-cpp]", "licence"]),
+        (('weights = "a/b-GGUF"', ""), ["[engines.llama-cpp]", "weights", "goes with"]),
+        (('[engines.llama-cpp]\nweights = "a/b-GGUF"', "[engines]\nllama-cpp = 3"), ["= '3'", "a table"]),
+        (
+            ('source = "measured"', 'source = "card"\ninference_s = 0.1'),
+            ["[engines.llama-cpp] has no latency; add it"],
+        ),
+        (('revision = "v1"', 'file = "b.gguf"'), ["file", "llama-cpp"]),
+        (('revision = "v1"', 'quantisation = "Q4_K_M"'), ["quantisation", "llama-cpp"]),
+        (('revision = "v1"', 'sha256 = "abc"'), ["sha256 = 'abc'", "64 digits"]),
+        (('revision = "v1"', "gated = 1"), ["gated", "bool"]),
+    ],
+)
+def test_a_mistake_about_engines_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    refused(shelf, TWO_ENGINES, change, said)
+
+
+def test_a_gguf_file_is_a_model_named_after_it(tmp_path: Path) -> None:
+    file = tmp_path / "small-Q8_0.gguf"
+    file.write_bytes(b"GGUF")
+    plain = cards.resolve(str(file))
+    assert (plain.name, plain.engine, plain.weights) == ("small-Q8_0", "llama-cpp", str(file.resolve()))
+    assert (plain.thinking, plain.latency.source, plain.file) == ("none", "measured", None)
+    file.write_bytes(b"GGUF" + bytes(1000) + b"{% if enable_thinking %}")
+    assert cards.resolve(str(file)).thinking == "switch"
+
+
+def test_a_directory_with_a_checkpoint_and_a_gguf_file_runs_on_either(tmp_path: Path) -> None:
+    folder = tmp_path / "small"
+    folder.mkdir()
+    (folder / "small-f16.gguf").write_bytes(b"GGUF")
+    assert (cards.resolve(str(folder)).engine, cards.resolve(str(folder)).name) == ("llama-cpp", "small-f16")
+    (folder / "config.json").write_text("{}")
+    assert cards.resolve(str(folder)).engine == "transformers"
+    assert cards.resolve(str(folder), "llama-cpp").weights == str((folder / "small-f16.gguf").resolve())
+    (folder / "small-q4.gguf").write_bytes(b"GGUF")
+    with pytest.raises(UserError, match=r"holds 2 \.gguf files; give one of them"):
+        cards.resolve(str(folder), "llama-cpp")
 
 
 def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
@@ -89,8 +221,13 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
 def test_a_mistake_in_a_card_is_one_line_that_names_it(
     shelf: Path, change: tuple[str, str], said: list[str]
 ) -> None:
-    broken = MINIMAL.replace(*change)
-    assert broken != MINIMAL
+    refused(shelf, MINIMAL, change, said)
+
+
+def refused(shelf: Path, card: str, change: tuple[str, str], said: list[str]) -> str:
+    """The one line that a card gets once something in it is changed."""
+    broken = card.replace(*change)
+    assert broken != card
     write_card(shelf, broken)
     with pytest.raises(UserError) as caught:
         cards.load("mine")
@@ -98,6 +235,94 @@ def test_a_mistake_in_a_card_is_one_line_that_names_it(
     assert "\n" not in message
     for part in ["mine.toml", *said]:
         assert part in message
+    return message
+
+
+def test_a_served_model_has_a_server_with_defaults_that_are_stated(shelf: Path) -> None:
+    write_card(shelf, SERVED)
+    card = cards.resolve("mine")
+    assert (card.engine, card.weights) == ("openai", "some-model")
+    assert card.server == Server(
+        "https://models.example/v1", "generic", key_env="OPENAI_API_KEY", timeout_s=120.0, retries=3
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[server]\nbase_url", "[server]\nurl"), ["[server]", "'url'", "base_url"]),
+        (('base_url = "https://models.example/v1"', ""), ["[server]", "base_url", "add it"]),
+        (("weights =", "revision ="), ["weights", "openai"]),
+        (("https:", "ftp:"), ["base_url", "http or https", "http://127.0.0.1:8080/v1"]),
+        (("https://models.example", "models.example"), ["base_url", "http or https"]),
+        (("https://models.example", "https://:8080"), ["base_url", "host"]),
+        (("models.example", "models.example:port"), ["base_url", "no URL"]),
+        (("/v1", "/v1#top"), ["base_url", "fragment"]),
+        (("[server]", '[server]\nkind = "vlm"'), ["kind", "vlm", "did you mean 'vllm'"]),
+        (("[server]", "[server]\ntimeout_s = 0"), ["timeout_s = 0", "more than 0"]),
+        (("[server]", "[server]\ntimeout_s = inf"), ["timeout_s = inf", "more than 0"]),
+        (("[server]", "[server]\nretries = -1"), ["retries = -1", "0 to 10"]),
+        (("[server]", "[server]\nretries = true"), ["retries", "int"]),
+        (
+            ("[latency]", 'thinking = "switch"\n[latency]'),
+            ["thinking", "vllm or llama-server", "at the server"],
+        ),
+        (('[server]\nbase_url = "https://models.example/v1"', ""), ["[server]", "openai"]),
+    ],
+)
+def test_a_mistake_about_a_server_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    refused(shelf, SERVED, change, said)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("https://", "https://me:sk-5ecret@"),
+        ("https://", "https://sk-5ecret@"),
+        ("/v1", "/v1?api-key=sk-5ecret"),
+        ("[server]", '[server]\nkey_env = "sk-5ecret"'),
+        ("[server]", '[server]\napi_key = "sk-5ecret"'),
+    ],
+)
+def test_a_secret_in_a_card_is_refused_and_not_repeated(shelf: Path, change: tuple[str, str]) -> None:
+    assert "5ecret" not in refused(shelf, SERVED, change, ["[server]"])
+
+
+def test_a_server_and_failures_go_with_their_engines_only(shelf: Path) -> None:
+    served = ("[latency]", '[server]\nbase_url = "http://a/v1"\n[latency]')
+    refused(shelf, MINIMAL, served, ["[server]", "openai"])
+    refused(shelf, MINIMAL, ("[latency]", "[failures]\nnan = 0.5\n[latency]"), ["[failures]", "proxy"])
+
+
+def test_a_faulty_proxy_is_declared_by_its_shares(shelf: Path) -> None:
+    write_card(shelf, FAULTY)
+    assert cards.resolve("mine").failures == Failures(nan=0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("nan = 0.5", "naan = 0.5"), ["'naan'", "did you mean 'nan'"]),
+        (("nan = 0.5", "nan = 1.5"), ["nan = 1.5", "0 to 1"]),
+        (("nan = 0.5", "nan = -0.5"), ["nan = -0.5", "0 to 1"]),
+        (("nan = 0.5", "nan = nan"), ["nan = nan", "0 to 1"]),
+        (("nan = 0.5", "nan = 0.5\nprose = 0.6"), ["sum to 1.1", "1 at most"]),
+        (("nan = 0.5", "slow_tail = 0.5"), ["slow_tail", "slow_s", "together"]),
+        (("nan = 0.5", "slow_s = 0.5"), ["slow_tail", "slow_s", "together"]),
+        (("nan = 0.5", "slow_s = inf"), ["slow_s = inf", "seconds"]),
+        (
+            ('source = "card"\ninference_s = 0', 'source = "measured"'),
+            ["slow tail", 'source = "card"'],
+        ),
+    ],
+)
+def test_a_mistake_about_failures_is_one_line_that_names_it(
+    shelf: Path, change: tuple[str, str], said: list[str]
+) -> None:
+    card = FAULTY.replace("nan = 0.5", "slow_tail = 0.5\nslow_s = 1") if "source" in change[0] else FAULTY
+    refused(shelf, card, change, ["[failures]", *said])
 
 
 def test_a_directory_with_a_config_is_a_transformers_model_named_after_it(tmp_path: Path) -> None:
@@ -135,7 +360,8 @@ def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "cruise", "replay:RUN_DIR"]),
-        ("./no/such/dir", ["'./no/such/dir'", "no directory", "hub id"]),
+        ("./no/such/dir", ["'./no/such/dir'", "no directory", ".gguf", "hub id"]),
+        ("./no/such.gguf", ["'./no/such.gguf'", "no .gguf file"]),
         ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),
         ("replay:", ["'replay:'", "no such run directory"]),
         ("../models/proxy", ["'../models/proxy'", "no directory"]),
@@ -149,11 +375,11 @@ def test_a_model_that_is_nothing_says_what_would_be_one(text: str, said: list[st
 
 
 def test_a_directory_without_a_config_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"holds no config\.json; give the directory of a transformers"):
+    with pytest.raises(UserError, match=r"holds no config\.json and no \.gguf file; give the directory of"):
         cards.resolve(str(tmp_path))
 
 
-@given(st.text(max_size=60))
+@given(st.text(max_size=60).filter(lambda text: text not in cards.names()))
 @example("~nobody-of-that-name/x")
 @example("x" * 5000)
 @example("a/" + "b" * 5000)

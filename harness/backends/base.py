@@ -5,7 +5,7 @@ A backend batches, threads or loops inside as suits its engine; nothing else in 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -27,6 +27,7 @@ class Request:
             choices of a fixed text. `readout`: the messages ask for one letter (see `harness.readout`), whose
             probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
+        sample: which of several answers to one question; 0 where one is asked for.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
@@ -40,6 +41,7 @@ class Request:
     form: str = "distribution"
     answer: AnswerMode = "json"
     thinking: bool = False
+    sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
 
@@ -85,4 +87,17 @@ class Backend(Protocol):
 
     def identity(self) -> dict[str, Any]:
         """What decides the answers, as JSON: engine, versions, weights, settings. It goes in the manifest."""
+        ...
+
+
+@runtime_checkable
+class Rendering(Backend, Protocol):
+    """A backend of a language model, which can say what its model is sent."""
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """The prompt of each request as the model reads it; as a server is sent it, where that renders it.
+
+        Raises:
+            UserError: the chat template refuses the messages.
+        """
         ...

@@ -63,6 +63,11 @@ class Child:
         found: dict[str, Any] = self.call("identity")
         return found
 
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """The backend's own."""
+        found: list[str] = self.call("rendered", requests)
+        return found
+
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
         """An attribute of the backend, by its dotted name; what it returns, where it is a method.
 

@@ -58,6 +58,10 @@ class LanguageModel:
                 done[prompt.position] = completion
         return [done[position] for position in range(len(requests))]
 
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """The prompt of each request as the model reads it."""
+        return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
+
     def identity(self) -> dict[str, Any]:
         """What decides the answers: the engine's."""
         return self.engine.identity()

@@ -75,6 +75,7 @@ class Replay:
         return Completion(
             request.id, answer["raw"], answer["prompt_tokens"], answer["completion_tokens"],
             answer["finish_reason"], answer["seconds"], answer["batch_size"], answer["error"],
+            answer["label_mass"], answer["retries"], answer["cached"],
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

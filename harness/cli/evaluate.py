@@ -20,8 +20,9 @@ MOST_SEEDS = 1000
 
 def evaluate(
     model: str = typer.Option(
-        "proxy", help="Model card, checkpoint directory, hub id, or replay:RUN. `harness model list`."
+        "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
     ),
+    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
     dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
     condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
@@ -36,6 +37,7 @@ def evaluate(
         None, help="The run's folder. Default: reports/<model>-<prompt>-<dataset>."
     ),
     resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
+    no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
     tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
@@ -49,7 +51,7 @@ def evaluate(
     if limit is not None and limit < 1:
         raise UserError(f"--limit {limit}: give 1 or more episodes")
     spec = Spec(
-        card=cards.resolve(model),
+        card=cards.resolve(model, engine),
         prompt=prompts.load(prompt),
         dataset=load.load(load.find(dataset), limit),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
@@ -64,16 +66,17 @@ def evaluate(
     if dry_run:
         _dry_run(spec, tokenizer, as_json)
         return
-    _run(spec, out or default_out(spec, resume), resume, as_json)
+    _run(spec, out or default_out(spec, resume), resume, no_cache, as_json)
 
 
-def _run(spec: "Spec", out: Path, resume: bool, as_json: bool) -> None:
+def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool) -> None:
+    from harness.backends.cache import default_file
     from harness.cli.progress import bar
     from harness.run.asking import request_count
     from harness.run.evaluate import evaluate as evaluate_run
 
     with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
-        done = evaluate_run(spec, out, resume, progress)
+        done = evaluate_run(spec, out, resume, progress, None if no_cache else default_file())
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
     page = write(out, None, quiet=as_json)
@@ -170,6 +173,8 @@ def _table(done: "Evaluated") -> None:
     )
     console.print("gain is over single-local, paired by episode")
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
+    if m.get("cached_answers"):
+        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
     for role in ("ego", "helper"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:

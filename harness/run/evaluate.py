@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.backends.base import Rendering
+from harness.backends.cache import Cached
 from harness.backends.registry import open_backend
 from harness.errors import UserError, printable
 from harness.files import alone, canonical_json, digest, write_whole
@@ -20,7 +22,7 @@ from harness.run.intents import intents
 from harness.run.scoring import draw, score
 from harness.run.spec import FORMAT, Spec, versions
 from harness.run.summary import summary
-from harness.run.timing import inference_s, measure
+from harness.run.timing import inference_s, measure, settled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +40,9 @@ class Evaluated:
     summary: "pd.DataFrame"
 
 
-def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None]) -> Evaluated:
+def evaluate(
+    spec: Spec, out: Path, resume: bool, progress: Callable[[int], None], cache: Path | None = None
+) -> Evaluated:
     """Evaluate a model with a prompt on a dataset and write the run's folder.
 
     Args:
@@ -46,6 +50,7 @@ def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None
         out: the run's folder.
         resume: go on with the run that a kill left there.
         progress: called with the number of answers just had, those kept from before included.
+        cache: file of completions kept between runs, for language models; None to ask for every answer.
 
     Raises:
         UserError: the folder holds something else, or the model cannot be had. Nothing is written then.
@@ -56,8 +61,11 @@ def evaluate(spec: Spec, out: Path, resume: bool, progress: Callable[[int], None
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     identity = backend.identity()
     with _begun(spec, out, identity) as work:
+        # Times are had from the backend itself: the cache answers in no time, which is nobody's.
         latency = measure(spec, backend, work / "latency.json")
-        by_id = ask_all(spec, backend, work / "answers.jsonl", progress)
+        asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
+        by_id = ask_all(spec, asked, work / "answers.jsonl", progress)
+        latency = settled(spec, backend, latency, by_id, work / "latency.json")
         created = json.loads((work / CONFIG).read_text())["created"]
         done = _scored(spec, out, by_id, {"created": created, "identity": identity, "latency": latency})
     _tidy(out)
@@ -82,6 +90,7 @@ def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, An
         **spec.settings(),
         "identity": begun["identity"],
         "latency": begun["latency"],
+        "cached_answers": sum(answer["cached"] for answer in by_id.values()),
         "delay_allowance_s": laid.allowance_s,
         "versions": versions(),
     }

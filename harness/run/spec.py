@@ -111,7 +111,7 @@ class Spec:
 
 def model_argument(card: Card) -> str:
     """What `--model` was given, or anything that resolves to the same card."""
-    if card.name in names() and load(card.name) == card:
+    if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 

@@ -53,6 +53,25 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
     return latency
 
 
+def settled(
+    spec: Spec, backend: Backend, latency: dict[str, Any], answers: Mapping[str, Answer], kept: Path
+) -> dict[str, Any]:
+    """The latency, once everything is answered: it may be that no answer of a role has a time of its own.
+
+    Where each answer's own time counts, one that comes from the cache has none. If a role has no other, a
+    sample is timed as it is for batches, and stands for every answer of the run; it is kept as well.
+    """
+    if latency["inference_s"] is not None or isinstance(backend, Replay):
+        return latency
+    asked = list(requests(spec, spec.dataset.scenes))
+    timed = {r.role for r in asked if answers[r.id]["seconds"] is not None}
+    if {r.role for r in asked if answers[r.id]["cached"]} <= timed:
+        return latency
+    latency = _timed(backend, list(requests(spec, _sample(spec.dataset.scenes))))
+    write_whole(kept, canonical_json(latency))
+    return latency
+
+
 def _sample(scenes: Sequence[Scene]) -> Sequence[Scene]:
     return scenes[:: max(1, len(scenes) // SAMPLE)][:SAMPLE]
 
@@ -76,7 +95,8 @@ def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
 
-    Where each answer's own time counts, one that failed has none and takes its role's median.
+    Where each answer's own time counts, one that failed or comes from the cache has none and takes its
+    role's median.
     """
     asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]

@@ -1,0 +1,330 @@
+"""The completion cache: what is asked again and what is not, and that nothing depends on the file."""
+
+import json
+import multiprocessing
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import Scripted, decisions, failed, rows_of, spec_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness import cards, prompts
+from harness.backends.base import Backend, Completion, Rendering, Request
+from harness.backends.cache import NOT_IN_KEY, Cached, default_file, key
+from harness.backends.completion_file import CompletionFile
+from harness.backends.registry import open_backend
+from harness.cards import Latency
+from harness.dataset.load import Dataset, load
+from harness.operating_point import POINTS
+from harness.run.evaluate import Evaluated, evaluate
+from harness.run.spec import Spec
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)
+# One other value for every field of a request.
+CHANGED: dict[str, Any] = {
+    "id": "00000-1/v1",
+    "role": "helper",
+    "messages": ({"role": "user", "content": "Another scene"},),
+    "actions": ("SLOWER", "IDLE"),
+    "max_tokens": 65,
+    "form": "recommendation",
+    "answer": "constrained",
+    "thinking": True,
+    "sample": 1,
+    "view": {"nodes": []},
+    "truth": {"nodes": []},
+}
+
+
+class Talker(Scripted):
+    """A scripted language model, whose prompt is its messages as JSON."""
+
+    def __init__(self, lines: dict[str, str | Completion] | None = None, **identity: Any) -> None:
+        super().__init__(lines or {})
+        self.name = {"engine": "talker", **identity}
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        return [json.dumps(request.messages) for request in requests]
+
+    def identity(self) -> dict[str, Any]:
+        return self.name
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "cache" / "completions.sqlite"
+
+
+# -- what is in the key -------------------------------------------------------------------------------------
+
+
+def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None:
+    names = {f.name for f in fields(Request)}
+    assert set(CHANGED) == names, "a new field: say here what another value of it would be"
+    assert set(NOT_IN_KEY) < names
+    for name, value in CHANGED.items():
+        other = replace(BASE, **{name: value})
+        same = key({}, "prompt", other) == key({}, "prompt", BASE)
+        assert same == (name in NOT_IN_KEY), name
+
+
+@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "view", "truth"}))
+def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str, file: Path) -> None:
+    talker = Talker()
+    Cached(talker, file).complete([BASE])
+    [again] = Cached(talker, file).complete([BASE])
+    [other] = Cached(talker, file).complete([replace(BASE, **{name: CHANGED[name]})])
+    assert (again.cached, other.cached, len(talker.asked)) == (True, False, 2)
+
+
+def test_the_same_question_from_another_place_of_a_run_is_answered_under_its_own_id(file: Path) -> None:
+    talker = Talker()
+    Cached(talker, file).complete([BASE])
+    [again] = Cached(talker, file).complete([replace(BASE, id="00007-3/v1")])
+    assert (again.request_id, again.cached) == ("00007-3/v1", True)
+
+
+def test_another_model_in_any_respect_is_asked(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_qwen3
+
+    folder = tiny_qwen3.build(tmp_path / "tiny")
+    identity = open_backend(cards.resolve(str(folder)), device="cpu").identity()
+    assert {"engine", "weights", "revision", "files_sha256", "dtype", "device"} <= set(identity)
+    assert {"transformers", "torch", "chat_template_sha256"} <= set(identity)
+    base = key(identity, "prompt", BASE)
+    assert key(dict(reversed(identity.items())), "prompt", BASE) == base
+    for name in identity:
+        assert key({**identity, name: "other"}, "prompt", BASE) != base, name
+    assert key({**identity, "new": None}, "prompt", BASE) != base
+    assert key(identity, "prompt, as another template writes it", BASE) != base
+
+
+# -- what comes out -----------------------------------------------------------------------------------------
+
+
+def test_what_was_answered_is_not_asked_again_and_the_order_holds(file: Path) -> None:
+    asked = [
+        replace(BASE, id=f"s{i}/v1", messages=({"role": "user", "content": f"Scene {i}"},)) for i in range(6)
+    ]
+    lines = {f"s{i}/v1": f"answer {i}" for i in range(6)}
+    first = Talker(dict(lines))
+    Cached(first, file).complete(asked[1:4])
+    second = Talker(dict(lines))
+    done = Cached(second, file).complete(asked)
+    assert second.asked == ["s0/v1", "s4/v1", "s5/v1"]
+    assert [(c.request_id, c.text) for c in done] == list(lines.items())
+    assert [c.cached for c in done] == [False, True, True, True, False, False]
+
+
+def test_an_answer_from_the_cache_has_all_but_its_seconds(file: Path) -> None:
+    said = Completion(BASE.id, "x", 12, 5, "length", 0.7, 1, label_mass=0.5, retries=2)
+    assert Cached(Talker({BASE.id: said}), file).complete([BASE]) == [said]
+    [again] = Cached(Talker(), file).complete([BASE])
+    assert again == replace(said, seconds=None, retries=0, cached=True)
+
+
+def test_errors_are_asked_again(file: Path) -> None:
+    for _ in range(2):
+        talker = Talker({BASE.id: failed(BASE.id, "out of memory")})
+        assert [c.error for c in Cached(talker, file).complete([BASE])] == ["out of memory"]
+        assert talker.asked == [BASE.id]
+    assert not Cached(Talker(), file).complete([BASE])[0].cached
+
+
+@given(text=st.text(st.characters(codec=None, exclude_categories=())))
+def test_any_text_comes_back_as_it_was_said(text: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    store = CompletionFile(tmp_path_factory.getbasetemp() / "texts.sqlite")
+    name = str(hash(text))
+    store.add({name: Completion("", text, None, None, "stop", None, 1)})
+    assert store.find([name])[name].text == text
+
+
+def test_neither_prompt_nor_model_can_be_read_in_the_file(file: Path) -> None:
+    Cached(Talker({BASE.id: "the answer"}, server="secret-host"), file).complete([BASE])
+    [data] = [p.read_bytes() for p in file.parent.iterdir()]
+    assert b"the answer" in data
+    assert b"Scene" not in data
+    assert b"secret-host" not in data
+
+
+# -- the file is no more than a help ------------------------------------------------------------------------
+
+
+def test_a_deleted_file_is_an_empty_cache_also_while_a_run_goes_on(file: Path) -> None:
+    talker = Talker()
+    cached = Cached(talker, file)
+    cached.complete([BASE])
+    for path in file.parent.iterdir():
+        path.unlink()
+    file.parent.rmdir()
+    assert [c.cached for c in cached.complete([BASE])] == [False]
+    assert [c.cached for c in cached.complete([BASE])] == [True]
+
+
+@pytest.mark.parametrize("damage", ["no database", "torn", "another table", "no answer", "no folder"])
+def test_a_file_that_gives_trouble_is_one_line_and_the_run_goes_on(
+    damage: str, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Cached(Talker(), file).complete([replace(BASE, sample=i) for i in range(200)])
+    if damage == "no database":
+        file.write_bytes(b"thesis notes" * 1000)
+    elif damage == "torn":
+        file.write_bytes(file.read_bytes()[:5000])
+    elif damage == "no folder":
+        file.unlink()
+        file.parent.rmdir()
+        file.parent.write_text("a file")
+    else:
+        with sqlite3.connect(file) as open_file:
+            open_file.execute(
+                "UPDATE completions SET answer = '[1'"
+                if damage == "no answer"
+                else "ALTER TABLE completions RENAME COLUMN answer TO completion"
+            )
+        open_file.close()
+    talker = Talker()
+    cached = Cached(talker, file)
+    for _ in range(2):
+        assert [c.cached for c in cached.complete([BASE])] == [False]
+    assert len(talker.asked) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith(f"harness: completion cache {file}: ")
+    assert "delete the file" in said
+
+
+def _write(path: str, first: int) -> None:
+    cached = Cached(Talker(), Path(path))
+    for i in range(first, first + 20):
+        cached.complete([replace(BASE, sample=i), replace(BASE, sample=i + 20)])
+
+
+def test_processes_that_write_at_once_lose_nothing(file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write, args=(str(file), 20 * n)) for n in range(4)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [writer.exitcode for writer in writers] == [0] * 4
+    assert capfd.readouterr().err == ""
+    done = Cached(Talker(), file).complete([replace(BASE, sample=i) for i in range(100)])
+    assert all(c.cached for c in done)
+
+
+def test_the_file_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "mine"))
+    assert default_file() == tmp_path / "mine" / "completions.sqlite"
+    monkeypatch.delenv("SWARMDRIVE_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+    assert default_file() == tmp_path / "caches" / "swarmdrive-harness" / "completions.sqlite"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert default_file() == tmp_path / ".cache" / "swarmdrive-harness" / "completions.sqlite"
+
+
+# -- runs ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_qwen3
+
+    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=700)
+
+
+def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options: Any) -> Evaluated:
+    card = replace(cards.resolve(str(tiny)), max_new_tokens=6)
+    latency = options.pop("latency", Latency("card", 0.1, "declared: for this test"))
+    card = replace(card, latency=latency)
+    points = tuple(POINTS.values())
+    spec = Spec(card, prompts.load("v2"), data, points, (0,), device="cpu", dtype="float32", **options)
+    return evaluate(spec, out, False, lambda done: None, cache)
+
+
+def answers_of(out: Path) -> list[dict[str, Any]]:
+    return [answer for row in rows_of(out) for answer in row["answers"].values()]
+
+
+def test_a_run_from_the_cache_is_the_run_that_was_asked(
+    tiny: Path, small_path: Path, tmp_path: Path, file: Path
+) -> None:
+    data = load(small_path, limit=1)
+    asked = tiny_run(tiny, data, tmp_path / "asked", None)
+    first = tiny_run(tiny, data, tmp_path / "first", file)
+    again = tiny_run(tiny, data, tmp_path / "again", file)
+    assert (tmp_path / "first/rows.jsonl").read_bytes() == (tmp_path / "asked/rows.jsonl").read_bytes()
+    for table in ("summary.csv", "episodes.csv"):
+        assert (tmp_path / "again" / table).read_bytes() == (tmp_path / "asked" / table).read_bytes()
+    good = [a["error"] is None for a in answers_of(tmp_path / "asked")]
+    assert any(good)
+    assert not all(good), "prompts too long for the model are no answers, and are not kept"
+    assert [a["cached"] for a in answers_of(tmp_path / "again")] == good
+    assert [r.manifest["cached_answers"] for r in (asked, first, again)] == [0, 0, sum(good)]
+
+    file.unlink()
+    spec = spec_of(data, f"replay:{tmp_path / 'again'}", seeds=(0,))
+    evaluate(spec, tmp_path / "replayed", False, lambda done: None)
+    assert (tmp_path / "replayed/rows.jsonl").read_bytes() == (tmp_path / "again/rows.jsonl").read_bytes()
+
+
+MEASURED = Latency("measured", None, "this machine")
+
+
+def test_batches_are_timed_though_every_answer_is_kept(
+    tiny: Path, small_path: Path, tmp_path: Path, file: Path
+) -> None:
+    data = load(small_path, limit=1)
+    for name in ("first", "again"):
+        done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=4)
+        assert done.manifest["latency"]["n"]["ego"] > 0
+        assert done.manifest["latency"]["inference_s"]["ego"] > 0
+    assert done.manifest["cached_answers"] > 0
+
+
+def test_one_by_one_the_cached_answers_take_the_median_of_those_that_were_asked(
+    tiny: Path, small_path: Path, tmp_path: Path, file: Path
+) -> None:
+    few, data = load(small_path, limit=1), load(small_path, limit=2)
+    tiny_run(tiny, few, tmp_path / "few", file, latency=MEASURED, batch_size=1)
+    done = tiny_run(tiny, data, tmp_path / "run", file, latency=MEASURED, batch_size=1)
+    assert done.manifest["latency"]["inference_s"] is None
+    rows = rows_of(tmp_path / "run")
+    own = [row["answers"]["v1"] for row in rows]
+    assert all(a["seconds"] is None for a in own if a["cached"])
+    assert any(a["cached"] for a in own)
+    typical = float(np.median([a["seconds"] for a in own if a["seconds"] is not None]))
+    expected = [1000 * (a["seconds"] or typical) for a in own]
+    found = [d["latency_ms"] for d in decisions(rows, "single-local")]
+    assert found == pytest.approx(expected, abs=1e-3)
+
+
+def test_one_by_one_with_every_answer_kept_a_sample_is_timed(
+    tiny: Path, small_path: Path, tmp_path: Path, file: Path
+) -> None:
+    data = load(small_path, limit=1)
+    for name in ("first", "again"):
+        done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=1)
+    latency = done.manifest["latency"]
+    assert latency["n"]["ego"] > 0
+    assert all(a["seconds"] is None for a in answers_of(tmp_path / "again"))
+    for decision in decisions(rows_of(tmp_path / "again"), "single-local"):
+        assert decision["latency_ms"] == pytest.approx(1000 * latency["inference_s"]["ego"], abs=1e-3)
+
+
+def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:
+    for model in ("proxy", "local-view"):
+        backend: Backend = open_backend(cards.load(model))
+        assert not isinstance(backend, Rendering)
+        evaluate(spec_of(small, model), tmp_path / model, False, lambda done: None, file)
+    assert not file.exists()
+    assert isinstance(Talker(), Rendering)
