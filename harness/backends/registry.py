@@ -11,6 +11,7 @@ _OPEN: dict[Engine, str] = {
     "driver": "harness.backends.driver:open",
     "replay": "harness.backends.replay:open",
     "transformers": "harness.backends.transformers_backend:open",
+    "openai": "harness.backends.openai_backend:open",
 }
 
 

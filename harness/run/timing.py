@@ -60,9 +60,9 @@ def _sample(scenes: Sequence[Scene]) -> Sequence[Scene]:
 def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
     times: dict[str, list[float]] = {"ego": [], "helper": []}
     for request in asked:
-        seconds = backend.complete([request])[0].seconds
-        if seconds is not None:
-            times[request.role].append(seconds)
+        answer = backend.complete([request])[0]
+        if answer.seconds is not None and answer.error is None:
+            times[request.role].append(answer.seconds)
     known = {role: statistics.median(t) for role, t in times.items() if t}
     fill = max(known.values(), default=None)
     return {
@@ -76,7 +76,7 @@ def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
 
-    Where each answer's own time counts, one that failed has none and takes its role's median.
+    Where each answer's own time counts, one that has none, since its engine failed, takes its role's median.
     """
     asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]
