@@ -1,9 +1,11 @@
 """What the documents list is what the program has."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
+from harness.failures import Failures
 from harness.parse import Repair, Status
 
 ROOT = Path(__file__).parent.parent
@@ -12,6 +14,12 @@ ROOT = Path(__file__).parent.parent
 @pytest.mark.parametrize("member", [*Status, *Repair], ids=str)
 def test_every_status_and_repair_is_documented_with_its_meaning(member: Status | Repair) -> None:
     assert f"| `{member.value}` | {member.meaning} |" in (ROOT / "docs/answers.md").read_text()
+
+
+def test_every_failure_on_purpose_is_documented() -> None:
+    documented = (ROOT / "docs/answers.md").read_text().partition("## Failures on purpose")[2]
+    for name in asdict(Failures()):
+        assert f"`{name}`" in documented
 
 
 def test_the_readme_names_every_command() -> None:

@@ -77,6 +77,7 @@ def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) 
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
 
     Where each answer's own time counts, one that has none, since its engine failed, takes its role's median.
+    What an answer is declared to be slower than its card comes on top of the card's.
     """
     asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]
@@ -85,7 +86,8 @@ def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) 
         typical = [_median(own[:, :1]), *[_median(own[:, 1:])] * (own.shape[1] - 1)]
         return np.where(asked & np.isnan(own), typical, own)
     by_place = np.array([fixed["ego"], *[fixed["helper"]] * (asked.shape[1] - 1)], dtype=float)
-    return np.where(asked, by_place, np.nan)
+    slow = np.array([[a["slow_s"] if a else 0.0 for a in row] for row in answers])
+    return np.where(asked, by_place + slow, np.nan)
 
 
 def _median(seconds: Floats) -> float:
