@@ -4,9 +4,8 @@
 
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
 `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
-(left out where `lm_eval` is not installed). `--shape 0.6b` takes random weights of Qwen3-0.6B's shape with the
-model's tokenizer: such weights never stop, so every free answer is as long as a JSON answer is in Qwen's tokens.
-CPU seconds of this process; what llama.cpp does in its own process is taken from its answers' wall time.
+(left out where `lm_eval` is not installed). `--shape 0.6b` takes random weights of Qwen3-0.6B's shape with
+the model's tokenizer: such weights never stop, so every free answer is as long as Qwen's tokens make it. CPU seconds of this process; what llama.cpp does in its own process is taken from its answers' wall time.
 """
 
 import argparse
@@ -150,7 +149,8 @@ def shaped(card: cards.Card, folder: Path) -> Path:
     config = Qwen3Config(
         vocab_size=151936, hidden_size=1024, intermediate_size=3072, num_hidden_layers=28,
         num_attention_heads=16, num_key_value_heads=8, head_dim=128, tie_word_embeddings=True,
-        max_position_embeddings=4096, eos_token_id=151645, pad_token_id=tokenizer.pad_token_id, bos_token_id=None,
+        max_position_embeddings=4096, eos_token_id=151645, pad_token_id=tokenizer.pad_token_id,
+        bos_token_id=None,
     )  # fmt: skip
     Qwen3ForCausalLM(config).to(torch.bfloat16).save_pretrained(folder)
     tokenizer.save_pretrained(folder)

@@ -7,15 +7,17 @@ exported on the spot, and with the GGUF file that the model's card names.
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from harness.arrays import Floats
-from harness.backends import checkpoint
-from harness.backends.base import Request
+from harness.backends import checkpoint, llama_backend, transformers_engine
+from harness.backends.base import Backend, Request
 from harness.backends.language_model import LanguageModel
-from harness.backends.registry import open_backend
+from harness.backends.llama_backend import LlamaBackend
 from harness.cards import Card
 from harness.gguf_export import export
 from harness.parse import parse
@@ -23,6 +25,8 @@ from harness.parse import parse
 LEAST_TEXTS, MOST_READOUT = 0.98, 0.02
 MOST_LOGIT = {"F32": 1e-3, "F16": 0.1}  # other formats are measured, and held to nothing
 SHOWN = 5  # differences of a kind that are named
+BATCH = 8
+PASSES = 5
 
 
 @dataclass(frozen=True)
@@ -74,74 +78,80 @@ def compare(
         gguf: a card on llama-cpp.
         asked: requests for JSON.
         letters: requests for a read-out.
-        progress: called with how many of five passes over the prompts are done.
+        progress: called with 1 after each of `PASSES` passes over the prompts.
 
     Raises:
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
     where = checkpoint.find(reference)
     rows = checkpoint.vocabulary(where)
-    known = _hear(reference, "float32", 1, asked, letters, rows)
+    plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
+    known = _hear(plain(batch_size=1), asked, letters, rows)
     progress(1)
-    found = []
     with tempfile.TemporaryDirectory() as folder:
-        exact = Path(folder) / f"{where.name}-f32.gguf"
-        export(where, exact, "F32")
-        same = replace(gguf, weights=str(exact), file=None, revision=None, sha256=None)
-        for label, card in (("F32", same), ("card", gguf)):
-            heard = _hear(card, None, 1, asked, letters, rows)
-            found += _findings(label if label == "F32" else (gguf.quantisation or "GGUF"), asked, known, heard)
+        file = Path(folder) / "f32.gguf"
+        export(where, file, "F32")
+        same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None)
+        exact = partial(llama_backend.open, same, device="cpu")
+        shipped = partial(llama_backend.open, gguf, device="cpu")
+        found = []
+        for label, opened in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
+            found += _findings(label, asked, known, _hear(opened(batch_size=1), asked, letters, rows))
             progress(1)
-        for name, card, dtype in (("transformers", reference, "float32"), ("llama-cpp F32", same, None)):
-            found.append(_company(name, card, dtype, asked))
+        for label, opened, alone in (("transformers", plain, known.texts), ("llama.cpp F32", exact, None)):
+            found.append(_company(label, opened, asked, alone))
             progress(1)
     return found
 
 
 def _hear(
-    card: Card, dtype: str | None, batch_size: int, asked: Sequence[Request], letters: Sequence[Request], rows: int
+    backend: LanguageModel | LlamaBackend, asked: Sequence[Request], letters: Sequence[Request], rows: int
 ) -> Heard:
-    backend = open_backend(card, device="cpu", dtype=dtype, batch_size=batch_size)
     tokens = [backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in asked]
     logits = np.concatenate([backend.next_log_probs([ids], rows) for ids in tokens])
-    texts = [c.text if c.error is None else f"error: {c.error}" for c in backend.complete(asked)]
-    read = [parse(c.text, role="ego", actions=r.actions) for r, c in zip(letters, backend.complete(letters), strict=True)]
-    nothing = [np.nan] * len(asked[0].actions)
-    return Heard(tokens, logits, texts, np.array([p.intent or nothing for p in read]))
+    read = [
+        parse(c.text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
+        for r, c in zip(letters, backend.complete(letters), strict=True)
+    ]
+    return Heard(tokens, logits, _texts(backend, asked), np.array(read))
+
+
+def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
+    return [c.text if c.error is None else f"error: {c.error}" for c in backend.complete(asked)]
 
 
 def _findings(label: str, asked: Sequence[Request], one: Heard, other: Heard) -> list[Finding]:
-    n = len(asked)
     ids = [r.id for r in asked]
-    tokens = [i for i, a, b in zip(ids, one.tokens, other.tokens, strict=True) if a != b]
-    texts = [
-        f"{i}: {a!r} / {b!r}" for i, a, b in zip(ids, one.texts, other.texts, strict=True) if a != b
-    ]
     logit = np.abs(one.logits - other.logits).max(axis=1)
     read = np.abs(one.readouts - other.readouts).max(axis=1)
-    most = MOST_LOGIT.get(label)
     return [
-        Finding(f"{label}: token ids equal", 1 - len(tokens) / n, 1.0, not tokens, n, tuple(tokens[:SHOWN])),
-        Finding(f"{label}: largest difference of a logit", float(logit.max()), most,
-                most is None or bool(logit.max() <= most), n, _worst(ids, logit, most)),
-        Finding(f"{label}: greedy text equal", 1 - len(texts) / n, LEAST_TEXTS,
-                len(texts) <= (1 - LEAST_TEXTS) * n, n, tuple(texts[:SHOWN])),
-        Finding(f"{label}: largest difference of a read-out", float(read.max()), MOST_READOUT,
-                bool(read.max() <= MOST_READOUT), n, _worst(ids, read, MOST_READOUT)),
-    ]  # fmt: skip
+        _equal(f"{label}: token ids equal", 1.0, ids, one.tokens, other.tokens),
+        _near(f"{label}: largest difference of a logit", MOST_LOGIT.get(label), ids, logit),
+        _equal(f"{label}: greedy text equal", LEAST_TEXTS, ids, one.texts, other.texts),
+        _near(f"{label}: largest difference of a read-out", MOST_READOUT, ids, read),
+    ]
 
 
-def _worst(ids: Sequence[str], values: Floats, most: float | None) -> tuple[str, ...]:
-    order = np.argsort(-values)[:SHOWN]
-    return tuple(f"{ids[i]}: {values[i]:.2g}" for i in order if most is not None and not values[i] <= most)
+def _company(
+    label: str, opened: Callable[..., Backend], asked: Sequence[Request], alone: list[str] | None
+) -> Finding:
+    """Batches in reverse order, against one at a time."""
+    alone = alone or _texts(opened(batch_size=1), asked)
+    together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
+    return _equal(
+        f"{label}: text equal in reversed batches of {BATCH}", 1.0, [r.id for r in asked], alone, together
+    )
 
 
-def _company(name: str, card: Card, dtype: str | None, asked: Sequence[Request]) -> Finding:
-    """Batches in another order, against one at a time."""
-    alone = open_backend(card, device="cpu", dtype=dtype, batch_size=1).complete(asked)
-    together = open_backend(card, device="cpu", dtype=dtype, batch_size=8).complete(asked[::-1])[::-1]
-    other = [f"{a.request_id}: {a.text!r} / {b.text!r}" for a, b in zip(alone, together, strict=True) if a.text != b.text]
+def _equal(what: str, least: float, ids: Sequence[str], one: Sequence[Any], other: Sequence[Any]) -> Finding:
+    unlike = [f"{i}: {a!r} / {b!r}" for i, a, b in zip(ids, one, other, strict=True) if a != b]
+    share = 1 - len(unlike) / len(ids)
+    return Finding(what, share, least, share >= least, len(ids), tuple(unlike[:SHOWN]))
+
+
+def _near(what: str, most: float | None, ids: Sequence[str], values: Floats) -> Finding:
+    worst = [i for i in np.argsort(-values)[:SHOWN] if most is not None and not values[i] <= most]
     return Finding(
-        f"{name}: text the same alone and in batches of 8 in reverse order",
-        1 - len(other) / len(asked), 1.0, not other, len(asked), tuple(other[:SHOWN]),
+        what, float(values.max()), most, most is None or bool(values.max() <= most), len(ids),
+        tuple(f"{ids[i]}: {values[i]:.2g}" for i in worst),
     )  # fmt: skip

@@ -86,7 +86,8 @@ def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[fl
     intent = np.array(weights) / sum(weights)
     for prompt in VERSIONS:
         for graph in few.scenes[2].record["graphs"].values():
-            said = parse(answer(prompt, graph, intent, ACTIONS, bare=bare), role=graph["role"], actions=ACTIONS)
+            text = answer(prompt, graph, intent, ACTIONS, bare=bare)
+            said = parse(text, role=graph["role"], actions=ACTIONS)
             reasons_first = prompt.helper_answer == "recommendation" and not bare
             assert said.verdict == ("recovered" if reasons_first else "strict")
             assert said.intent is not None

@@ -3,6 +3,7 @@
 Nothing is ever downloaded: an evaluation names its weights, and a person fetches them once.
 """
 
+import json
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,6 +96,12 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> Loaded:
             "or put a chat_template.jinja beside its config.json"
         )
     return Loaded(tokenizer, model)
+
+
+def vocabulary(where: Path) -> int:
+    """How many tokens the model of a checkpoint knows, padding rows included."""
+    config = json.loads((where / "config.json").read_text(encoding="utf-8"))
+    return int(config["vocab_size"])
 
 
 def files_sha256(where: Path) -> str:

@@ -50,18 +50,14 @@ def distill(
             "build the one with other seeds (`harness dataset build --seed`)"
         )
 
-    import torch
-
     from harness.backends.transformers_engine import device_of
     from harness.distill.distill import distill as run
     from harness.distill.train import STAGES, Plan
 
-    if threads:
-        torch.set_num_threads(threads)
     plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
     begun_s = time.monotonic()
     with _losses(plan.samples) as show:
-        facts = run(data, versions, plan, out, show, device_of(device))
+        facts = run(data, versions, plan, out, show, device_of(device), threads)
     apart = facts["held_out"]
     typer.echo(
         f"no scene of {printable(apart_from)} is among the {len(data.scenes)} trained on\n"

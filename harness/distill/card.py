@@ -14,8 +14,8 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     return f"""# {name}
 
 A Qwen3 of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained from random weights
-by `harness distill` to imitate one planner in one scenario. It shows the harness with a real language model that
-fits beside the source; it says nothing about Qwen3-4B or any other model, and drives nothing but
+by `harness distill` to imitate one planner in one scenario. It shows the harness with a real language model
+that fits beside the source; it says nothing about Qwen3-4B or any other model, and drives nothing but
 `occluded-intersection`.
 
 - Data: `{data["name"]}`, {data["episodes"]} episodes from seed {data["seed"]}, {data["scenes"]} scenes
@@ -32,5 +32,6 @@ fits beside the source; it says nothing about Qwen3-4B or any other model, and d
 {losses}
 
 `alone` fits the probabilities of one letter an action, `messages` the same with helpers' messages in the
-ego's prompt, `answers` the JSON text, which states the read-out's own distribution. Curves are in `training.json`.
+ego's prompt, `answers` the JSON text, which states the read-out's own distribution. Curves are in
+`training.json`.
 """

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from harness.dataset.load import Dataset
 from harness.distill.card import model_card
 from harness.distill.student import Progress, Student
@@ -19,7 +21,13 @@ from harness.prompts import Prompt
 
 
 def distill(
-    dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, out: Path, progress: Progress, device: str
+    dataset: Dataset,
+    prompts: Sequence[Prompt],
+    plan: Plan,
+    out: Path,
+    progress: Progress,
+    device: str,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Train a model on a dataset and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
@@ -32,6 +40,7 @@ def distill(
         out: folder to make; its name is the model's.
         progress: called with the stage, the sequences seen in it and the loss.
         device: `cpu` or `cuda`.
+        threads: on a CPU; None is PyTorch's choice.
 
     Returns:
         What the model card states: data, plan, curves, and the KL of the read-out on held-out episodes.
@@ -39,6 +48,8 @@ def distill(
     Raises:
         UserError: the folder holds something else.
     """
+    if threads:
+        torch.set_num_threads(threads)
     work = _begin(out, {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)})
     student = Student(dataset, prompts, plan, work, device)
     curves = {name: student.stage(name, progress) for name in STAGES}
