@@ -22,8 +22,9 @@ _FIELDS = c.llama_batch._fields_
 class LlamaContext:
     """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
 
-    Beginnings that were forked are stored once. The memory is made when it is first needed. When it is full
-    it is made anew at twice the size, and filled again from the tokens.
+    Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would attend
+    to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a sequence
+    has filled its room it is made anew at twice the size, and filled again from the tokens.
 
     Attributes:
         tokens: of each sequence that is there.
@@ -39,9 +40,10 @@ class LlamaContext:
         self.tokens: dict[int, list[int]] = {}
 
     def fork(self, source: int, copy: int, length: int) -> None:
-        """Let a new sequence begin with the first `length` tokens of another, computed once."""
-        if length:
-            c.llama_memory_seq_cp(self._memory(), source, copy, 0, length)
+        """Let a new sequence begin with the first `length` tokens of another, as they were computed."""
+        if length:  # between rooms llama.cpp copies a whole sequence only
+            c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
+            c.llama_memory_seq_rm(self._memory(), copy, length, -1)
         self.tokens[copy] = self.tokens[source][:length] if length else []
 
     def drop(self, sequence: int) -> None:
@@ -50,7 +52,7 @@ class LlamaContext:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
     def reserve(self, room: int) -> None:
-        """Make the memory, for so many tokens, if there is none yet."""
+        """Make the memory, for so many tokens of each sequence, if there is none yet."""
         if not self._context:
             self._make(room)
 
@@ -66,7 +68,8 @@ class LlamaContext:
         try:
             logits = self._decode(chunks)
             if logits is None:
-                self._make(self._room + max(self._room, sum(map(len, chunks.values()))))
+                longest = max(len(self.tokens[s]) + len(chunk) for s, chunk in chunks.items())
+                self._make(max(2 * self._room, longest))
                 self._fill()
                 logits = self._decode(chunks)
             if logits is None:
@@ -92,11 +95,11 @@ class LlamaContext:
         if self._context:  # before the new one is there: both may not fit
             c.llama_free(self._context)
         params = c.llama_context_default_params()
-        self._room = max(4 * _PAGE, -(-room // _PAGE) * _PAGE)
-        params.n_ctx = self._room
+        self._room = -(-room // _PAGE) * _PAGE
+        params.n_ctx = self._room * self._sequences
         params.n_batch = params.n_ubatch = _BATCH
         params.n_seq_max = params.n_outputs_max = self._sequences
-        params.kv_unified = True
+        params.kv_unified = False
         params.swa_full = True  # else a beginning is forgotten as its window passes
         if self.cache_type == "F32":
             # As exact as the weights: llama.cpp's own choice, and its fused attention, round to F16.
@@ -108,10 +111,10 @@ class LlamaContext:
         last_error()
         self._context = c.llama_init_from_model(self._model.pointer, params)
         if not self._context:
-            raise RuntimeError(f"no context for {self._room} tokens: {last_error()}")
+            raise RuntimeError(f"no memory for {self._sequences} x {self._room} tokens: {last_error()}")
 
     def _fill(self) -> None:
-        """Compute all sequences again. In this order each shares with the one before what it can with any."""
+        """Compute all sequences again. In this order each begins like the one before as far as like any."""
         held = sorted(self.tokens.items(), key=lambda item: item[1])
         before, self.tokens = held[0][0], {}
         for sequence, tokens in held:

@@ -18,8 +18,8 @@ from harness.cards import Card
 from harness.errors import UserError
 from harness.files import sha256_bytes, sha256_file
 
-BEGINNINGS = 4  # prompts' beginnings that are kept between calls: roles times prompt versions, and to spare
-_ANSWER = 64  # tokens of an answer that memory is made for at once
+BEGINNINGS = 3  # of prompts, kept between calls: one a role, and one of a batch with both
+_ANSWER = 256  # tokens of an answer that memory is made for at once
 
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
@@ -74,7 +74,7 @@ class LlamaEngine:
         # The last token of each is left for its logits.
         common = 0 if self._model.whole_state else common_length([p[:-1] for p in prompts.values()])
         shared = prompts[first][:common]
-        self._context.reserve(sum(len(ids) - common + _ANSWER for ids in prompts.values()) + common)
+        self._context.reserve(max(map(len, prompts.values())) + _ANSWER)
         kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
         new = 2 * max(kept.values()) < common
         if not rest:  # a prompt that is asked again is read again: else its time would be no answer's time
