@@ -22,9 +22,9 @@ _FIELDS = c.llama_batch._fields_
 class LlamaContext:
     """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
 
-    Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would attend
-    to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a sequence
-    has filled its room it is made anew at twice the size, and filled again from the tokens.
+    Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would
+    attend to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a
+    sequence has filled its room it is made anew at twice the size, and filled again from the tokens.
 
     Attributes:
         tokens: of each sequence that is there.
@@ -94,6 +94,7 @@ class LlamaContext:
     def _make(self, room: int) -> None:
         if self._context:  # before the new one is there: both may not fit
             c.llama_free(self._context)
+            self._context = None
         params = c.llama_context_default_params()
         self._room = -(-room // _PAGE) * _PAGE
         params.n_ctx = self._room * self._sequences
