@@ -1,6 +1,6 @@
 """A checkpoint on disk: where it lies, whether it is whole, and its loading.
 
-Nothing is ever downloaded: an evaluation names its weights, and a person fetches them once.
+Nothing is ever downloaded here: a person fetches weights once (`harness.backends.pull`).
 """
 
 from importlib.util import find_spec
@@ -15,6 +15,9 @@ from harness.resources import folder
 # Without these AutoTokenizer builds an empty tokenizer and says nothing.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
 _WEIGHTS = ("*.safetensors", "*.bin")
+# What transformers loads; a repository's other formats of the same weights would come on top. Fetching and
+# looking both name these: the hub's cache calls a snapshot incomplete that lacks a file nobody needs.
+FILES = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 # What decides an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
 
@@ -57,6 +60,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> Loaded:
     """
     import transformers
 
+    held_to_digest(card, where / "model.safetensors")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     # trust_remote_code=False: else a checkpoint with code of its own asks at the terminal.
@@ -97,6 +101,16 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> Loaded:
     return Loaded(tokenizer, model)
 
 
+def held_to_digest(card: Card, file: Path) -> Path:
+    """The file, if the card's digest is the file's, or the card has none. Raises UserError if it is not."""
+    if card.sha256 and (found := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
+        raise UserError(
+            f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {found}, "
+            f"and the card has {card.sha256}; fetch it again, or mend the card"
+        )
+    return file
+
+
 def files_sha256(where: Path) -> str:
     """Digest of the files of a checkpoint that decide its answers, by name and content."""
     files = sorted(path for path in where.iterdir() if path.is_file() and path.suffix in _HASHED)
@@ -107,7 +121,9 @@ def _cached(card: Card, weights: str) -> Path:
     from huggingface_hub import constants, snapshot_download
 
     try:
-        return Path(snapshot_download(weights, revision=card.revision, local_files_only=True))
+        return Path(
+            snapshot_download(weights, revision=card.revision, allow_patterns=FILES, local_files_only=True)
+        )
     except (OSError, ValueError):  # not there; no hub id
         at = f" at revision {card.revision!r}" if card.revision else ""
         raise UserError(
@@ -119,5 +135,4 @@ def _cached(card: Card, weights: str) -> Path:
 def _fetch(card: Card) -> str:
     if Path(card.weights or "").is_absolute():
         return "copy the checkpoint again, or give another directory"
-    revision = f" --revision {card.revision}" if card.revision else ""
-    return f"run `hf download {card.weights}{revision}`, or point --model at a local directory"
+    return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"
