@@ -42,7 +42,12 @@ class Reader:
             self._prefixes.clear()
             if self._model.device.type == "cuda":
                 torch.cuda.empty_cache()
-            self._failed = False
+        self._failed = True  # until all went well
+        session = self._read(prompts)
+        self._failed = False
+        return session
+
+    def _read(self, prompts: Sequence[Sequence[int]]) -> Session:
         if not self.together:
             return Apart([Rows(self, NOTHING, [prompt]) for prompt in prompts])
         # Each prompt's last token is left to be read, for what comes after it.
