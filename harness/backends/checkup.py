@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.backends.base import Completion, Request
-from harness.backends.transformers_backend import TransformersBackend
+from harness.backends.language_model import LanguageModel
 from harness.cards import Thinking
 
 MESSAGES = (
@@ -36,14 +36,14 @@ class Checkup:
     identity: dict[str, Any]
 
 
-def check(backend: TransformersBackend, *, thinking: bool) -> Checkup:
+def check(backend: LanguageModel, *, thinking: bool) -> Checkup:
     """Render one tiny chat and answer it. `thinking` asks the model to think first, where it can."""
     request = Request("check/ego", "ego", MESSAGES, ACTIONS, MAX_TOKENS, thinking=thinking)
     prompt = backend.chat.render(MESSAGES, thinking=thinking)
     ids = backend.chat.encode(prompt)
     backend.complete([request])  # the first call of a process pays for kernels and caches
     [completion] = backend.complete([request])
-    bos = backend.chat.tokenizer.bos_token_id
+    bos = backend.chat.bos
     return Checkup(
         prompt=prompt,
         prompt_tokens=len(ids),

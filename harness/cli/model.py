@@ -55,9 +55,9 @@ def check(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    from harness.backends import checkup, transformers_backend
+    from harness.backends import checkup, transformers_engine
 
-    backend = transformers_backend.open(card, device=device, dtype=dtype, batch_size=1)
+    backend = transformers_engine.open(card, device=device, dtype=dtype, batch_size=1)
     seen = checkup.check(backend, thinking=thinking)
     if as_json:
         head = {"name": card.name, "engine": card.engine, "model_free": False, "thinking_asked": thinking}

@@ -1,17 +1,20 @@
 """What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from evaluating import run, spec_of
+from misbehaving import completion, serving
 
 from harness import cards
 from harness.backends.base import Backend, Request
 from harness.backends.registry import missing, open_backend
 from harness.dataset.load import load
+from harness.files import digest
 from harness.run.asking import requests
 
 
@@ -27,11 +30,13 @@ def model_free() -> list[str]:
     return [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
 
 
-ENGINES = [*model_free(), "replay", "transformers"]
+ENGINES = [*model_free(), "replay", "transformers", "openai"]
 
 
 @pytest.fixture(scope="module", params=ENGINES)
-def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+def case(
+    request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Case]:
     folder, model = tmp_path_factory.mktemp("conformance"), request.param
     data = load(small_path, limit=1)
     if model == "replay":
@@ -43,14 +48,21 @@ def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pyt
         import tiny_qwen3
 
         model = str(tiny_qwen3.build(folder / "tiny", context_tokens=2048))
+    if model == "openai":
+        with serving(lambda asked: asked.reply(completion(digest(asked.body)))) as there:
+            card = cards.load("openai-example")
+            assert card.server is not None
+            card = replace(card, server=replace(card.server, base_url=there.url))
+            yield Case(open_backend(card, batch_size=3), tuple(requests(spec_of(data), data.scenes[:5]))[:5])
+        return
     spec = spec_of(data, model)
     asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in requests(spec, data.scenes[:5])]
     device = "cpu" if spec.card.engine == "transformers" else None
-    return Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
+    yield Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", "transformers"}
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", "transformers", "openai"}
     assert tried == set(cards.Engine.__args__)
     assert all(missing(cards.load(name)) is None for name in model_free())
 

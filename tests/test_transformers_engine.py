@@ -1,4 +1,4 @@
-"""The transformers backend, played on a real tiny Qwen3 with random weights."""
+"""The transformers engine, played on a real tiny Qwen3 with random weights."""
 
 import shutil
 import socket
@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from harness.backends import checkpoint, checkup
 from harness.backends.base import Completion, Request
+from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
-from harness.backends.transformers_backend import TransformersBackend
 from harness.cards import Card, Latency, load, resolve
 from harness.errors import UserError
 
@@ -31,13 +31,13 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def backend(tiny: Path) -> TransformersBackend:
+def backend(tiny: Path) -> LanguageModel:
     return open_tiny(tiny)
 
 
-def open_tiny(folder: Path, batch_size: int = 8, **options: str) -> TransformersBackend:
+def open_tiny(folder: Path, batch_size: int = 8, **options: str) -> LanguageModel:
     opened = open_backend(resolve(str(folder)), batch_size=batch_size, device="cpu", **options)
-    assert isinstance(opened, TransformersBackend)
+    assert isinstance(opened, LanguageModel)
     return opened
 
 
@@ -74,12 +74,12 @@ def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Pat
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.builds(ask, st.integers(0, 15), max_tokens=st.integers(1, 12)), max_size=6))
-def test_company_never_changes_an_answer(backend: TransformersBackend, requests: list[Request]) -> None:
+def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
     alone = [backend.complete([request])[0] for request in requests]
     assert said(backend.complete(requests)) == said(alone)
 
 
-def test_an_answer_ends_with_its_stop_token_or_is_cut_off(backend: TransformersBackend) -> None:
+def test_an_answer_ends_with_its_stop_token_or_is_cut_off(backend: LanguageModel) -> None:
     answers = backend.complete(REQUESTS)
     assert {c.finish_reason for c in answers} == {"stop", "length"}
     for c in answers:
@@ -90,7 +90,7 @@ def test_an_answer_ends_with_its_stop_token_or_is_cut_off(backend: TransformersB
         assert tiny_qwen3.IM_END not in c.text
 
 
-def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(backend: TransformersBackend) -> None:
+def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(backend: LanguageModel) -> None:
     [whole] = backend.complete([ask(0)])
     assert whole.finish_reason == "stop"
     assert whole.completion_tokens is not None
@@ -102,20 +102,20 @@ def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(backend:
     assert (cut.text, cut.finish_reason) == (whole.text, "length")
 
 
-def test_tokens_in_are_the_rendered_prompts(backend: TransformersBackend) -> None:
+def test_tokens_in_are_the_rendered_prompts(backend: LanguageModel) -> None:
     [answer] = backend.complete([ask(4)])
     prompt = backend.chat.render(ask(4).messages, thinking=False)
     assert answer.prompt_tokens == len(backend.chat.encode(prompt))
     assert backend.chat.tokenizer.decode(backend.chat.encode(prompt)) == prompt
 
 
-def test_think_tags_stay_in_the_text_and_special_tokens_do_not(backend: TransformersBackend) -> None:
+def test_think_tags_stay_in_the_text_and_special_tokens_do_not(backend: LanguageModel) -> None:
     assert any("<think>" in c.text for c in backend.complete(REQUESTS))
     ids = backend.chat.encode("<think>slow</think>IDLE<|im_end|>")
     assert backend.chat.decode(ids) == "<think>slow</think>IDLE"
 
 
-def test_the_thinking_switch_alters_the_prompt(backend: TransformersBackend) -> None:
+def test_the_thinking_switch_alters_the_prompt(backend: LanguageModel) -> None:
     assert backend.chat.thinking == "switch"
     on = backend.chat.render(ask(0).messages, thinking=True)
     off = backend.chat.render(ask(0).messages, thinking=False)
@@ -146,7 +146,7 @@ def test_seconds_belong_to_an_answer_that_was_asked_alone(tiny: Path) -> None:
             assert c.seconds is None
 
 
-def test_no_requests_no_completions(backend: TransformersBackend) -> None:
+def test_no_requests_no_completions(backend: LanguageModel) -> None:
     assert backend.complete([]) == []
 
 
@@ -154,7 +154,7 @@ def test_no_requests_no_completions(backend: TransformersBackend) -> None:
 
 
 def test_a_prompt_that_leaves_no_room_is_an_error_and_its_neighbours_are_answered(
-    backend: TransformersBackend,
+    backend: LanguageModel,
 ) -> None:
     long = ask(1, text="truck " * 600)
     first, over, last = backend.complete([ask(0), long, ask(2)])
@@ -193,7 +193,7 @@ def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
         raise KeyboardInterrupt
 
     opened = open_tiny(tiny)
-    opened.model.register_forward_pre_hook(press)
+    opened.engine.model.register_forward_pre_hook(press)
     with pytest.raises(KeyboardInterrupt):
         opened.complete([ask(0)])
 
@@ -350,7 +350,7 @@ def test_nothing_goes_over_the_network_and_nothing_is_said_on_stderr(
 
 
 def test_a_checkup_shows_the_prompt_its_tokens_and_one_answer_asked_alone(
-    backend: TransformersBackend,
+    backend: LanguageModel,
 ) -> None:
     seen = checkup.check(backend, thinking=False)
     assert seen.prompt == backend.chat.render(checkup.MESSAGES, thinking=False)

@@ -1,0 +1,121 @@
+"""The backend of every language model that runs in this process, whatever its engine."""
+
+import time
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import Any, NamedTuple
+
+from harness.backends.base import Completion, Request
+from harness.backends.decoding import Answer, Decoding
+from harness.backends.engine import Engine
+from harness.errors import printable
+
+
+class _Prompt(NamedTuple):
+    """One request as the engine sees it."""
+
+    position: int
+    request: Request
+    ids: list[int]
+
+
+class LanguageModel:
+    """An engine that is asked in batches.
+
+    Attributes:
+        engine: the loaded model.
+        chat: its tokenizer and chat template.
+        batch_size: most requests that go through the engine together.
+    """
+
+    def __init__(self, engine: Engine, batch_size: int) -> None:
+        self.engine = engine
+        self.chat = engine.chat
+        self.batch_size = batch_size
+        self._decoding = Decoding(engine)
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in the same order.
+
+        `completion_tokens` counts what was written, the stop token and fixed tokens included, padding not.
+        A batch that fails is asked again, one request at a time.
+
+        Raises:
+            UserError: the tokenizer or `max_tokens` leaves no room for the way of answering, or the template
+                refuses the messages.
+        """
+        done: dict[int, Completion] = {}
+        fitting = []
+        for position, request in enumerate(requests):
+            ids = self.chat.encode(self.chat.render(request.messages, thinking=request.thinking))
+            room = self._decoding.room(request)
+            if len(ids) + room > self.engine.context_tokens:
+                done[position] = _failed(request, len(ids), self._overflow(len(ids), room))
+            else:
+                fitting.append(_Prompt(position, request, ids))
+        for batch in self._batches(fitting):
+            for prompt, completion in zip(batch, self._answer(batch), strict=True):
+                done[prompt.position] = completion
+        return [done[position] for position in range(len(requests))]
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the answers: the engine's."""
+        return self.engine.identity()
+
+    def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:
+        """Prompts that are answered alike, begin alike (a role has one system prompt) and are as long."""
+
+        def kind(p: _Prompt) -> tuple[str, str, int, int]:
+            return p.request.answer, p.request.role, p.request.max_tokens, len(p.ids)
+
+        for _, same in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
+            alike = list(same)
+            for start in range(0, len(alike), self.batch_size):
+                yield alike[start : start + self.batch_size]
+
+    def _overflow(self, prompt_tokens: int, room: int) -> str:
+        return (
+            f"context overflow: {prompt_tokens + room} tokens > {self.engine.context_tokens} "
+            f"({prompt_tokens} in the prompt, {room} for the answer)"
+        )
+
+    def _answer(self, batch: list[_Prompt]) -> list[Completion]:
+        answered = self._try(batch)
+        if isinstance(answered, list):
+            return answered
+        # Out here nothing of the failed batch is alive, so that an engine can free its memory.
+        completions = []
+        for prompt in batch:
+            alone = self._try([prompt])
+            completions += (
+                alone if isinstance(alone, list) else [_failed(prompt.request, len(prompt.ids), alone)]
+            )
+        return completions
+
+    def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
+        """Completions of a batch, or the engine's message."""
+        try:
+            start_s = time.perf_counter()
+            answers = self._decoding.answer([p.request for p in batch], [p.ids for p in batch])
+            seconds = time.perf_counter() - start_s
+        except Exception as error:  # an engine may fail in any way; what it says is data
+            return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
+        alone = seconds if len(batch) == 1 else None
+        return [_completion(p, answer, alone, len(batch)) for p, answer in zip(batch, answers, strict=True)]
+
+
+def _completion(prompt: _Prompt, answer: Answer, seconds: float | None, batch_size: int) -> Completion:
+    return Completion(
+        request_id=prompt.request.id,
+        text=answer.text,
+        prompt_tokens=len(prompt.ids),
+        completion_tokens=answer.tokens,
+        finish_reason=answer.finish_reason,
+        seconds=seconds,
+        batch_size=batch_size,
+        label_mass=answer.label_mass,
+    )
+
+
+def _failed(request: Request, prompt_tokens: int, error: str) -> Completion:
+    return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)

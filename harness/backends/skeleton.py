@@ -1,0 +1,136 @@
+"""The fixed text of a constrained answer, in which the model fills in digits and choices.
+
+Compact JSON, always in the answer schema's form. A probability is `0.` and two digits, so 1.00 cannot be
+written, and what was written need not sum to 1: `finished` divides the sum out. A helper's evidence is empty,
+since there is no free text.
+
+What is fixed is never asked for: a choice is walked token by token, and only where the options that are left
+differ in their next token does the model decide (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
+"""
+
+from collections.abc import Generator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from harness.answer_schema import RISKS
+from harness.backends.chat import Chat
+from harness.errors import UserError, printable
+from harness.files import canonical_json
+from harness.rounding import rounded
+
+Part = str | tuple[str, ...]
+TWO_DIGITS = tuple(f"{n:02d}" for n in range(100))
+
+
+def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
+    """The text: what stands as it is, and tuples of options, never two in a row and none at either end.
+
+    It is cut beside letters and digits only, where tokenizers cut, too.
+    """
+    text: list[Part] = []
+    opening = "{"
+    if role == "helper":
+        text, opening = ['{"evidence":"","risk":"', RISKS], '",'
+    names = tuple(canonical_json(action) for action in actions)
+    if role == "helper" and form == "recommendation":
+        bare = tuple(name[1:-1] for name in names)
+        return [*text, f'{opening}"recommended_maneuver":"', bare, '","confidence":0.', TWO_DIGITS, "}"]
+    opening += '"action_distribution":{'
+    for name in names:
+        text += [f"{opening}{name}:0.", TWO_DIGITS]
+        opening = ","
+    return [*text, "}}"]
+
+
+def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]) -> str:
+    """The answer as text, valid under the schema; two decimals, a distribution's summing to 1.
+
+    Args:
+        role: `ego` or `helper`.
+        form: what a helper is asked for.
+        actions: meta-action names.
+        chosen: for each choice of `parts` the place of the chosen option. Digits that are all zero say
+            nothing about any action, so they become the uniform distribution.
+    """
+    body: dict[str, object] = {"evidence": "", "risk": RISKS[chosen[0]]} if role == "helper" else {}
+    if role == "helper" and form == "recommendation":
+        body |= {"recommended_maneuver": actions[chosen[1]], "confidence": chosen[2] / 100}
+        return canonical_json(body)
+    digits = chosen[-len(actions) :]
+    digits = digits if any(digits) else [1] * len(actions)
+    p = rounded([n / sum(digits) for n in digits])
+    return canonical_json(body | {"action_distribution": dict(zip(actions, p, strict=True))})
+
+
+def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
+    """Tokens of a text that stands behind another: some tokenizers mark where a text begins.
+
+    Where a token would span the two, those of the text alone.
+    """
+    head, whole = chat.encode(before), chat.encode(before + text)
+    return tuple(whole[len(head) :] if whole[: len(head)] == head else chat.encode(text))
+
+
+class Ask(NamedTuple):
+    """A decision: tokens to append first, the last decision's among them, and the sorted tokens to choose from."""
+
+    forced: list[int]
+    among: list[int]
+
+
+class Skeleton:
+    """The text of `parts` in a tokenizer's tokens.
+
+    Attributes:
+        most_tokens: length of its longest filling.
+    """
+
+    def __init__(self, chat: Chat, role: str, form: str, actions: Sequence[str]) -> None:
+        self._literals: list[tuple[int, ...]] = []
+        self._choices: list[list[tuple[int, ...]]] = []
+        pieces = parts(role, form, actions)
+        before = "\n"  # an answer follows a line's end in every chat template we know
+        for piece in pieces:
+            if isinstance(piece, str):
+                self._literals.append(tokens_after(chat, before, piece))
+                before = piece
+            else:
+                self._choices.append([tokens_after(chat, before, option) for option in piece])
+                before = piece[0]
+        for place, options in enumerate(self._choices):
+            # An option may begin as another does, whole (SLOW, SLOWER): what comes after decides.
+            stop = self._literals[place + 1][:1]
+            self._choices[place] = ended = [option + stop for option in options]
+            if any(longer[: len(short)] == short for short, longer in pairwise(sorted(ended))):
+                raise UserError(
+                    f"model {printable(chat.name)!r}: its tokenizer cannot tell the choices of a constrained "
+                    f"answer apart; use --answer json"
+                )
+        longest = [max(options, key=len) for options in self._choices]
+        self.most_tokens = self._count(longest)
+
+    def _count(self, ended: Sequence[tuple[int, ...]]) -> int:
+        return sum(map(len, self._literals)) + sum(len(option) - 1 for option in ended)
+
+    def count(self, chosen: Sequence[int]) -> int:
+        """Length of a filling, in tokens."""
+        return self._count([options[i] for options, i in zip(self._choices, chosen, strict=True)])
+
+    def walk(self) -> Generator[Ask, int, list[int]]:
+        """Ask for each decision, be sent its token, and return the chosen places that `finished` takes."""
+        chosen = []
+        forced = list(self._literals[0])
+        for options, after in zip(self._choices, self._literals[1:], strict=True):
+            left, depth = list(range(len(options))), 0
+            while len(left) > 1:
+                among = sorted({options[i][depth] for i in left})
+                if len(among) > 1:
+                    token = yield Ask(forced, among)
+                    forced = []
+                    left = [i for i in left if options[i][depth] == token]
+                if len(left) > 1:
+                    forced.append(options[left[0]][depth])
+                    depth += 1
+            chosen.append(left[0])
+            forced += [*options[left[0]][depth:-1], *after]
+        return chosen

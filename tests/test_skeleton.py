@@ -1,0 +1,232 @@
+"""The fixed text of a constrained answer: what stands, what is chosen, and how it is walked in tokens."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.answer_schema import answer_schema
+from harness.backends.skeleton import TWO_DIGITS, Skeleton, finished, parts, tokens_after
+from harness.errors import UserError
+from harness.parse import parse
+from harness.tokens import tokenizer
+
+THREE = ("SLOWER", "IDLE", "FASTER")
+FIVE = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+KINDS = [("ego", "distribution"), ("helper", "distribution"), ("helper", "recommendation")]
+QWEN = Path(__file__).parents[2] / "shared" / "tokenizer" / "qwen2-vocab-only.gguf"
+
+
+class Encoder:
+    """What a skeleton asks of a chat: its name, and texts in tokens."""
+
+    def __init__(self, name: str, encode: Callable[[str], list[int]]) -> None:
+        self.name, self.encode = name, encode
+
+
+def characters(text: str) -> list[int]:
+    return [ord(c) for c in text]
+
+
+CHARACTERS: Any = Encoder("characters", characters)
+
+
+def of(source: Path) -> Any:
+    loaded = tokenizer(source)
+    return Encoder(source.name, lambda text: loaded.encode(text, add_special_tokens=False).ids)
+
+
+@pytest.fixture(scope="module", params=["characters", "tiny", "qwen"])
+def chat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    if request.param == "characters":
+        return CHARACTERS
+    if request.param == "qwen":
+        if not QWEN.is_file():
+            pytest.skip("Qwen's vocabulary is not here")
+        return of(QWEN)
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_qwen3
+
+    return of(tiny_qwen3.build(tmp_path_factory.mktemp("tiny")))
+
+
+def filled(role: str, form: str, actions: tuple[str, ...], chosen: list[int]) -> str:
+    places = iter(chosen)
+    return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(role, form, actions))
+
+
+def played(skeleton: Skeleton, choose: Callable[[list[int]], int]) -> tuple[list[int], list[list[int]], Any]:
+    """A whole walk: the tokens before its last decision, what stood to choose, and the chosen places."""
+    walk, ids, choices = skeleton.walk(), [], []
+    ask = next(walk)
+    while True:
+        token = choose(ask.among)
+        ids += ask.forced
+        choices.append(ask.among)
+        try:
+            ask = walk.send(token)
+        except StopIteration as end:
+            return ids, choices, end.value
+
+
+# -- the text -----------------------------------------------------------------------------------------
+
+
+def test_the_egos_text_is_a_distribution_with_two_digits_an_action() -> None:
+    assert parts("ego", "recommendation", THREE) == parts("ego", "distribution", THREE)
+    assert parts("ego", "distribution", THREE) == [
+        '{"action_distribution":{"SLOWER":0.', TWO_DIGITS,
+        ',"IDLE":0.', TWO_DIGITS,
+        ',"FASTER":0.', TWO_DIGITS,
+        "}}",
+    ]  # fmt: skip
+
+
+def test_a_helper_says_its_risk_first_and_has_no_words_for_evidence() -> None:
+    assert parts("helper", "distribution", ("GO", "STOP")) == [
+        '{"evidence":"","risk":"', ("low", "medium", "high"),
+        '","action_distribution":{"GO":0.', TWO_DIGITS,
+        ',"STOP":0.', TWO_DIGITS,
+        "}}",
+    ]  # fmt: skip
+    assert parts("helper", "recommendation", ("GO", "STOP")) == [
+        '{"evidence":"","risk":"', ("low", "medium", "high"),
+        '","recommended_maneuver":"', ("GO", "STOP"),
+        '","confidence":0.', TWO_DIGITS,
+        "}",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("digits", "text"),
+    [
+        ([70, 20, 10], '{"FASTER":0.1,"IDLE":0.2,"SLOWER":0.7}'),
+        ([99, 0, 0], '{"FASTER":0.0,"IDLE":0.0,"SLOWER":1.0}'),  # 1.00 cannot be written, but meant
+        ([99, 99, 99], '{"FASTER":0.33,"IDLE":0.33,"SLOWER":0.34}'),
+        ([0, 0, 0], '{"FASTER":0.33,"IDLE":0.33,"SLOWER":0.34}'),  # nothing said: uniform
+        ([1, 1, 0], '{"FASTER":0.0,"IDLE":0.5,"SLOWER":0.5}'),
+    ],
+)
+def test_the_digits_sum_is_divided_out(digits: list[int], text: str) -> None:
+    assert finished("ego", "distribution", THREE, digits) == f'{{"action_distribution":{text}}}'
+
+
+def test_a_recommendation_keeps_its_confidence() -> None:
+    assert finished("helper", "recommendation", THREE, [2, 1, 7]) == (
+        '{"confidence":0.07,"evidence":"","recommended_maneuver":"IDLE","risk":"high"}'
+    )
+
+
+@given(st.data(), st.sampled_from(KINDS), st.sampled_from([THREE, FIVE, ("GO", 'say "x"\\')]))
+def test_every_filling_is_a_strict_answer_under_the_schema(
+    data: st.DataObject, kind: tuple[str, str], actions: tuple[str, ...]
+) -> None:
+    role, form = kind
+    options = [p for p in parts(role, form, actions) if not isinstance(p, str)]
+    chosen = [data.draw(st.integers(0, len(option) - 1)) for option in options]
+    text = finished(role, form, actions, chosen)
+    parsed = parse(text, role=role, actions=actions)
+    assert parsed.verdict == "strict", parsed.detail
+    # What the model wrote, before the sum is divided out, fits the published schema as well.
+    for written in (text, filled(role, form, actions, chosen)):
+        jsonschema.validate(json.loads(written), answer_schema(role, actions))
+    if form == "distribution" or role == "ego":
+        digits = chosen[-len(actions) :]
+        order = sorted(range(len(actions)), key=digits.__getitem__)
+        assert parsed.intent is not None
+        for low, high in zip(order, order[1:], strict=False):
+            assert parsed.intent[low] <= parsed.intent[high] + 0.01 + 1e-9
+
+
+# -- the walk -----------------------------------------------------------------------------------------
+
+
+@given(random=st.randoms(use_true_random=False))
+@pytest.mark.parametrize("actions", [THREE, FIVE], ids=["three", "five"])
+@pytest.mark.parametrize("kind", KINDS, ids="-".join)
+def test_the_tokens_are_those_of_the_whole_text(
+    chat: Any, kind: tuple[str, str], actions: tuple[str, ...], random: Any
+) -> None:
+    skeleton = Skeleton(chat, *kind, actions)
+    ids, choices, chosen = played(skeleton, random.choice)
+    whole = chat.encode(filled(*kind, actions, chosen))
+    assert ids == whole[: len(ids)], "another cut than the tokenizer's own"
+    assert skeleton.count(chosen) == len(whole) <= skeleton.most_tokens
+    assert all(among == sorted(set(among)) and len(among) > 1 for among in choices)
+
+
+def test_labels_that_begin_alike_are_decided_where_they_part() -> None:
+    skeleton = Skeleton(CHARACTERS, "helper", "recommendation", ("LANE_LEFT", "LANE_RIGHT", "IDLE"))
+    said = iter("hLR07")
+    ids, choices, chosen = played(skeleton, lambda among: ord(next(said)))
+    assert ["".join(map(chr, among)) for among in choices] == [
+        "hlm",  # risk: high, low, medium
+        "IL",  # IDLE, or one of the lanes
+        "LR",  # behind LANE_, which nobody was asked for
+        "0123456789",
+        "0123456789",
+    ]
+    assert "".join(map(chr, ids)) == (
+        '{"evidence":"","risk":"high","recommended_maneuver":"LANE_RIGHT","confidence":0.0'
+    )
+    assert chosen == [2, 1, 7]
+
+
+@pytest.mark.skipif(not QWEN.is_file(), reason="Qwen's vocabulary is not here")
+def test_in_qwens_vocabulary_the_lanes_share_two_tokens_and_are_one_decision() -> None:
+    qwen = of(QWEN)
+    left, right = qwen.encode("LANE_LEFT"), qwen.encode("LANE_RIGHT")
+    assert left[:2] == right[:2]
+    assert len(left) == len(right) == 3
+    skeleton = Skeleton(qwen, "helper", "recommendation", ("LANE_LEFT", "LANE_RIGHT"))
+    _, choices, chosen = played(skeleton, max)
+    assert choices[1] == sorted([left[2], right[2]])
+    assert chosen[1] == (0 if left[2] > right[2] else 1)
+
+
+@pytest.mark.parametrize(("said", "maneuver"), [('l"07', "SLOW"), ("lE07", "SLOWER")])
+def test_a_label_that_is_another_ones_beginning_ends_with_its_quote(said: str, maneuver: str) -> None:
+    actions = ("SLOWER", "SLOW")
+    skeleton = Skeleton(CHARACTERS, "helper", "recommendation", actions)
+    tokens = iter(said)
+    ids, choices, chosen = played(skeleton, lambda among: ord(next(tokens)))
+    assert "".join(map(chr, choices[1])) == '"E'
+    assert actions[chosen[1]] == maneuver
+    assert f'maneuver":"{maneuver}","conf' in "".join(map(chr, ids)), "the quote stands once"
+
+
+def test_a_tokenizer_that_merges_digits_is_asked_for_both_at_once() -> None:
+    def pairs(text: str) -> list[int]:
+        """Characters, but two digits are one token."""
+        ids, at = [], 0
+        while at < len(text):
+            two = text[at : at + 2].isdigit() and len(text[at : at + 2]) == 2
+            ids.append(100000 + int(text[at : at + 2]) if two else ord(text[at]))
+            at += 2 if two else 1
+        return ids
+
+    merging: Any = Encoder("merging", pairs)
+    _, choices, chosen = played(Skeleton(merging, "ego", "distribution", ("GO",)), max)
+    assert choices == [[100000 + n for n in range(100)]]
+    assert chosen == [99]
+
+
+def test_a_tokenizer_that_marks_a_beginning_marks_none_inside_the_text() -> None:
+    marking: Any = Encoder("marking", lambda text: [0, *characters(text)])
+    assert tokens_after(marking, "0.", "70") == tuple(characters("70"))
+
+
+def test_where_a_token_spans_the_cut_the_text_alone_is_taken() -> None:
+    spanning: Any = Encoder("spanning", lambda text: [7] if text == "ab" else characters(text))
+    assert tokens_after(spanning, "a", "b") == (ord("b"),)
+
+
+def test_a_tokenizer_that_cannot_tell_labels_apart_is_refused() -> None:
+    blind: Any = Encoder("blind", lambda text: [min(ord(c), 128) for c in text])
+    with pytest.raises(UserError, match=r"'blind'.*tell the choices.*--answer json"):
+        Skeleton(blind, "helper", "recommendation", ("é", "è"))
