@@ -1,11 +1,13 @@
 """What the documents list is what the program has."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from harness.backends.base import AnswerMode
+from harness.failures import Failures
 from harness.parse import Repair, Status
 
 ROOT = Path(__file__).parent.parent
@@ -19,6 +21,12 @@ def test_every_status_and_repair_is_documented_with_its_meaning(member: Status |
 @pytest.mark.parametrize("mode", get_args(AnswerMode))
 def test_every_way_of_answering_is_documented(mode: str) -> None:
     assert f"| `{mode}` |" in (ROOT / "docs/answers.md").read_text()
+
+
+def test_every_failure_on_purpose_is_documented() -> None:
+    documented = (ROOT / "docs/answers.md").read_text().partition("## Failures on purpose")[2]
+    for name in asdict(Failures()):
+        assert f"`{name}`" in documented
 
 
 def test_the_readme_names_every_command() -> None:

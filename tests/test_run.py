@@ -262,14 +262,27 @@ def test_a_prompt_that_does_not_render_some_scene_leaves_nothing(small: Dataset,
         ({"seeds": (3, 3)}, "--seeds [3, 3]: give one or more different"),
         ({"batch_size": 0}, "--batch-size 0: give 1 or more"),
         ({"thinking": True}, "--thinking: proxy cannot think; leave it out"),
-        ({"device": "cuda"}, "--device cuda: proxy has no weights; leave it out"),
-        ({"dtype": "float32"}, "--dtype float32: proxy has no weights; leave it out"),
+        (
+            {"device": "cuda"},
+            "--device cuda: proxy has no weights here (engines transformers and llama-cpp have)",
+        ),
+        (
+            {"dtype": "float32"},
+            "--dtype float32: proxy has no weights here (engines transformers and llama-cpp have)",
+        ),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(options: dict[str, Any], said: str, small: Dataset) -> None:
     with pytest.raises(UserError) as caught:
         spec_of(small, **options)
     assert str(caught.value).startswith(said)
+
+
+def test_a_served_model_thinks_where_its_card_says_so(small: Dataset) -> None:
+    card = cards.load("openai-example")
+    assert Spec(card, prompts.load("v2"), small, (), (0,), thinking=True).thinking is True
+    with pytest.raises(UserError, match="--thinking: openai-example cannot think; leave it out"):
+        Spec(replace(card, thinking="none"), prompts.load("v2"), small, (), (0,), thinking=True)
 
 
 def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to(small: Dataset) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.backends.base import Completion
+from harness import cards
+from harness.backends.base import Completion, Request
+from harness.cards import Latency
 from harness.dataset.load import Dataset
 from harness.frozen import table
 from harness.operating_point import OperatingPoint
 from harness.run import record
 from harness.run.scoring import draw, score, statuses
 from harness.run.summary import COLUMNS, summary
-from harness.run.timing import inference_s
+from harness.run.timing import inference_s, measure
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
@@ -289,8 +292,8 @@ def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path)
 
 
 def test_an_answer_without_a_time_takes_its_roles_median() -> None:
-    def took(seconds: float | None) -> dict[str, float | None]:
-        return {"seconds": seconds}
+    def took(seconds: float | None, slow_s: float = 0.0) -> dict[str, float | None]:
+        return {"seconds": seconds, "slow_s": slow_s}
 
     answers = [
         [took(0.1), took(0.5), None],
@@ -300,8 +303,24 @@ def test_an_answer_without_a_time_takes_its_roles_median() -> None:
     seconds = inference_s({"inference_s": None}, answers)
     expected = [[0.1, 0.5, np.nan], [0.2, 0.7, np.nan], [0.3, 0.6, 0.6]]
     assert seconds == pytest.approx(np.array(expected), nan_ok=True)
+    answers[0][1] = took(0.5, slow_s=0.4)
     declared = inference_s({"inference_s": {"ego": 0.1, "helper": 0.2}}, answers)
-    assert declared == pytest.approx(np.array([[0.1, 0.2, np.nan]] * 2 + [[0.1, 0.2, 0.2]]), nan_ok=True)
+    expected = [[0.1, 0.6, np.nan], [0.1, 0.2, np.nan], [0.1, 0.2, 0.2]]
+    assert declared == pytest.approx(np.array(expected), nan_ok=True)
+
+
+def test_an_answer_that_failed_is_no_sample_of_a_models_latency(small: Dataset, tmp_path: Path) -> None:
+    """A server that refuses at once would look fast: of five egos' answers, one fails after no time."""
+
+    class Timed(Scripted):
+        def _say(self, request: Request) -> Completion:
+            first = request.id == "00000-0/v1"
+            return replace(super()._say(request), seconds=0.0 if first else 0.3, error="x" if first else None)
+
+    card = replace(cards.load("proxy"), latency=Latency("measured", None, "this test"))
+    latency = measure(replace(spec_of(small), card=card), Timed({}), tmp_path / "latency.json")
+    assert latency["inference_s"] == {"ego": 0.3, "helper": 0.3}
+    assert latency["n"]["ego"] == 4
 
 
 NASTY = st.text(max_size=40) | st.sampled_from(

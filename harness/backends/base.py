@@ -63,6 +63,7 @@ class Completion:
         label_mass: probability on the letters together, of a `readout`; None otherwise.
         retries: attempts that failed before this one; their time is in `seconds`.
         cached: it comes from the cache, so it has no seconds.
+        slow_s: seconds that this answer is declared to take beyond its card's latency: a proxy's slow tail.
     """
 
     request_id: str
@@ -76,6 +77,7 @@ class Completion:
     label_mass: float | None = None
     retries: int = 0
     cached: bool = False
+    slow_s: float = 0.0
 
 
 class Backend(Protocol):

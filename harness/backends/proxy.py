@@ -2,14 +2,17 @@
 
 It needs no model and shows the whole path. It plans on what its viewer sees, as `local-view` does, and is the
 less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not fitted: what it scores says
-something about the harness and nothing about any language model.
+something about the harness and nothing about any language model. Its card may make it fail at known rates.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, FinishReason, Request
+from harness.backends.spoiling import drawn, spoilt
 from harness.cards import Card
+from harness.failures import Failures
 from harness.files import canonical_json
 from harness.planner import plan
 from harness.rounding import rounded
@@ -22,23 +25,40 @@ OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor th
 
 
 def open(card: Card, **_: Any) -> "Proxy":
-    """The proxy."""
-    return Proxy()
+    """The proxy, with the failures of its card."""
+    return Proxy(card.failures)
 
 
 class Proxy:
-    """Answers like a well-behaved small language model, in the form its prompt asks for."""
+    """Answers like a well-behaved small language model, in the form its prompt asks for.
+
+    With failures it answers like one that is not so well-behaved.
+    """
+
+    def __init__(self, failures: Failures | None = None) -> None:
+        self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in order."""
-        return [Completion(r.id, answer(r), None, None, "stop", None, 1) for r in requests]
+        return [self._completion(request) for request in requests]
+
+    def _completion(self, request: Request) -> Completion:
+        text = answer(request)
+        finish_reason: FinishReason = "stop"
+        slow_s = 0.0
+        if self._failures:
+            how, slow_s = drawn(self._failures, request.id)
+            if how:
+                text, finish_reason = spoilt(text, how, request.actions)
+        return Completion(request.id, text, None, None, finish_reason, None, 1, slow_s=slow_s)
 
     def identity(self) -> dict[str, Any]:
-        """Its version."""
+        """Its version and its failures."""
         return {
             "engine": "proxy",
             "proxy_model_version": VERSION,
             "calibration_label": "none: chosen by hand",
+            "failures": asdict(self._failures) if self._failures else None,
         }
 
 

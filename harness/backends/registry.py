@@ -12,6 +12,7 @@ _OPEN: dict[Engine, str] = {
     "replay": "harness.backends.replay:open",
     "transformers": "harness.backends.transformers_engine:open",
     "llama-cpp": "harness.backends.llama_backend:open",
+    "openai": "harness.backends.openai_backend:open",
 }
 
 

@@ -75,7 +75,9 @@ class Replay:
         return Completion(
             request.id, answer["raw"], answer["prompt_tokens"], answer["completion_tokens"],
             answer["finish_reason"], answer["seconds"], answer["batch_size"], answer["error"],
-            answer["label_mass"], answer["retries"], answer["cached"],
+            # Runs of older versions hold none of these.
+            answer.get("label_mass"), answer.get("retries", 0), answer.get("cached", False),
+            answer.get("slow_s", 0.0),
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

@@ -104,6 +104,7 @@ def _answer(request: Request, completion: Completion) -> Answer:
         "label_mass": completion.label_mass,
         "retries": completion.retries,
         "cached": completion.cached,
+        "slow_s": completion.slow_s,
         "prompt_sha256": digest(request.messages),
     }
 

@@ -56,7 +56,8 @@ class Spec:
             )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        if self.thinking and self.card.engine not in (*WEIGHTED, "replay"):
+        served = self.card.engine == "openai" and self.card.thinking != "none"
+        if self.thinking and not (served or self.card.engine in (*WEIGHTED, "replay")):
             raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
@@ -74,7 +75,8 @@ class Spec:
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and self.card.engine not in WEIGHTED:
                 raise UserError(
-                    f"{flag} {printable(value)}: {printable(self.card.name)} has no weights; leave it out"
+                    f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
+                    f"(engines {' and '.join(WEIGHTED)} have); leave it out"
                 )
 
     def settings(self) -> dict[str, Any]:

@@ -79,9 +79,9 @@ def _sample(scenes: Sequence[Scene]) -> Sequence[Scene]:
 def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
     times: dict[str, list[float]] = {"ego": [], "helper": []}
     for request in asked:
-        seconds = backend.complete([request])[0].seconds
-        if seconds is not None:
-            times[request.role].append(seconds)
+        answer = backend.complete([request])[0]
+        if answer.seconds is not None and answer.error is None:
+            times[request.role].append(answer.seconds)
     known = {role: statistics.median(t) for role, t in times.items() if t}
     fill = max(known.values(), default=None)
     return {
@@ -95,8 +95,9 @@ def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
 
-    Where each answer's own time counts, one that failed or comes from the cache has none and takes its
-    role's median.
+    Where each answer's own time counts, one that has none, since it comes from the cache or its engine
+    failed, takes its role's median. What an answer is declared to be slower than its card comes on top of
+    the card's.
     """
     asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]
@@ -105,7 +106,8 @@ def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) 
         typical = [_median(own[:, :1]), *[_median(own[:, 1:])] * (own.shape[1] - 1)]
         return np.where(asked & np.isnan(own), typical, own)
     by_place = np.array([fixed["ego"], *[fixed["helper"]] * (asked.shape[1] - 1)], dtype=float)
-    return np.where(asked, by_place, np.nan)
+    slow = np.array([[a["slow_s"] if a else 0.0 for a in row] for row in answers])
+    return np.where(asked, by_place + slow, np.nan)
 
 
 def _median(seconds: Floats) -> float:

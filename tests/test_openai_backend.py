@@ -1,0 +1,560 @@
+"""The openai backend against a server that misbehaves on purpose; a real one is in test_openai_server.py."""
+
+import json
+import re
+import socket
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from misbehaving import Asked, Play, completion, read_out, serving
+
+from harness import cards, cli
+from harness.backends import openai_backend, openai_http
+from harness.backends.base import AnswerMode, Completion, Request
+from harness.backends.openai_shapes import body, read
+from harness.cards import Card, Latency, Thinking
+from harness.errors import UserError
+from harness.parse import parse
+from harness.servers import KINDS, Kind, Server
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+KEY = "sk-5ecret/+very"
+MESSAGES = ({"role": "system", "content": "You drive."}, {"role": "user", "content": "The zone is clear."})
+GOOD = '{"action_distribution":{"SLOWER":0.10,"IDLE":0.80,"FASTER":0.10}}'
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retries come soon, and no key of whoever runs the tests is sent anywhere."""
+    monkeypatch.setattr(openai_http, "FIRST_WAIT_S", 0.01)
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+
+
+def card(url: str, kind: Kind = "generic", thinking: Thinking = "none", **server: Any) -> Card:
+    where = Server(url, kind, **{"timeout_s": 20.0, "retries": 2, **server})
+    return Card("mine", "openai", "d", Latency("measured", None, "b"), "m", thinking=thinking, server=where)
+
+
+def request(name: str = "s/v1", answer: AnswerMode = "json", thinking: bool = False, **more: Any) -> Request:
+    return Request(name, "ego", MESSAGES, ACTIONS, 64, answer=answer, thinking=thinking, **more)
+
+
+def ask(play: Play, requests: Sequence[Request] = (request(),), **server: Any) -> list[Completion]:
+    with serving(play) as there:
+        return openai_backend.open(card(there.url, **server), batch_size=1).complete(requests)
+
+
+def ask_one(play: Play, **server: Any) -> Completion:
+    [done] = ask(play, **server)
+    return done
+
+
+# -- what is asked ------------------------------------------------------------------------------------------
+
+
+def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(lambda asked: asked.reply(completion(GOOD))) as there:
+        backend = openai_backend.open(card(there.url + "/"), batch_size=1)
+        [done] = backend.complete([request()])
+    [asked] = there.asked
+    assert asked.path == "/v1/chat/completions"
+    assert asked.body == {
+        "model": "m", "messages": list(MESSAGES), "max_tokens": 64, "temperature": 0, "seed": 0,
+        "stream": False,
+    }  # fmt: skip
+    assert "Authorization" not in asked.headers
+    assert (done.request_id, done.text, done.finish_reason, done.error) == ("s/v1", GOOD, "stop", None)
+    assert (done.prompt_tokens, done.completion_tokens, done.retries, done.batch_size) == (12, 3, 0, 1)
+    assert done.seconds is not None
+    assert done.seconds > 0
+    assert backend.identity() == {
+        "engine": "openai", "server": "generic", "base_url": there.url + "/", "model": "m",
+        "listed": {"id": "m", "owned_by": "tests"},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("thinking", [True, False])
+def test_a_server_that_can_be_told_is_told_whether_to_think(thinking: bool) -> None:
+    for kind in ("vllm", "llama-server"):
+        mine = card("http://a/v1", kind, "switch")
+        assert mine.server is not None
+        asked = body(mine, mine.server, request(thinking=thinking))
+        assert asked["chat_template_kwargs"] == {"enable_thinking": thinking}
+
+
+def constraint(kind: Kind, role: str = "ego", form: str = "distribution") -> dict[str, Any]:
+    """What a constrained request says beside what every request does."""
+    mine = card("http://a/v1", kind)
+    assert mine.server is not None
+    asking = Request("s/v1", role, MESSAGES, ACTIONS, 64, form, "constrained")  # type: ignore[arg-type]
+    asked = body(mine, mine.server, asking)
+    plain = body(mine, mine.server, request())
+    return {key: value for key, value in asked.items() if key not in plain}
+
+
+HELPER = '{"evidence":"","risk":"low",'
+
+
+@pytest.mark.parametrize(
+    ("role", "form", "good"),
+    [
+        ("ego", "distribution", GOOD),
+        ("helper", "distribution", HELPER + GOOD[1:]),
+        ("helper", "recommendation", HELPER + '"recommended_maneuver":"IDLE","confidence":1.00}'),
+    ],
+)
+def test_a_constrained_answer_of_every_role_and_form_is_one_the_parser_takes(
+    role: str, form: str, good: str
+) -> None:
+    assert parse(good, role=role, actions=ACTIONS).verdict == "strict"
+    regex = constraint("vllm", role, form)["structured_outputs"]["regex"]
+    assert re.fullmatch(regex, good)
+    spoilt = (good[:-1], good + " ", good.replace(":", ": "), good.replace("IDLE", "STOP"),
+              good.replace(".", "1."), good.replace("0", "-0"), good.replace('""', '"a"'))  # fmt: skip
+    for bad in spoilt:
+        assert bad == good or not re.fullmatch(regex, bad), bad
+    asked = constraint("generic", role, form)["response_format"]
+    assert (asked["type"], asked["json_schema"]["strict"]) == ("json_schema", True)
+    import jsonschema
+
+    judge = jsonschema.Draft202012Validator(asked["json_schema"]["schema"])
+    assert judge.is_valid(json.loads(good))
+    assert not judge.is_valid({**json.loads(good), "more": 1})
+
+
+def test_each_kind_of_server_is_asked_for_a_constrained_answer_in_its_own_words() -> None:
+    asked = {kind: [*constraint(kind)] for kind in KINDS}
+    assert asked == {
+        "generic": ["response_format"], "ollama": ["response_format"], "lm-studio": ["response_format"],
+        "vllm": ["structured_outputs"], "llama-server": ["grammar"], "llama-cpp-python": ["grammar"],
+    }  # fmt: skip
+
+
+# -- retries ------------------------------------------------------------------------------------------------
+
+
+def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() -> None:
+    """Two failures, each with a wait of 0.1 s that the server asked for."""
+
+    def play(asked: Asked) -> None:
+        if asked.number < 2:
+            asked.reply({"error": "busy"}, (503, 429)[asked.number], retry_after="0.1")
+        else:
+            asked.reply(completion(GOOD))
+
+    done = ask_one(play)
+    assert (done.text, done.retries, done.error) == (GOOD, 2, None)
+    assert done.seconds is not None
+    assert done.seconds >= 0.2
+
+
+def test_a_wait_that_would_never_end_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(openai_http, "LONGEST_WAIT_S", 0.02)
+    done = ask_one(lambda asked: asked.reply({"error": "busy"}, 429, retry_after="86400"))
+    assert (done.retries, done.error) == (2, "HTTP 429: busy")
+
+
+@pytest.mark.parametrize("text", ["soon", "", "nan", "Wed, 99 Foo", "-5", "Wed, 21 Oct 2015 07:28:00 GMT"])
+def test_a_retry_after_that_says_nothing_or_lies_behind_is_no_wait(text: str) -> None:
+    done = ask_one(lambda asked: asked.reply({"error": "busy"}, 429, retry_after=text))
+    assert (done.retries, done.error) == (2, "HTTP 429: busy")
+
+
+@pytest.mark.parametrize("retries", [0, 3])
+def test_a_server_that_always_breaks_down_gives_an_error_and_the_next_request_its_chance(
+    retries: int,
+) -> None:
+    def play(asked: Asked) -> None:
+        asked.reply(*(({"error": {"message": "boom"}}, 500) if asked.number <= retries else (completion(),)))
+
+    first, second = ask(play, [request("a"), request("b")], retries=retries)
+    assert (first.finish_reason, first.text, first.error) == ("error", "", "HTTP 500: boom")
+    assert first.retries == retries
+    assert (second.text, second.retries) == ("hello", 0)
+
+
+@pytest.mark.parametrize("status", [400, 403, 404, 422])
+def test_what_the_server_refuses_is_not_asked_again(status: int) -> None:
+    done = ask_one(lambda asked: asked.reply({"detail": "no such\nmodel \x1b[31m" + "x" * 5000}, status))
+    assert done.retries == 0
+    assert done.error is not None
+    assert done.error.startswith(f"HTTP {status}: no such model \\x1b[31mxxx")
+    assert len(done.error) < 300
+
+
+def test_a_server_that_hangs_up_halfway_is_asked_again() -> None:
+    def play(asked: Asked) -> None:
+        if asked.number == 0:
+            asked.raw(b"HTTP/1.1 200 OK\r\nContent-Length: 4000\r\n\r\n{")
+        elif asked.number == 1:
+            asked.raw(b"")
+        else:
+            asked.reply(completion(GOOD))
+
+    done = ask_one(play)
+    assert (done.text, done.retries) == (GOOD, 2)
+    done = ask_one(lambda asked: asked.raw(b"no HTTP at all\r\n\r\n"), retries=1)
+    assert (done.retries, done.finish_reason) == (1, "error")
+    assert done.error is not None
+    assert done.error.startswith("RemoteProtocolError: ")
+
+
+@pytest.mark.parametrize(
+    "head", [b"HTTP/1.1 200 OK\r\nX: ", b"HTTP/1.1 200 OK\r\nContent-Length: 4000\r\n\r\n"]
+)
+def test_an_answer_that_drips_is_given_up_when_its_time_is_over(head: bytes) -> None:
+    def play(asked: Asked) -> None:
+        with suppress(OSError):
+            asked.raw(head)
+            while True:
+                asked.raw(b"x")
+                sleep(0.02)
+
+    done = ask_one(play, timeout_s=0.3, retries=1)
+    assert (done.error, done.retries) == ("no whole answer within 0.3 s", 1)
+    assert done.seconds is not None
+    assert done.seconds >= 0.6
+
+
+# -- garbage ------------------------------------------------------------------------------------------------
+
+
+def one(message: Any) -> bytes:
+    return json.dumps({"choices": [{"message": message}]}).encode()
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (b"", "the answer is no JSON"),
+        (b"<html>502 Bad Gateway</html>", "the answer is no JSON"),
+        (b"\x1f\x8b\x08\x00garbage", "the answer is no JSON"),
+        (b"\xff\xfe{", "the answer is no JSON"),
+        (b"[" * 100_000, "the answer is no JSON"),
+        (b"null", "the answer is no chat completion"),
+        (b"[]", "the answer is no chat completion"),
+        (b"{}", "the answer is no chat completion"),
+        (b'{"choices":[]}', "the answer is no chat completion"),
+        (b'{"choices":{"0":1}}', "the answer is no chat completion"),
+        (b'{"choices":["text"]}', "the answer is no chat completion"),
+        (b'{"choices":[{"text":"hello"}]}', "the answer is no chat completion"),
+        (b'{"usage":[1],' + one({"content": "a"})[1:], "the answer is no chat completion"),
+        (one({"role": "assistant"}), "the answer is no chat completion"),
+        (one({"content": None}), "the answer's content is no text but null"),
+        (one({"content": 3}), "the answer's content is no text but int"),
+        (one({"content": [{"type": "text", "text": "a"}]}), "the answer's content is no text but list"),
+        (one({"content": "x" * (4 * 2**20)}), "the answer is longer than 4194304 bytes"),
+    ],
+)
+def test_an_answer_that_is_none_is_an_error_and_not_asked_for_again(answer: bytes, said: str) -> None:
+    done = ask_one(lambda asked: asked.reply(answer))
+    assert (done.error, done.finish_reason, done.text, done.retries) == (said, "error", "", 0)
+    assert parse(done.text, role="ego", actions=ACTIONS, error=done.error).status == "engine_error"
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(
+        st.sampled_from(["choices", "message", "content", "usage", "logprobs", "top_logprobs", "token",
+                         "logprob", "prompt_tokens", "reasoning_content", "finish_reason"]), inner),
+)  # fmt: skip
+
+
+@given(json_values, st.sampled_from(["json", "readout"]))
+def test_whatever_json_comes_is_an_answer_or_an_error(payload: Any, answer: AnswerMode) -> None:
+    choice = {"message": payload, "logprobs": payload}
+    for made in (payload, {"choices": [payload]}, {"choices": [choice]}):
+        said = read(made, request(answer=answer))
+        if said.error is not None:
+            assert (said.finish_reason, said.text) == ("error", "")
+            assert said.error.isprintable()
+        else:
+            assert said.finish_reason in ("stop", "length")
+            assert isinstance(said.text, str)
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours"),
+    [
+        ("stop", "stop"),
+        ("length", "length"),
+        ("content_filter", "length"),
+        ("tool_calls", "stop"),
+        (None, "stop"),
+    ],
+)
+def test_the_reason_to_finish_is_cut_off_or_not(theirs: Any, ours: str) -> None:
+    assert read(completion("a", theirs), request()).finish_reason == ours
+
+
+def test_tokens_that_are_no_counts_are_unknown() -> None:
+    made = {**completion("a"), "usage": {"prompt_tokens": -1, "completion_tokens": True}}
+    said = read(made, request())
+    assert (said.text, said.prompt_tokens, said.completion_tokens) == ("a", None, None)
+
+
+# -- thoughts -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("made", "thinking", "status"),
+    [
+        (completion(GOOD, reasoning_content="Clear."), True, "strict"),
+        (completion(GOOD, reasoning="Clear."), True, "strict"),
+        (completion(GOOD, reasoning_content=""), True, "strict"),
+        (completion(f"<think>Clear.</think>{GOOD}"), True, "strict"),
+        (completion(f"<think>Clear.</think>{GOOD}", reasoning_content=None), True, "strict"),
+        (completion(GOOD, reasoning_content=None), True, "truncated_reasoning"),
+        (completion(GOOD), True, "truncated_reasoning"),
+        (completion(None, "length", reasoning_content=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
+        (completion("", "length", reasoning_content=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
+        (completion("", reasoning_content=f"So {GOOD}"), True, "empty"),
+        (completion(GOOD[:-9], "length", reasoning_content="Clear."), True, "truncated_json"),
+        (completion(GOOD, reasoning_content="Clear."), False, "recovered"),
+        (completion(GOOD, reasoning_content=""), False, "strict"),
+    ],
+)
+def test_a_thought_that_the_server_took_out_is_put_back_and_judged_like_any(
+    made: dict[str, Any], thinking: bool, status: str
+) -> None:
+    said = read(made, request(thinking=thinking))
+    parsed = parse(
+        said.text, role="ego", actions=ACTIONS, thinking=thinking, finish_reason=said.finish_reason,
+        error=said.error,
+    )  # fmt: skip
+    assert (parsed.status, said.error) == (status, None)
+
+
+# -- read-out -----------------------------------------------------------------------------------------------
+
+HALF, QUARTER, EIGHTH, SIXTEENTH = -0.693147181, -1.386294361, -2.079441542, -2.772588722
+
+
+def shares(*likeliest: tuple[str, float]) -> tuple[list[float], float | None]:
+    said = read(read_out(*likeliest), request(answer="readout"))
+    assert (said.error, said.finish_reason) == (None, "stop")
+    assert parse(said.text, role="ego", actions=ACTIONS).status == "strict"
+    p = json.loads(said.text)["action_distribution"]
+    return [p[action] for action in ACTIONS], said.label_mass
+
+
+def test_a_read_out_is_the_letters_probabilities_among_themselves() -> None:
+    """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8. ` A` is another token than `A`."""
+    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), (" A", SIXTEENTH), ("the", SIXTEENTH))
+    assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
+    assert mass == pytest.approx(7 / 8)
+
+
+def test_a_letter_that_is_not_listed_gets_the_most_that_it_can_have() -> None:
+    """C is no likelier than the last listed token, 1/8; A and B are 6/8, so that C is 1/7 of 7/8."""
+    p, mass = shares(("A", HALF), ("B", QUARTER), ("the", EIGHTH))
+    assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
+    assert mass == pytest.approx(6 / 8), "only what was listed"
+    # B and C share what is left, 1/4, since that is less than the last listed token's for each.
+    p, mass = shares(("A", HALF), ("the", QUARTER))
+    assert p == pytest.approx([4 / 6, 1 / 6, 1 / 6], abs=1e-6)
+    assert mass == pytest.approx(1 / 2)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (completion("A"), "the server gives no log-probabilities"),
+        (read_out(("A", float("nan"))), "the server's log-probabilities are none"),
+        (read_out(("A", 0.5)), "the server's log-probabilities are none"),
+        (read_out(("A", 1e6)), "the server gives no log-probabilities"),
+        (read_out(("the", HALF), ("a", QUARTER)), "none of the letters ABC is among the 2 likeliest tokens"),
+        (read_out(("A", -9999.0), ("the", 0.0)), "none of the letters ABC is among the 2 likeliest tokens"),
+    ],
+)
+def test_a_read_out_without_the_letters_is_an_error(made: dict[str, Any], said: str) -> None:
+    got = read(made, request(answer="readout"))
+    assert (got.error, got.finish_reason) == (said, "error")
+
+
+def test_a_read_out_asks_for_one_token_and_the_likeliest() -> None:
+    with serving(lambda asked: asked.reply(read_out(("A", HALF), ("B", QUARTER), ("C", EIGHTH)))) as there:
+        openai_backend.open(card(there.url), batch_size=1).complete([request(answer="readout")])
+    asked = there.asked[0].body
+    assert (asked["max_tokens"], asked["logprobs"], asked["top_logprobs"]) == (1, True, 20)
+
+
+# -- several at a time --------------------------------------------------------------------------------------
+
+
+def test_requests_of_a_batch_are_asked_at_the_same_time_and_answered_in_order() -> None:
+    """Four must be there before the first is answered; the last comes back first."""
+    four, waiting, most = threading.Barrier(4), [], []
+
+    def play(asked: Asked) -> None:
+        waiting.append(asked)
+        most.append(len(waiting))
+        four.wait(timeout=20)
+        sleep(0.01 * (3 - asked.number % 4))
+        waiting.remove(asked)
+        asked.reply(completion(asked.body["messages"][0]["content"]))
+
+    asked = [
+        Request(f"s/v{i}", "ego", ({"role": "user", "content": str(i)},), ACTIONS, 64) for i in range(12)
+    ]
+    with serving(play) as there:
+        done = openai_backend.open(card(there.url), batch_size=4).complete(asked)
+    assert [(c.request_id, c.text) for c in done] == [(f"s/v{i}", str(i)) for i in range(12)]
+    assert max(most) == 4
+    assert {(c.batch_size, c.seconds) for c in done} == {(4, None)}, "a batch's time is nobody's latency"
+
+
+# -- opening ------------------------------------------------------------------------------------------------
+
+
+def test_a_server_that_nobody_listens_at_is_one_line() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
+    with pytest.raises(UserError) as caught:
+        openai_backend.open(card(url), batch_size=1)
+    assert f"nobody answers at {url} (ConnectError" in str(caught.value)
+    assert "start the server" in str(caught.value)
+    with pytest.raises(UserError, match="nobody answers at"):
+        openai_backend.open(card("http://a..b/v1"), batch_size=1)
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        lambda asked: asked.reply({"error": "x"}, 500),
+        lambda asked: asked.reply(b"<html>"),
+        lambda asked: asked.reply({"data": [3, {"id": ["m"]}, {"id": "other"}]}),
+        lambda asked: asked.reply({"data": "m"}),
+        lambda asked: asked.raw(b""),
+        lambda asked: asked.reply(b"", 307, location="http://127.0.0.1:9/v1/models"),
+    ],
+)
+def test_a_server_without_a_list_of_models_is_asked_all_the_same(listed: Play) -> None:
+    with serving(lambda asked: asked.reply(completion()), listed) as there:
+        backend = openai_backend.open(card(there.url), batch_size=1)
+        assert backend.identity()["listed"] is None
+        assert backend.complete([request()])[0].text == "hello"
+
+
+def test_a_server_with_one_model_answers_to_any_name() -> None:
+    entry = {"id": "qwen.gguf\x1b", "owned_by": "llamacpp", "created": 17, "max_model_len": 4096}
+    with serving(lambda asked: None, lambda asked: asked.reply({"data": [entry]})) as there:
+        backend = openai_backend.open(card(there.url), batch_size=1)
+    assert backend.identity()["listed"] == {
+        "id": "qwen.gguf\\x1b",
+        "owned_by": "llamacpp",
+        "max_model_len": 4096,
+    }
+
+
+# -- the key ------------------------------------------------------------------------------------------------
+
+
+def test_the_key_is_read_from_the_variable_that_the_card_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MY_KEY", f" {KEY}\n")
+    monkeypatch.setenv("OPENAI_API_KEY", "not-this-one")
+    with serving(lambda asked: asked.reply(completion())) as there:
+        openai_backend.open(card(there.url, key_env="MY_KEY"), batch_size=1).complete([request()])
+    assert there.asked[0].headers["Authorization"] == f"Bearer {KEY}"
+
+
+def test_a_key_that_no_header_can_hold_is_refused_and_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    for bad in ("sk-5ecret\nX-Header: 1", "sk-5ecret é", "sk-5ecret x"):
+        monkeypatch.setenv("OPENAI_API_KEY", bad)
+        with pytest.raises(UserError, match="OPENAI_API_KEY holds characters") as caught:
+            openai_backend.open(card("http://127.0.0.1:9/v1"), batch_size=1)
+        assert "5ecret" not in str(caught.value)
+
+
+def test_a_server_that_refuses_the_key_is_one_line_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+
+    def refuse(asked: Asked) -> None:
+        asked.reply({"error": {"message": f"no such key: {KEY}"}}, 401)
+
+    with serving(refuse, refuse) as there, pytest.raises(UserError) as caught:
+        openai_backend.open(card(there.url), batch_size=1)
+    said = str(caught.value)
+    assert "refuses the key (HTTP 401: no such key: [key]); set OPENAI_API_KEY in the environment" in said
+    assert "5ecret" not in said
+
+
+def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    with serving(lambda asked: asked.reply(completion())) as other:
+        done = ask_one(lambda asked: asked.reply(b"", 307, location=other.url + "/chat/completions"))
+    assert (done.error, done.retries) == ("HTTP 307: a redirect, which is not followed", 0)
+    assert other.asked == []
+
+
+def echo(asked: Asked) -> None:
+    """Say the Authorization header back, another way each time."""
+    header = asked.headers["Authorization"]
+    spelt = "".join(f"\\u{ord(c):04x}" for c in header)
+    ways = [
+        lambda: asked.reply(completion(f"You said {header}.")),
+        lambda: asked.reply(completion(None, reasoning_content=header)),
+        lambda: asked.reply(json.dumps(completion("HEADER")).replace("HEADER", spelt).encode()),
+        lambda: asked.reply(json.dumps(completion(header)).replace("/", "\\/").encode()),
+        lambda: asked.reply({"error": {"message": "x" * 185 + header}}, 400),
+        lambda: asked.reply({header: header}, 400),
+        lambda: asked.reply(header.encode(), 404),
+        lambda: asked.raw(header.encode() + b"\r\n\r\n"),
+        lambda: asked.reply({**completion(), "choices": [{"message": {"content": {header: header}}}]}),
+    ]
+    ways[asked.number % len(ways)]()
+
+
+def test_a_key_that_the_server_says_back_stands_in_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    done = ask(echo, [request(f"s/v{i}") for i in range(9)], retries=0)
+    assert "5ecret" not in repr(done)
+    assert done[0].text == "You said Bearer [key]."
+    assert done[2].text == done[3].text == "Bearer [key]"
+    assert done[6].error == "HTTP 404: Bearer [key]"
+
+
+def test_a_short_key_is_no_secret_and_changes_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`x` is what local servers are given; it may stand in any text."""
+    monkeypatch.setenv("OPENAI_API_KEY", "0")
+    assert ask_one(lambda asked: asked.reply(completion(GOOD))).text == GOOD
+
+
+def test_after_a_run_the_key_is_nowhere(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
+) -> None:
+    """A whole `harness eval` against a server that says the key back in every way."""
+    monkeypatch.setenv("MY_KEY", KEY)
+    monkeypatch.chdir(tmp_path)
+    shipped = cards.folder
+    monkeypatch.setattr(cards, "folder", lambda kind: tmp_path if kind == "models" else shipped(kind))
+    with serving(echo) as there:
+        (tmp_path / "served.toml").write_text(
+            'engine = "openai"\ndescription = "d"\nweights = "m"\n'
+            f'[server]\nbase_url = "{there.url}"\nkey_env = "MY_KEY"\nretries = 1\n'
+            '[latency]\nsource = "measured"\nbasis = "b"\n'
+        )
+        options = ["--model", "served", "--dataset", str(small_path), "--limit", "1", "--out", "run"]
+        monkeypatch.setattr(sys, "argv", ["harness", "eval", *options])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    assert ended.value.code in (None, 0)
+    assert len(there.asked) > 9
+    printed = capfd.readouterr()
+    files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    texts = [path.read_bytes().decode("utf-8", "replace") for path in files]
+    assert {"run.json", "rows.jsonl"} <= {path.name for path in files}
+    for text in (printed.out, printed.err, *texts):
+        assert "5ecret" not in text
+    assert any("[key]" in text for text in texts)
+    assert "MY_KEY" in (tmp_path / "run" / "run.json").read_text()
