@@ -35,18 +35,24 @@ def digest(value: Any) -> str:
     return sha256_bytes(canonical_json(value).encode())
 
 
-def write_whole(path: Path, data: str | bytes) -> None:
-    """Replace `path` by `data` in one step, so that a kill leaves the old file or the new one."""
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write to, which takes the place of `path` at the end; gone if that is not reached."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as f:
-            f.write(data.encode() if isinstance(data, str) else data)
-            f.flush()
+        yield part
+        with part.open("rb+") as f:
             os.fsync(f.fileno())
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: str | bytes) -> None:
+    """Replace `path` by `data` in one step, so that a kill leaves the old file or the new one."""
+    with replacing(path) as part:
+        part.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 @contextmanager
