@@ -14,7 +14,16 @@ class Chat:
         self.name = name
         self.tokenizer = tokenizer
         self.template = str(tokenizer.get_chat_template())
-        self._switch = "enable_thinking" in self.template
+
+    @property
+    def bos(self) -> int | None:
+        """Id of the token that begins a sequence; None if there is none."""
+        token: int | None = self.tokenizer.bos_token_id
+        return token
+
+    @property
+    def _switch(self) -> bool:
+        return "enable_thinking" in self.template
 
     @property
     def thinking(self) -> Thinking:
@@ -30,14 +39,17 @@ class Chat:
 
         switch = {"enable_thinking": thinking} if self._switch else {}
         try:
-            text: str = self.tokenizer.apply_chat_template(
-                [dict(message) for message in messages], tokenize=False, add_generation_prompt=True, **switch
-            )
+            return self._apply([dict(message) for message in messages], switch)
         except TemplateError as error:
             raise UserError(
                 f"model {self.name!r}: its chat template refuses the messages "
                 f"({printable(error)}); use a prompt with roles that it knows"
             ) from None
+
+    def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:
+        text: str = self.tokenizer.apply_chat_template(
+            messages, tokenize=False, add_generation_prompt=True, **switch
+        )
         return text
 
     def encode(self, prompt: str) -> list[int]:

@@ -43,7 +43,7 @@ def check(backend: LanguageModel, *, thinking: bool) -> Checkup:
     ids = backend.chat.encode(prompt)
     backend.complete([request])  # the first call of a process pays for kernels and caches
     [completion] = backend.complete([request])
-    bos = backend.chat.tokenizer.bos_token_id
+    bos = backend.chat.bos
     return Checkup(
         prompt=prompt,
         prompt_tokens=len(ids),
