@@ -15,10 +15,11 @@ from typing import Any, Literal, get_args
 from harness.errors import UserError, printable, unknown
 from harness.resources import folder
 
-Engine = Literal["proxy", "driver", "replay", "transformers"]
+Engine = Literal["proxy", "driver", "replay", "transformers", "llama-cpp"]
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
 LatencySource = Literal["card", "measured"]
+WEIGHTED: tuple[Engine, ...] = ("transformers", "llama-cpp")  # engines that load weights here
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
@@ -50,6 +51,7 @@ class Card:
         latency: time of one answer.
         weights: directory (absolute, or relative to the cards) or hub id; the run's directory for `replay`;
             None if model-free.
+        file: name of the GGUF file in `weights`; None where `weights` is the file, or needs none.
         revision: branch, tag or commit on the hub; None is its default branch.
         dtype: number format of the weights; `auto` is the checkpoint's own.
         context_tokens: most tokens of prompt and answer together; None takes the checkpoint's own.
@@ -65,6 +67,7 @@ class Card:
     description: str
     latency: Latency
     weights: str | None = None
+    file: str | None = None
     revision: str | None = None
     dtype: Dtype = "auto"
     context_tokens: int | None = None
@@ -80,6 +83,7 @@ _CARD_KEYS: Mapping[str, type] = {
     "description": str,
     "latency": dict,
     "weights": str,
+    "file": str,
     "revision": str,
     "dtype": str,
     "context_tokens": int,
@@ -178,8 +182,10 @@ def _card(name: str, table: Mapping[str, Any], where: str) -> Card:
     for key in ("context_tokens", "max_new_tokens", "thinking_tokens"):
         if table.get(key, 1) < 1:
             raise UserError(f"{where}: {key} = {table[key]}; allowed: 1 or more")
-    if (table["engine"] == "transformers") != ("weights" in table):
-        raise UserError(f'{where}: weights go with engine = "transformers", and only with it')
+    if (table["engine"] in WEIGHTED) != ("weights" in table):
+        raise UserError(f"{where}: weights go with engine = {' or '.join(WEIGHTED)}, and only with it")
+    if "file" in table and table["engine"] != "llama-cpp":
+        raise UserError(f'{where}: file = {printable(table["file"])!r}; only engine = "llama-cpp" has one')
     if table.get("privileged") and table["engine"] != "driver":
         raise UserError(f'{where}: privileged = true; only engine = "driver" may see the truth')
     return Card(name=name, **{**table, "latency": Latency(latency["source"], seconds, latency["basis"])})

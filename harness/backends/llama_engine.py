@@ -1,5 +1,6 @@
 """llama.cpp as an engine: GGUF files, mostly on a CPU."""
 
+import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -8,14 +9,30 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import Floats
+from harness.backends.chat import Chat
 from harness.backends.gguf_chat import GgufChat
+from harness.backends.language_model import LanguageModel
 from harness.backends.llama_context import LlamaContext, Logits, common_length
-from harness.backends.llama_model import LlamaModel, build
+from harness.backends.llama_model import LlamaModel, build, most_sequences
 from harness.cards import Card
+from harness.errors import UserError
 from harness.files import sha256_bytes, sha256_file
 
 BEGINNINGS = 4  # prompts' beginnings that are kept between calls: roles times prompt versions, and to spare
 _ANSWER = 64  # tokens of an answer that memory is made for at once
+
+
+def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
+    """Load a GGUF file in this process, which llama.cpp may end.
+
+    Raises:
+        UserError: the file, the device or the batch size is none for llama.cpp.
+    """
+    os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # which starts a debugger where there is one
+    most = most_sequences() - BEGINNINGS
+    if batch_size > most:
+        raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
+    return LanguageModel(LlamaEngine(card, file, LlamaModel(card.name, file, device), batch_size), batch_size)
 
 
 class LlamaEngine:
@@ -28,9 +45,9 @@ class LlamaEngine:
     """
 
     def __init__(self, card: Card, file: Path, model: LlamaModel, batch_size: int) -> None:
-        self.chat = GgufChat(card.name, model)
+        self.chat: Chat = GgufChat(card.name, model)
         self.context_tokens = card.context_tokens or model.trained_tokens
-        self.stops = model.stops
+        self.stops: Sequence[int] = model.stops
         self._card, self._file, self._model = card, file, model
         self._context = LlamaContext(model, batch_size + BEGINNINGS)
         self._free = list(range(batch_size))
@@ -86,17 +103,23 @@ class LlamaEngine:
         self._free += places
 
     def identity(self) -> dict[str, Any]:
-        """What decides the answers: the file by its content, and the build of llama.cpp."""
+        """What decides the answers: the build of llama.cpp, and the file by its hub commit or its content."""
         return {
             "engine": "llama-cpp",
             **build(),
             "weights": self._card.weights,
-            "file_sha256": self._sha256,
+            "file": self._card.file,
+            "revision": self._file.parent.name if self._cached else None,
+            "file_sha256": None if self._cached else self._sha256,
             "dtype": self._model.dtype,
             "kv_cache": self._context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
         }
+
+    @property
+    def _cached(self) -> bool:
+        return self._file.parent.parent.name == "snapshots"
 
     @cached_property
     def _sha256(self) -> str:

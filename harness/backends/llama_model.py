@@ -118,6 +118,12 @@ class LlamaModel:
         return buffer.value.decode(errors="replace")
 
 
+def most_sequences() -> int:
+    """How many sequences llama.cpp keeps apart."""
+    most: int = c.llama_max_parallel_sequences()
+    return most
+
+
 def build() -> dict[str, str]:
     """What of llama.cpp itself moves an answer's last digits."""
     features: bytes = c.llama_print_system_info()

@@ -11,6 +11,7 @@ _OPEN: dict[Engine, str] = {
     "driver": "harness.backends.driver:open",
     "replay": "harness.backends.replay:open",
     "transformers": "harness.backends.transformers_engine:open",
+    "llama-cpp": "harness.backends.llama_backend:open",
 }
 
 
@@ -34,14 +35,16 @@ def open_backend(
 
 def missing(card: Card) -> str | None:
     """What a card lacks to run here, in a word: a package's name or `weights`. None if nothing."""
-    if card.engine != "transformers":
+    if card.engine == "transformers":
+        from harness.backends.checkpoint import find, missing_package
+    elif card.engine == "llama-cpp":
+        from harness.backends.llama_backend import find, missing_package
+    else:
         return None
-    from harness.backends import checkpoint
-
-    if package := checkpoint.missing_package():
+    if package := missing_package():
         return package
     try:
-        checkpoint.find(card)
+        find(card)
     except UserError:
         return "weights"
     return None

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from harness import __version__
 from harness.backends.base import AnswerMode
-from harness.cards import Card, load, names
+from harness.cards import WEIGHTED, Card, load, names
 from harness.dataset.load import Dataset
 from harness.errors import UserError, printable, unknown
 from harness.operating_point import OperatingPoint
@@ -56,7 +56,7 @@ class Spec:
             )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        if self.thinking and self.card.engine not in ("transformers", "replay"):
+        if self.thinking and self.card.engine not in (*WEIGHTED, "replay"):
             raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
@@ -72,7 +72,7 @@ class Spec:
                 "which only json leaves room for"
             )
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
-            if value is not None and self.card.engine != "transformers":
+            if value is not None and self.card.engine not in WEIGHTED:
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights; leave it out"
                 )
@@ -117,7 +117,15 @@ def model_argument(card: Card) -> str:
 
 
 def versions(
-    packages: Sequence[str] = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers"),
+    packages: Sequence[str] = (
+        "numpy",
+        "scipy",
+        "jinja2",
+        "highway-env",
+        "torch",
+        "transformers",
+        "llama-cpp-python",
+    ),
 ) -> Any:
     """Versions of what a result may depend on, as far as it is installed."""
     found = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
