@@ -62,9 +62,9 @@ def _from_gguf(file: Path) -> Any:
         ]
     )
     built.decoder = decoders.ByteLevel()
-    built.add_special_tokens(
-        [AddedToken(t, special=True) for t, k in zip(vocabulary, types, strict=True) if k == 3]
-    )
+    # Control tokens, and words of the user's such as `<think>`: found whole in a text, whatever is round them.
+    added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
+    built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built
 
 
