@@ -43,7 +43,9 @@ def export(checkpoint: Path, out: Path, dtype: Literal["F16", "F32"] = "F16") ->
         saved = read(checkpoint, shown)
         with replacing(out) as part:
             _write(part, checkpoint, saved, dtype, shown)
-    except (KeyError, TypeError, ValueError, OSError) as error:
+    except UserError:
+        raise
+    except Exception as error:  # a broken file surfaces as any of a dozen exception types
         reason = printable(f"{type(error).__name__}: {error}", 200)
         raise UserError(f"{shown} cannot be exported: {reason}; save or copy it again") from error
 
