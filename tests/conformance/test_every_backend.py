@@ -13,6 +13,7 @@ from harness import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.registry import missing, open_backend
 from harness.dataset.load import load
+from harness.gguf_export import export
 from harness.run.asking import requests
 
 
@@ -28,10 +29,9 @@ def model_free() -> list[str]:
     return [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
 
 
-LANGUAGE_MODELS = ("transformers",)
 ENGINES = [
     *((name, "json") for name in (*model_free(), "replay")),
-    *((engine, answer) for engine in LANGUAGE_MODELS for answer in get_args(AnswerMode)),
+    *((engine, answer) for engine in cards.WEIGHTED for answer in get_args(AnswerMode)),
 ]
 
 
@@ -43,22 +43,27 @@ def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pyt
     if model == "replay":
         run(spec_of(data, seeds=(0,)), folder / "run")
         model = f"replay:{folder / 'run'}"
-    if model == "transformers":
+    if model in cards.WEIGHTED:
         if find_spec("torch") is None or find_spec("transformers") is None:
             pytest.skip("needs the transformers extra")
         import tiny_qwen3
 
         model = str(tiny_qwen3.build(folder / "tiny", context_tokens=2048))
     spec = spec_of(data, model, answer=answer)
+    if request.param[0] == "llama-cpp":
+        if find_spec("llama_cpp") is None:
+            pytest.skip("needs the llama-cpp extra")
+        export(folder / "tiny", folder / "tiny.gguf", "F32")
+        spec = replace(spec, card=replace(spec.card, engine="llama-cpp", weights=str(folder / "tiny.gguf")))
     asked = list(requests(spec, data.scenes[:5]))
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
-    device = "cpu" if spec.card.engine == "transformers" else None
+    device = "cpu" if spec.card.engine in cards.WEIGHTED else None
     return Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", *LANGUAGE_MODELS}
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", *cards.WEIGHTED}
     assert tried == set(cards.Engine.__args__)
     assert all(missing(cards.load(name)) is None for name in model_free())
 
