@@ -87,13 +87,18 @@ class LlamaEngine:
         for place in rest:
             self._context.fork(first, place, common)
         logits = self._context.extend({p: ids[len(self._context.tokens[p]) :] for p, ids in prompts.items()})
+        if known:
+            self._used(nearest)
         if new:
-            nearest = self._beginnings[0]
-            self._context.drop(nearest)
-            self._context.fork(first, nearest, common)
-        self._beginnings.remove(nearest)
-        self._beginnings.append(nearest)
+            oldest = self._beginnings[0]
+            self._context.drop(oldest)
+            self._context.fork(first, oldest, common)
+            self._used(oldest)
         return logits
+
+    def _used(self, beginning: int) -> None:
+        self._beginnings.remove(beginning)
+        self._beginnings.append(beginning)
 
     def extend(self, chunks: dict[int, Sequence[int]]) -> Logits:
         """Append tokens to sequences by place; logits after each, (len(chunks), vocabulary)."""
