@@ -2,11 +2,15 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from harness import cards, cli
+from harness.backends.registry import open_backend
+from harness.errors import UserError
+from harness.files import sha256_file
 
 
 def harness(
@@ -116,6 +120,19 @@ def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answ
     assert [a[0] for a in answers] == ["json", "constrained", "readout"]
     assert all(float(a[1]) > 0 for a in answers)
     assert answers[2][3].startswith('1 tokens, stop: \'{"action_distribution":')
+
+
+@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+def test_weights_are_held_to_the_digest_of_their_card_whenever_they_are_loaded(
+    engine: str, tiny: Path
+) -> None:
+    if engine == "llama-cpp":
+        pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    file = tiny / ("tiny-f32.gguf" if engine == "llama-cpp" else "model.safetensors")
+    card = replace(cards.resolve(str(tiny), engine), sha256=sha256_file(file))
+    assert open_backend(card, device="cpu").identity()["engine"] == engine
+    with pytest.raises(UserError, match=rf"{file.name} is not what its card says: sha256 {card.sha256}"):
+        open_backend(replace(card, sha256="0" * 64), device="cpu")
 
 
 @pytest.fixture(scope="module")
