@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 
-from harness import cards, readout
+from harness import readout
 from harness.arrays import Floats
 from harness.backends import llama_backend
 from harness.backends.base import Request
@@ -433,14 +433,3 @@ def test_nothing_is_said_on_stderr(tiny: Path, capfd: pytest.CaptureFixture[str]
         open_gguf(tiny / "config.json")
     opened.close()
     assert capfd.readouterr() == ("", "")
-
-
-def test_only_a_gguf_card_names_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cards, "folder", lambda kind: tmp_path)
-    text = 'engine = "llama-cpp"\ndescription = "d"\nweights = "a/b"\nfile = "b.gguf"\n'
-    text += '[latency]\nsource = "measured"\nbasis = "b"\n'
-    (tmp_path / "mine.toml").write_text(text)
-    assert (cards.load("mine").weights, cards.load("mine").file) == ("a/b", "b.gguf")
-    (tmp_path / "mine.toml").write_text(text.replace("llama-cpp", "transformers"))
-    with pytest.raises(UserError, match=r"mine\.toml: file goes with engine = llama-cpp, and only with it"):
-        cards.load("mine")

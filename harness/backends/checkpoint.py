@@ -3,6 +3,7 @@
 Nothing is ever downloaded here: a person fetches weights once (`harness.backends.pull`).
 """
 
+import json
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,6 +110,12 @@ def held_to_digest(card: Card, file: Path) -> Path:
             f"and the card has {card.sha256}; fetch it again, or mend the card"
         )
     return file
+
+
+def vocabulary(where: Path) -> int:
+    """How many tokens the model of a checkpoint knows, padding rows included."""
+    config = json.loads((where / "config.json").read_text(encoding="utf-8"))
+    return int(config["vocab_size"])
 
 
 def files_sha256(where: Path) -> str:

@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from itertools import groupby
 from typing import Any, NamedTuple
 
+from harness.arrays import Floats
 from harness.backends.base import Completion, Request
 from harness.backends.decoding import Answer, Decoding
 from harness.backends.engine import Engine
@@ -61,6 +63,11 @@ class LanguageModel:
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         """The prompt of each request as the model reads it."""
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
+
+    def next_log_probs(self, prompts: Sequence[Sequence[int]], vocabulary: int) -> Floats:
+        """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
+        with closing(self.engine.begin(prompts)) as session:
+            return session.log_probs(range(vocabulary))
 
     def identity(self) -> dict[str, Any]:
         """What decides the answers: the engine's."""

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from harness.arrays import Floats
 from harness.backends.chat import Chat
 from harness.backends.checkpoint import held_to_digest
 from harness.backends.child import Child
@@ -70,6 +71,11 @@ class LlamaBackend(Child):
     def __init__(self, card: Card, file: Path, device: str | None, batch_size: int) -> None:
         super().__init__(card.name, "harness.backends.llama_engine:open_here", card, file, device, batch_size)
         self.chat = _RemoteChat(card.name, self)
+
+    def next_log_probs(self, prompts: Sequence[Sequence[int]], vocabulary: int) -> Floats:
+        """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
+        found: Floats = self.call("next_log_probs", prompts, vocabulary)
+        return found
 
 
 class _RemoteChat(Chat):

@@ -34,11 +34,12 @@ def open(
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     where = checkpoint.find(card)
-    loaded = checkpoint.load(card, where, dtype=dtype, device=_device(device))
+    loaded = checkpoint.load(card, where, dtype=dtype, device=device_of(device))
     return LanguageModel(TransformersEngine(card, where, loaded), batch_size)
 
 
-def _device(asked: str | None) -> str:
+def device_of(asked: str | None) -> str:
+    """The device that a user means: CUDA where there is any, for None. Raises UserError for one not there."""
     import torch
 
     if asked is None:

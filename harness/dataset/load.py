@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from harness.dataset.verify import file_problems, read_manifest, records, released
 from harness.errors import UserError, printable, unknown
+from harness.files import canonical_json
 from harness.memory import uncollected
 from harness.resources import folder
 from harness.scene import WorldState
@@ -102,6 +103,16 @@ def find(name: str) -> Path:
     if name in known:
         return folder("datasets") / name
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
+
+
+def shared(one: Dataset, other: Dataset) -> int:
+    """How many scenes of one are in the other too: of the same layout seed, or in the same state."""
+    seeds = {scene.record["episode_seed"] for scene in other.scenes}
+    states = {canonical_json(scene.record["state"]) for scene in other.scenes}
+    return sum(
+        scene.record["episode_seed"] in seeds or canonical_json(scene.record["state"]) in states
+        for scene in one.scenes
+    )
 
 
 def released_digests() -> set[str]:

@@ -1,0 +1,108 @@
+"""`harness distill`: train a small language model on a frozen dataset."""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+
+from harness.errors import UserError, printable
+
+SAMPLES = "120000,16000,36000"
+BATCH = 32
+LINE_S = 60.0
+
+
+def distill(
+    dataset: str = typer.Argument(help="A dataset's folder: what it learns from.", metavar="DIR"),
+    out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
+    prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
+    samples: str = typer.Option(SAMPLES, help="Sequences of the stages alone, messages and answers."),
+    seed: int = typer.Option(0, help="Of the weights and of the order."),
+    batch: int = typer.Option(BATCH, help="Sequences a step."),
+    apart_from: str = typer.Option(
+        "occluded-intersection-v1", help="Dataset that it will be evaluated on: no scene may be in both."
+    ),
+    device: str = typer.Option("cpu", help="cpu or cuda."),
+    threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
+) -> None:
+    """Train a small Qwen3 on a frozen dataset; the same command again goes on where a killed one stopped."""
+    from harness import prompts
+    from harness.backends import checkpoint
+    from harness.dataset import load
+
+    if package := checkpoint.missing_package():
+        raise UserError(
+            f"harness distill needs {package}; run `pip install 'swarmdrive-harness[transformers]'`"
+        )
+    counts = _counts(samples)
+    if batch < 1 or (threads is not None and threads < 1):
+        raise UserError(f"--batch {batch}, --threads {threads}: give 1 or more")
+    versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
+    data = load.load(load.find(dataset))
+    other = load.load(load.find(apart_from))
+    if both := load.shared(data, other):
+        raise UserError(
+            f"{printable(dataset)} and {printable(apart_from)} share {both} scenes; "
+            "build the one with other seeds (`harness dataset build --seed`)"
+        )
+
+    from harness.backends.transformers_engine import device_of
+    from harness.distill.distill import distill as run
+    from harness.distill.train import STAGES, Plan
+
+    plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
+    begun_s = time.monotonic()
+    with _losses(plan.samples) as show:
+        facts = run(data, versions, plan, out, show, device_of(device), threads)
+    apart = facts["held_out"]
+    typer.echo(
+        f"no scene of {printable(apart_from)} is among the {len(data.scenes)} trained on\n"
+        f"held-out KL {apart['kl_nats']:.3f} nats (mean label {apart['kl_of_the_mean_nats']:.3f}, "
+        f"n = {apart['questions']})\n"
+        f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"
+    )
+
+
+def _counts(text: str) -> list[int]:
+    """Three numbers of sequences."""
+    try:
+        counts = [int(part) for part in text.split(",")]
+    except ValueError:
+        counts = []
+    if len(counts) != 3 or min(counts) < 1:
+        raise UserError(f"--samples {printable(text)}: give three whole numbers, such as {SAMPLES}")
+    return counts
+
+
+@contextmanager
+def _losses(samples: Mapping[str, int]) -> Iterator[Callable[[str, int, float], None]]:
+    """Shows each stage's progress and loss on stderr: a bar for people, a line a minute for a log."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=Console(stderr=True)) as bars:
+            tasks = {
+                stage: bars.add_task(stage, total=count, start=False) for stage, count in samples.items()
+            }
+
+            def draw(stage: str, seen: int, loss: float) -> None:
+                bars.start_task(tasks[stage])
+                bars.update(tasks[stage], completed=seen, description=f"{stage} loss {loss:.3f}")
+
+            yield draw
+        return
+    said_s = -math.inf
+
+    def write(stage: str, seen: int, loss: float) -> None:
+        nonlocal said_s
+        if time.monotonic() - said_s > LINE_S or seen >= samples[stage]:
+            said_s = time.monotonic()
+            typer.echo(f"{stage} {seen}/{samples[stage]} loss {loss:.3f}", err=True)
+
+    yield write

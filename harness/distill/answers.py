@@ -1,0 +1,53 @@
+"""What a distilled model learns to write: a given distribution, in the form that its prompt asks for."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.arrays import Floats
+from harness.files import canonical_json
+from harness.prompts import Prompt
+from harness.rounding import rounded
+
+HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
+
+
+def evidence(view: Mapping[str, Any]) -> str:
+    """What a viewer reports: the nearest vehicle on a path that crosses the ego's, or what it cannot see."""
+    if view["conflicts"]:
+        first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
+        return f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m from the ego's path"
+    hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
+    return f"nothing on the ego's path, hidden {' '.join(hidden) or 'none'}"
+
+
+def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> dict[str, Any]:
+    """A helper's message that states an intent, with what any prompt may show of it."""
+    stated = rounded(intent.tolist())
+    best = int(np.argmax(intent))
+    braking = stated[0]  # meta-actions come in the environment's order, the most careful first
+    return {
+        "evidence": evidence(view),
+        "risk": "high" if braking > HIGH else "medium" if braking > MEDIUM else "low",
+        "intent": tuple(stated),
+        "recommended_maneuver": actions[best],
+        "confidence": stated[best],
+    }
+
+
+def answer(
+    prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False
+) -> str:
+    """The answer that states an intent; `bare` without free text, as a constrained answer has to begin."""
+    said = message(view, intent, actions)
+    numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
+    body = f'"action_distribution":{{{numbers}}}'
+    if view["role"] == "helper":
+        if prompt.helper_answer == "recommendation":
+            best = said["recommended_maneuver"]
+            body = f'"recommended_maneuver":"{best}","confidence":{said["confidence"]:.2f}'
+        reported = "" if bare else said["evidence"]
+        body = f'"evidence":{canonical_json(reported)},"risk":"{said["risk"]}",{body}'
+    reasons_first = prompt.helper_answer == "recommendation" and not bare
+    return f"{said['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"
