@@ -76,6 +76,9 @@ class LlamaEngine:
         shared = prompts[first][:common]
         self._context.reserve(sum(len(ids) - common + _ANSWER for ids in prompts.values()) + common)
         kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
+        new = 2 * max(kept.values()) < common
+        if not rest:  # a prompt that is asked again is read again: else its time would be no answer's time
+            kept = {b: n if n < common else 0 for b, n in kept.items()}
         nearest = max(self._beginnings, key=kept.__getitem__)
         known = kept[nearest]
         self._context.fork(nearest, first, known)
@@ -84,13 +87,18 @@ class LlamaEngine:
         for place in rest:
             self._context.fork(first, place, common)
         logits = self._context.extend({p: ids[len(self._context.tokens[p]) :] for p, ids in prompts.items()})
-        if 2 * known < common:
-            nearest = self._beginnings[0]
-            self._context.drop(nearest)
-            self._context.fork(first, nearest, common)
-        self._beginnings.remove(nearest)
-        self._beginnings.append(nearest)
+        if known:
+            self._used(nearest)
+        if new:
+            oldest = self._beginnings[0]
+            self._context.drop(oldest)
+            self._context.fork(first, oldest, common)
+            self._used(oldest)
         return logits
+
+    def _used(self, beginning: int) -> None:
+        self._beginnings.remove(beginning)
+        self._beginnings.append(beginning)
 
     def extend(self, chunks: dict[int, Sequence[int]]) -> Logits:
         """Append tokens to sequences by place; logits after each, (len(chunks), vocabulary)."""

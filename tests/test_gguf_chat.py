@@ -1,0 +1,97 @@
+"""A GGUF's chat template, rendered without transformers as transformers renders it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("transformers", reason="needs the transformers extra")
+
+import tiny_qwen3
+
+from harness.backends.chat import Chat
+from harness.backends.gguf_chat import GgufChat
+from harness.errors import UserError
+
+MESSAGES = (
+    {"role": "system", "content": "You drive.\n <b>é</b> & 'don't' 日本"},
+    {"role": "user", "content": "  Scene 1: truck 14 m "},
+)
+
+
+@dataclass
+class Words:
+    """What a GGUF file says of text, its bytes as tokens."""
+
+    template: str
+    specials: dict[str, str] = field(default_factory=lambda: {"eos_token": "<|im_end|>"})
+    bos: int | None = None
+
+    def encode(self, text: str) -> list[int]:
+        return list(text.encode())
+
+    def decode(self, ids: Sequence[int]) -> str:
+        return bytes(ids).decode()
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    from transformers import AutoTokenizer
+
+    return AutoTokenizer.from_pretrained(tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny"))
+
+
+TEMPLATES = {
+    "Qwen3's switch": tiny_qwen3.TEMPLATE,
+    "blocks on lines of their own": """
+    {% for m in messages %}
+      {% if m.role == 'user' %}
+        {{ m.content | trim }}
+      {% endif %}
+    {% endfor %}
+    {{- eos_token }}
+""",
+    "loop controls": "{% for m in messages %}{% if loop.index == 2 %}{% break %}{% endif %}x{% endfor %}",
+    "JSON as it is": "{{ messages | tojson }}{{ messages[0] | tojson(indent=2) }}",
+    "what it said": "{% for m in messages %}{% generation %}{{ m.content }}{% endgeneration %};{% endfor %}",
+    "the day": "{{ strftime_now('%Y') }}",
+    "nothing given": "{% if tools is none and documents is none %}none{% endif %}{{ bos_token }}{{ x }}",
+    "namespaces and slices": "{% set ns = namespace(n=0) %}{% for m in messages[::-1] %}"
+    "{% set ns.n = ns.n + 1 %}{{ ns.n }}{{ m.content[:4] }}{% endfor %}",
+    "Python's own methods": "{{ messages[0].content.split('.')[0].upper() }}{{ 'x'.startswith('u') }}",
+}
+
+
+@pytest.mark.parametrize("template", TEMPLATES.values(), ids=TEMPLATES)
+@pytest.mark.parametrize("thinking", [True, False])
+def test_a_template_renders_as_in_transformers(tokenizer: Any, template: str, thinking: bool) -> None:
+    tokenizer.chat_template = template
+    theirs, ours = Chat("tiny", tokenizer), GgufChat("tiny", Words(template))
+    assert ours.render(MESSAGES, thinking=thinking) == theirs.render(MESSAGES, thinking=thinking)
+    assert (ours.thinking, ours.template) == (theirs.thinking, theirs.template)
+
+
+def test_a_template_that_refuses_the_messages_says_so() -> None:
+    chat = GgufChat("gruff", Words("{{ raise_exception('System role not supported') }}"))
+    with pytest.raises(UserError, match=r"'gruff': .*refuses the messages \(System role not supported\)"):
+        chat.render(MESSAGES, thinking=False)
+
+
+def test_a_template_cannot_reach_out_of_its_sandbox() -> None:
+    chat = GgufChat("sly", Words("{{ messages.__class__.__mro__[1].__subclasses__() }}"))
+    with pytest.raises(UserError, match="refuses the messages"):
+        chat.render(MESSAGES, thinking=False)
+
+
+def test_a_template_that_is_no_jinja_is_known_at_once() -> None:
+    with pytest.raises(UserError, match=r"'torn': its chat template is no Jinja \(.*endfor"):
+        GgufChat("torn", Words("{% for m in messages %}"))
+
+
+def test_tokens_and_bos_are_the_files(tmp_path: Path) -> None:
+    chat = GgufChat("words", Words("{{ bos_token }}", {"bos_token": "<s>"}, bos=1))
+    assert (chat.bos, chat.encode("ab"), chat.decode([97, 98])) == (1, [97, 98], "ab")
+    assert chat.render(MESSAGES, thinking=False) == "<s>"
