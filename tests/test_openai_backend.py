@@ -101,6 +101,16 @@ def constraint(kind: Kind, role: str = "ego", form: str = "distribution") -> dic
     return {key: value for key, value in asked.items() if key not in plain}
 
 
+def test_no_server_that_can_be_told_punishes_repetition() -> None:
+    asked = {kind: body(card("http://a/v1", kind), Server("http://a/v1", kind), request()) for kind in KINDS}
+    told = {kind: [name for name in made if "penalty" in name] for kind, made in asked.items()}
+    assert told == {
+        "generic": [], "ollama": [], "vllm": ["repetition_penalty"], "llama-server": ["repeat_penalty"],
+        "lm-studio": ["repeat_penalty"], "llama-cpp-python": ["repeat_penalty"],
+    }  # fmt: skip
+    assert all(made[name] == 1.0 for kind, made in asked.items() for name in told[kind])
+
+
 HELPER = '{"evidence":"","risk":"low",'
 
 
