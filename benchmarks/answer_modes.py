@@ -5,7 +5,8 @@
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
 `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
 (left out where `lm_eval` is not installed). `--shape 0.6b` takes random weights of Qwen3-0.6B's shape with
-the model's tokenizer: such weights never stop, so every free answer is as long as Qwen's tokens make it. CPU seconds of this process; what llama.cpp does in its own process is taken from its answers' wall time.
+the model's tokenizer: such weights never stop, so every free answer is as long as Qwen's tokens make it. CPU
+seconds of this process; what llama.cpp does in its own process is its answers' wall time.
 """
 
 import argparse

@@ -95,12 +95,13 @@ def compare(
         exact = partial(llama_backend.open, same, device="cpu")
         shipped = partial(llama_backend.open, gguf, device="cpu")
         found = []
-        for label, opened in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
-            found += _findings(label, asked, known, _hear(opened(batch_size=1), asked, letters, rows))
+        for label, through in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
+            found += _findings(label, asked, known, _hear(through(batch_size=1), asked, letters, rows))
             progress(1)
-        for label, opened, alone in (("transformers", plain, known.texts), ("llama.cpp F32", exact, None)):
-            found.append(_company(label, opened, asked, alone))
-            progress(1)
+        found.append(_company("transformers", plain, asked, known.texts))
+        progress(1)
+        found.append(_company("llama.cpp F32", exact, asked, None))
+        progress(1)
     return found
 
 

@@ -63,7 +63,7 @@ def _from_gguf(file: Path) -> Any:
         ]
     )
     built.decoder = decoders.ByteLevel()
-    # Control tokens, and words of the user's such as `<think>`: found whole, whatever is round them.
+    # Control tokens, and words that a text holds whole, such as `<think>`.
     added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
     built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built

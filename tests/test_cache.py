@@ -13,6 +13,7 @@ import pytest
 from evaluating import Scripted, decisions, failed, rows_of, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
+from misbehaving import completion, serving
 
 from harness import cards, prompts
 from harness.backends.base import Backend, Completion, Rendering, Request
@@ -21,6 +22,7 @@ from harness.backends.completion_file import CompletionFile
 from harness.backends.registry import open_backend
 from harness.cards import Latency
 from harness.dataset.load import Dataset, load
+from harness.files import digest
 from harness.operating_point import POINTS
 from harness.run.evaluate import Evaluated, evaluate
 from harness.run.spec import Spec
@@ -319,6 +321,44 @@ def test_one_by_one_with_every_answer_kept_a_sample_is_timed(
     assert all(a["seconds"] is None for a in answers_of(tmp_path / "again"))
     for decision in decisions(rows_of(tmp_path / "again"), "single-local"):
         assert decision["latency_ms"] == pytest.approx(1000 * latency["inference_s"]["ego"], abs=1e-3)
+
+
+def test_a_served_models_answers_are_kept_and_its_key_is_not(
+    small_path: Path, tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-5ecret")
+    data = load(small_path, limit=1)
+    with serving(lambda asked: asked.reply(completion(digest(asked.body)))) as there:
+        card = cards.load("openai-example")
+        assert card.server is not None
+        card = replace(card, server=replace(card.server, base_url=there.url))
+        spec = Spec(card, prompts.load("v2"), data, tuple(POINTS.values()), (0,))
+        manifests = [
+            evaluate(spec, tmp_path / name, False, lambda done: None, file).manifest
+            for name in ("first", "again")
+        ]
+    asked = len(answers_of(tmp_path / "first"))
+    assert [m["cached_answers"] for m in manifests] == [0, asked]
+    assert not any(b"5ecret" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+
+
+def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, file: Path) -> None:
+    """Its prompts are rendered in another process."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_qwen3
+
+    from harness import gguf_export
+
+    folder = tiny_qwen3.build(tmp_path / "tiny", context_tokens=2048)
+    gguf_export.export(folder, tmp_path / "tiny.gguf", "F32")
+    card = replace(cards.resolve(str(tmp_path / "tiny.gguf")), max_new_tokens=6)
+    spec = Spec(card, prompts.load("v2"), load(small_path, limit=1), tuple(POINTS.values()), (0,))
+    for name in ("first", "again"):
+        done = evaluate(spec, tmp_path / name, False, lambda done: None, file)
+    answers = answers_of(tmp_path / "again")
+    assert done.manifest["cached_answers"] == len(answers)
+    assert [a["raw"] for a in answers] == [a["raw"] for a in answers_of(tmp_path / "first")]
 
 
 def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:

@@ -2,11 +2,15 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from harness import cards, cli
+from harness.backends.registry import open_backend
+from harness.errors import UserError
+from harness.files import sha256_file
 
 
 def harness(
@@ -30,6 +34,9 @@ def test_the_list_has_every_card_in_eighty_columns(
     assert "card 145 ms" in listed["proxy"]
     assert "yes" in listed["proxy"]
     assert "measured" in listed["qwen3-4b"]
+    lines = out.splitlines()
+    other = lines[lines.index(next(line for line in lines if line.startswith("qwen3-4b"))) + 1 :]
+    assert any(line.split()[:2] == ["llama-cpp", "switch"] for line in other[:3])
 
 
 def test_the_json_list_is_the_cards_with_what_they_lack(
@@ -41,6 +48,7 @@ def test_the_json_list_is_the_cards_with_what_they_lack(
     assert rows["proxy"]["latency"]["inference_s"] == 0.145
     assert rows["proxy"]["missing"] is None
     assert rows["full-view"]["privileged"] is True
+    assert rows["qwen3-4b:llama-cpp"]["quantisation"] == "Q4_K_M"
 
 
 def test_a_model_free_engine_says_so(
@@ -74,31 +82,105 @@ def test_without_the_extra_the_list_says_what_is_missing_and_a_check_how_to_get_
     assert "pip install 'swarmdrive-harness[transformers]'" in err
 
 
-def test_a_check_shows_prompt_tokens_thinking_and_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real model with random weights, as a checkpoint and as a GGUF file in one directory."""
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    folder = str(tiny_qwen3.build(tmp_path / "tiny"))
+    from harness import gguf_export
+
+    folder = tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=4096)
+    gguf_export.export(folder, folder / "tiny-f32.gguf", "F32")
+    return folder
+
+
+@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answering(
+    engine: str, tiny: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if engine == "llama-cpp":
+        pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     capsys.readouterr()
-    code, out, err = harness(monkeypatch, capsys, "model", "check", folder, "--device", "cpu")
+    code, out, err = harness(
+        monkeypatch, capsys, "model", "check", str(tiny), "--engine", engine, "--device", "cpu"
+    )
     assert (code, err) == (0, "")
     for part in (
-        "float32 on cpu",
+        f"{engine}  F32 on cpu" if engine == "llama-cpp" else f"{engine}  float32 on cpu",
         "0 of them BOS",
-        "switch; not asked",
+        "switch; not asked here; card: switch",
         "  | <|im_start|>system",
-        " ms for ",
+        "  | EGO speed 14.0 target 14 m/s",
+        "  # 1 '<|im_start|>'",
     ):
         assert part in out
+    assert all(line.isprintable() for line in out.splitlines())
+    answers = [line.split(maxsplit=3) for line in out.splitlines() if " ms, " in line]
+    assert [a[0] for a in answers] == ["json", "constrained", "readout"]
+    assert all(float(a[1]) > 0 for a in answers)
+    assert answers[2][3].startswith('1 tokens, stop: \'{"action_distribution":')
 
+
+@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+def test_weights_are_held_to_the_digest_of_their_card_whenever_they_are_loaded(
+    engine: str, tiny: Path
+) -> None:
+    if engine == "llama-cpp":
+        pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    file = tiny / ("tiny-f32.gguf" if engine == "llama-cpp" else "model.safetensors")
+    card = replace(cards.resolve(str(tiny), engine), sha256=sha256_file(file))
+    assert open_backend(card, device="cpu").identity()["engine"] == engine
+    with pytest.raises(UserError, match=rf"{file.name} is not what its card says: sha256 {card.sha256}"):
+        open_backend(replace(card, sha256="0" * 64), device="cpu")
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model whose context has room for one letter behind the prompt, and for no JSON."""
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_qwen3
+
+    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "short", context_tokens=650)
+
+
+def test_a_way_that_a_model_cannot_answer_in_is_said_and_the_others_are_timed(
+    short: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    code, out, _ = harness(monkeypatch, capsys, "model", "check", str(short), "--device", "cpu")
+    assert code == 0
+    assert "json         no answer: context overflow: " in out
+    assert " ms, 1 tokens, stop: " in out
+
+
+def test_a_check_as_json_has_every_token_and_asks_for_a_thought_in_json_only(
+    short: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
     code, out, _ = harness(
-        monkeypatch, capsys, "model", "check", folder, "--device", "cpu", "--thinking", "--json"
+        monkeypatch, capsys, "model", "check", str(short), "--device", "cpu", "--thinking", "--json"
     )
     seen = json.loads(out)
     assert code == 0
-    assert seen["thinking_asked"] is True
+    assert (seen["thinking_asked"], seen["thinking"]) == (True, "switch")
     assert seen["prompt"].endswith("<|im_start|>assistant\n")
-    assert seen["completion"]["batch_size"] == 1
+    assert "".join(piece for _, piece in seen["tokens"]) == seen["prompt"]
+    assert list(seen["answers"]) == ["json"]
     assert seen["identity"]["engine"] == "transformers"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("check", "qwen3-4b", "--engine", "openai"), "unknown engine of model qwen3-4b 'openai'"),
+        (("check", "openai-example", "--device", "cpu"), "--device cpu: openai-example has no weights"),
+        (("pull", "proxy"), "'proxy' runs on proxy: it has no weights to pull"),
+    ],
+)
+def test_what_a_model_has_not_is_one_line(
+    arguments: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = harness(monkeypatch, capsys, "model", *arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err

@@ -101,6 +101,16 @@ def constraint(kind: Kind, role: str = "ego", form: str = "distribution") -> dic
     return {key: value for key, value in asked.items() if key not in plain}
 
 
+def test_no_server_that_can_be_told_punishes_repetition() -> None:
+    asked = {kind: body(card("http://a/v1", kind), Server("http://a/v1", kind), request()) for kind in KINDS}
+    told = {kind: [name for name in made if "penalty" in name] for kind, made in asked.items()}
+    assert told == {
+        "generic": [], "ollama": [], "vllm": ["repetition_penalty"], "llama-server": ["repeat_penalty"],
+        "lm-studio": ["repeat_penalty"], "llama-cpp-python": ["repeat_penalty"],
+    }  # fmt: skip
+    assert all(made[name] == 1.0 for kind, made in asked.items() for name in told[kind])
+
+
 HELPER = '{"evidence":"","risk":"low",'
 
 
@@ -215,7 +225,7 @@ def test_an_answer_that_drips_is_given_up_when_its_time_is_over(head: bytes) -> 
     def play(asked: Asked) -> None:
         with suppress(OSError):
             asked.raw(head)
-            while True:
+            for _ in range(200):  # four seconds, then it hangs up, which would be another error
                 asked.raw(b"x")
                 sleep(0.02)
 

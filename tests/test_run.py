@@ -264,11 +264,11 @@ def test_a_prompt_that_does_not_render_some_scene_leaves_nothing(small: Dataset,
         ({"thinking": True}, "--thinking: proxy cannot think; leave it out"),
         (
             {"device": "cuda"},
-            "--device cuda: proxy has no weights here (engine transformers has); leave it out",
+            "--device cuda: proxy has no weights here (engines transformers and llama-cpp have)",
         ),
         (
             {"dtype": "float32"},
-            "--dtype float32: proxy has no weights here (engine transformers has); leave it out",
+            "--dtype float32: proxy has no weights here (engines transformers and llama-cpp have)",
         ),
     ],
 )

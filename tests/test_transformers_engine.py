@@ -264,7 +264,8 @@ def test_weights_that_are_nowhere_say_where_they_were_looked_for_and_how_to_get_
     card = replace(resolve("nobody/no-such-model"), revision="v9")
     with pytest.raises(UserError) as caught:
         open_backend(card)
-    for part in ("'nobody/no-such-model'", "'v9'", constants.HF_HUB_CACHE, "hf download", "--revision v9"):
+    pull = "`harness model pull nobody/no-such-model`"
+    for part in ("'nobody/no-such-model'", "'v9'", constants.HF_HUB_CACHE, pull):
         assert part in str(caught.value)
     assert missing(card) == "weights"
 
@@ -344,7 +345,7 @@ def test_nothing_goes_over_the_network_and_nothing_is_said_on_stderr(
     monkeypatch.setattr(socket.socket, "connect", shut)
     monkeypatch.setattr(socket, "getaddrinfo", shut)
     assert open_tiny(tiny).complete([ask(0)])[0].finish_reason == "stop"
-    with pytest.raises(UserError, match="hf download"):
+    with pytest.raises(UserError, match="harness model pull"):
         open_backend(load("qwen3-4b"))
     assert capfd.readouterr() == ("", "")
 
@@ -352,9 +353,14 @@ def test_nothing_goes_over_the_network_and_nothing_is_said_on_stderr(
 def test_a_checkup_shows_the_prompt_its_tokens_and_one_answer_asked_alone(
     backend: LanguageModel,
 ) -> None:
-    seen = checkup.check(backend, thinking=False)
-    assert seen.prompt == backend.chat.render(checkup.MESSAGES, thinking=False)
+    asked = ask(0)
+    seen = checkup.check(backend, [asked])
+    assert seen.prompt == backend.chat.render(asked.messages, thinking=False)
+    assert seen.tokens is not None
+    assert [i for i, _ in seen.tokens] == backend.chat.encode(seen.prompt)
+    assert "".join(piece for _, piece in seen.tokens) == seen.prompt
     assert (seen.thinking, seen.bos_tokens) == ("switch", 0)
-    assert seen.prompt_tokens == seen.completion.prompt_tokens
-    assert seen.completion.seconds is not None
+    answer = seen.answers["json"]
+    assert said([answer]) == said(backend.complete([asked]))
+    assert answer.seconds is not None
     assert seen.identity == backend.identity()

@@ -61,3 +61,10 @@ class Chat:
         """Text of an answer without its special tokens; `<think>` is none in Qwen3's tokenizer, and stays."""
         text: str = self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False)
         return text
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, special ones as they are written; broken bytes are U+FFFD."""
+        return [
+            self.tokenizer.decode([i], skip_special_tokens=False, clean_up_tokenization_spaces=False)
+            for i in ids
+        ]

@@ -1,6 +1,6 @@
 """A checkpoint on disk: where it lies, whether it is whole, and its loading.
 
-Nothing is ever downloaded: an evaluation names its weights, and a person fetches them once.
+Nothing is ever downloaded here: a person fetches weights once (`harness.backends.pull`).
 """
 
 import json
@@ -16,6 +16,9 @@ from harness.resources import folder
 # Without these AutoTokenizer builds an empty tokenizer and says nothing.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
 _WEIGHTS = ("*.safetensors", "*.bin")
+# What transformers loads; a repository's other formats of the same weights would come on top. Fetching and
+# looking both name these: the hub's cache calls a snapshot incomplete that lacks a file nobody needs.
+FILES = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 # What decides an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
 
@@ -58,6 +61,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> Loaded:
     """
     import transformers
 
+    held_to_digest(card, where / "model.safetensors")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     # trust_remote_code=False: else a checkpoint with code of its own asks at the terminal.
@@ -98,6 +102,16 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> Loaded:
     return Loaded(tokenizer, model)
 
 
+def held_to_digest(card: Card, file: Path) -> Path:
+    """The file, if the card's digest is the file's, or the card has none. Raises UserError if it is not."""
+    if card.sha256 and (found := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
+        raise UserError(
+            f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {found}, "
+            f"and the card has {card.sha256}; fetch it again, or mend the card"
+        )
+    return file
+
+
 def vocabulary(where: Path) -> int:
     """How many tokens the model of a checkpoint knows, padding rows included."""
     config = json.loads((where / "config.json").read_text(encoding="utf-8"))
@@ -114,7 +128,9 @@ def _cached(card: Card, weights: str) -> Path:
     from huggingface_hub import constants, snapshot_download
 
     try:
-        return Path(snapshot_download(weights, revision=card.revision, local_files_only=True))
+        return Path(
+            snapshot_download(weights, revision=card.revision, allow_patterns=FILES, local_files_only=True)
+        )
     except (OSError, ValueError):  # not there; no hub id
         at = f" at revision {card.revision!r}" if card.revision else ""
         raise UserError(
@@ -126,5 +142,4 @@ def _cached(card: Card, weights: str) -> Path:
 def _fetch(card: Card) -> str:
     if Path(card.weights or "").is_absolute():
         return "copy the checkpoint again, or give another directory"
-    revision = f" --revision {card.revision}" if card.revision else ""
-    return f"run `hf download {card.weights}{revision}`, or point --model at a local directory"
+    return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"

@@ -1,18 +1,13 @@
 """A look at a language model before any run: what it reads, token by token, and how fast it answers."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from harness.backends.base import Completion, Request
-from harness.backends.language_model import LanguageModel
+from harness.backends.base import AnswerMode, Completion, Rendering, Request
+from harness.backends.chat import Chat
 from harness.cards import Thinking
-
-MESSAGES = (
-    {"role": "system", "content": "You drive the ego vehicle. Answer with one word."},
-    {"role": "user", "content": "A truck hides the crossing lane. SLOWER, IDLE or FASTER?"},
-)
-ACTIONS = ("SLOWER", "IDLE", "FASTER")
-MAX_TOKENS = 8
+from harness.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -20,35 +15,45 @@ class Checkup:
     """What was seen.
 
     Attributes:
-        prompt: the rendered chat, just as the model reads it.
-        prompt_tokens: its length.
+        prompt: the first question, just as the model reads it; as a server is sent it.
+        tokens: its token ids, each with its text; None where only a server knows them.
         bos_tokens: how many of them begin a sequence; more than one harms most models.
-        thinking: what the model's own template can do, whatever its card says.
-        completion: one answer, asked alone after a warm-up; its seconds are batch-1 seconds.
+        thinking: what the model's own template can do, whatever its card says; None where a server has it.
+        answers: one answer a way of answering, asked alone after a warm-up; its seconds are batch-1 seconds.
         identity: as in a run's manifest.
     """
 
     prompt: str
-    prompt_tokens: int
-    bos_tokens: int
-    thinking: Thinking
-    completion: Completion
+    tokens: list[tuple[int, str]] | None
+    bos_tokens: int | None
+    thinking: Thinking | None
+    answers: dict[AnswerMode, Completion]
     identity: dict[str, Any]
 
 
-def check(backend: LanguageModel, *, thinking: bool) -> Checkup:
-    """Render one tiny chat and answer it. `thinking` asks the model to think first, where it can."""
-    request = Request("check/ego", "ego", MESSAGES, ACTIONS, MAX_TOKENS, thinking=thinking)
-    prompt = backend.chat.render(MESSAGES, thinking=thinking)
-    ids = backend.chat.encode(prompt)
-    backend.complete([request])  # the first call of a process pays for kernels and caches
-    [completion] = backend.complete([request])
-    bos = backend.chat.bos
+def check(backend: Rendering, asked: Sequence[Request]) -> Checkup:
+    """Look at a model by some questions, one a way of answering."""
+    [prompt] = backend.rendered(asked[:1])
+    chat: Chat | None = getattr(backend, "chat", None)
+    ids = chat.encode(prompt) if chat else []
     return Checkup(
         prompt=prompt,
-        prompt_tokens=len(ids),
-        bos_tokens=0 if bos is None else ids.count(bos),
-        thinking=backend.chat.thinking,
-        completion=completion,
+        tokens=list(zip(ids, chat.pieces(ids), strict=True)) if chat else None,
+        bos_tokens=ids.count(chat.bos) if chat and chat.bos is not None else (0 if chat else None),
+        thinking=chat.thinking if chat else None,
+        answers={request.answer: _answer(backend, request) for request in asked},
         identity=backend.identity(),
     )
+
+
+def _answer(backend: Rendering, request: Request) -> Completion:
+    try:
+        # The first answer pays for kernels and caches. As in a run, its system prompt is the same and its
+        # scene is another.
+        *head, last = request.messages
+        other = {**last, "content": f"Another scene. {last['content']}"}
+        backend.complete([replace(request, messages=(*head, other))])
+        [completion] = backend.complete([request])
+    except UserError as error:  # the tokenizer or the server leaves no room for this way of answering
+        return Completion(request.id, "", None, None, "error", None, 1, str(error))
+    return completion

@@ -29,6 +29,10 @@ class Vocabulary(Protocol):
         """Text of token ids."""
         ...
 
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, special ones as they are written."""
+        ...
+
 
 class GgufChat(Chat):
     """A GGUF file's tokenizer and chat template."""
@@ -56,6 +60,10 @@ class GgufChat(Chat):
     def decode(self, ids: Sequence[int]) -> str:
         """Text of an answer without its control tokens."""
         return self._vocabulary.decode(ids)
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, control tokens as they are written."""
+        return self._vocabulary.pieces(ids)
 
     def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:
         return self._compiled.render(

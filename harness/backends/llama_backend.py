@@ -6,6 +6,7 @@ from pathlib import Path
 
 from harness.arrays import Floats
 from harness.backends.chat import Chat
+from harness.backends.checkpoint import held_to_digest
 from harness.backends.child import Child
 from harness.cards import Card
 from harness.errors import UserError, printable
@@ -29,7 +30,7 @@ def open(
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    return LlamaBackend(card, find(card), device, batch_size)
+    return LlamaBackend(card, held_to_digest(card, find(card)), device, batch_size)
 
 
 def missing_package() -> str | None:
@@ -54,8 +55,7 @@ def find(card: Card) -> Path:
         try:
             return Path(hf_hub_download(weights, card.file, revision=card.revision, local_files_only=True))
         except (OSError, ValueError):  # not there; no hub id
-            revision = f" --revision {card.revision}" if card.revision else ""
-            hint = f"run `hf download {weights} {card.file}{revision}`, or point --model at a .gguf file"
+            hint = f"run `harness model pull {printable(card.name)}`, or point --model at a .gguf file"
     else:
         hint = "give the path of a .gguf file"
     raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
@@ -106,3 +106,8 @@ class _RemoteChat(Chat):
         """Text of an answer without its control tokens."""
         text: str = self._child.call("chat.decode", ids)
         return text
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, control tokens as they are written."""
+        texts: list[str] = self._child.call("chat.pieces", ids)
+        return texts

@@ -102,11 +102,15 @@ class LlamaModel:
         """Text of token ids, control tokens left out. Bytes that are no text become U+FFFD."""
         return b"".join(self._piece(token) for token in ids).decode(errors="replace")
 
-    def _piece(self, token: int) -> bytes:
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, control tokens as they are written."""
+        return [self._piece(token, control=True).decode(errors="replace") for token in ids]
+
+    def _piece(self, token: int, control: bool = False) -> bytes:
         size = 64
         while True:
             buffer = ctypes.create_string_buffer(size)
-            length: int = c.llama_token_to_piece(self._vocab, token, buffer, size, 0, False)
+            length: int = c.llama_token_to_piece(self._vocab, token, buffer, size, 0, control)
             if length >= 0:
                 return buffer.raw[:length]
             size = -length

@@ -10,6 +10,7 @@ from harness.backends.openai_http import Client
 from harness.backends.openai_shapes import Said, body, read
 from harness.cards import Card
 from harness.errors import UserError, printable
+from harness.files import canonical_json
 from harness.servers import Server
 
 _LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates: a server says when it was started
@@ -44,6 +45,10 @@ class OpenAIBackend:
         first of a call takes a connection, which the others go on with.
         """
         return asyncio.run(self._all(requests))
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """What the server is sent for each request; it renders the messages itself."""
+        return [canonical_json(body(self._card, self._server, request)) for request in requests]
 
     def identity(self) -> dict[str, Any]:
         """The server and its model, by what it says of it. Weights that it changes unsaid are not seen."""

@@ -19,6 +19,14 @@ from harness.rounding import rounded
 from harness.servers import Kind, Server
 
 TOP = 20  # most log-probabilities that servers give for one token
+# Greedy is not enough: some servers punish repetition unless told otherwise (llama_cpp.server by 1.1, vLLM by
+# what a checkpoint's generation_config.json says), and JSON repeats itself.
+_PENALTY: Mapping[Kind, str] = {
+    "vllm": "repetition_penalty",
+    "llama-server": "repeat_penalty",
+    "llama-cpp-python": "repeat_penalty",
+    "lm-studio": "repeat_penalty",
+}
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,8 @@ def body(card: Card, server: Server, request: Request) -> dict[str, Any]:
         "seed": 0,
         "stream": False,
     }
+    if server.kind in _PENALTY:
+        asked[_PENALTY[server.kind]] = 1.0
     if card.thinking == "switch":
         asked["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from harness.cli import dataset, distill, evaluate, model, parse, prompt, report, scenario
+from harness.cli import dataset, distill, evaluate, model, parity, parse, prompt, report, scenario
 from harness.errors import UserError, printable
 
 app = typer.Typer(
@@ -27,6 +27,7 @@ app.add_typer(model.app, name="model")
 app.command("report")(report.command)
 app.command("parse")(parse.command)
 app.command("distill")(distill.distill)
+app.command("parity")(parity.parity)
 
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]

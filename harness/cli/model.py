@@ -1,22 +1,31 @@
-"""`harness model`: the models at hand, and a look at one before a run."""
+"""`harness model`: the models at hand, fetching one, and a look at one before a run."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
 from harness.errors import printable
 
-app = typer.Typer(help="List models, or look at one before a run.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from harness.backends.checkup import Checkup
+    from harness.cards import Card
+    from harness.run.spec import Spec
+
+app = typer.Typer(help="List models, fetch one, or look at one before a run.", no_args_is_help=True)
+
+PROMPT, DATASET = "v2", "occluded-intersection-v1"  # what a check asks
+_WIDTH = 100  # of lines of tokens
 
 
 @app.command("list")
 def list_models(as_json: bool = typer.Option(False, "--json", help="Print the cards as JSON.")) -> None:
-    """List the model cards, and which of them can run here."""
+    """List the model cards, on each of their engines, and which of them can run here."""
     from harness import cards
     from harness.backends.registry import missing
 
-    rows = [(card, missing(card)) for card in map(cards.load, cards.names())]
+    rows = [(card, missing(card)) for card in cards.load_all()]
     if as_json:
         typer.echo(json.dumps([{**asdict(card), "missing": lack} for card, lack in rows], indent=2))
         return
@@ -31,50 +40,109 @@ def list_models(as_json: bool = typer.Option(False, "--json", help="Print the ca
         seconds = card.latency.inference_s
         latency = "measured" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
-        table.add_row(card.name, card.engine, card.thinking, latency, here, card.description)
+        name, _, other = card.name.partition(":")
+        shown = ("", "") if other else (name, card.description)
+        table.add_row(shown[0], card.engine, card.thinking, latency, here, shown[1])
     Console(width=80, markup=False, highlight=False).print(table)
 
 
 @app.command()
+def pull(
+    name: str = typer.Argument(help="Card or hub id."),
+    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
+) -> None:
+    """Fetch a model's weights from its hub, at the revision that its card names."""
+    from harness.backends.pull import pull as fetch
+    from harness.cards import resolve
+
+    card = resolve(name, engine)
+    licence = f"; licence: {printable(card.licence)}" if card.licence else ""
+    typer.echo(f"{printable(card.name)} lies in {printable(fetch(card), 1000)}{licence}")
+
+
+@app.command()
 def check(
-    name: str = typer.Argument(help="Card, checkpoint directory or hub id."),
+    name: str = typer.Argument(help="Card, checkpoint directory, .gguf file or hub id."),
+    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
     device: str | None = typer.Option(None, help="cpu, cuda or cuda:N; CUDA if there is any."),
     dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
     as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
 ) -> None:
-    """Load a model, show the prompt that it reads, and time one answer."""
-    from harness.cards import resolve
+    """Load a model, show the prompt that it reads, and time one decision in each way of answering."""
+    from harness import cards
 
-    card = resolve(name)
-    if card.engine != "transformers":
+    card = cards.resolve(name, engine)
+    head: dict[str, Any] = {"name": card.name, "engine": card.engine}
+    if card.engine not in (*cards.WEIGHTED, "openai"):
         if as_json:
-            typer.echo(json.dumps({"name": card.name, "engine": card.engine, "model_free": True}, indent=2))
+            typer.echo(json.dumps({**head, "model_free": True}, indent=2))
         else:
             typer.echo(
                 f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
             )
         return
-    from harness.backends import checkup, transformers_engine
-
-    backend = transformers_engine.open(card, device=device, dtype=dtype, batch_size=1)
-    seen = checkup.check(backend, thinking=thinking)
+    spec, seen = _seen(card, thinking, device, dtype)
     if as_json:
-        head = {"name": card.name, "engine": card.engine, "model_free": False, "thinking_asked": thinking}
-        typer.echo(json.dumps({**head, **asdict(seen)}, indent=2))
+        typer.echo(
+            json.dumps(
+                {**head, "model_free": False, "thinking_asked": spec.thinking, **asdict(seen)}, indent=2
+            )
+        )
         return
-    answer, what = seen.completion, seen.identity
-    typer.echo(f"model      {card.name}  {what['dtype']} on {what['device']}")
-    typer.echo(f"tokens     {seen.prompt_tokens} in the prompt, {seen.bos_tokens} of them BOS")
-    typer.echo(
-        f"thinking   {seen.thinking}; {'asked' if thinking else 'not asked'} here; card: {card.thinking}"
-    )
-    typer.echo("prompt")
+    _show(spec, seen)
+
+
+def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -> "tuple[Spec, Checkup]":
+    from harness import prompts
+    from harness.backends.base import AnswerMode, Rendering
+    from harness.backends.checkup import check as look
+    from harness.backends.registry import open_backend
+    from harness.dataset import load
+    from harness.run.asking import requests
+    from harness.run.spec import Spec
+
+    data = load.load(load.find(DATASET), 1)
+    spec = Spec(card, prompts.load(PROMPT), data, (), (0,), 1, thinking, "json", 1, device, dtype)
+    ways = ("json",) if spec.thinking else get_args(AnswerMode)
+    # The first of a scene's questions is the ego's.
+    asked = [next(requests(replace(spec, answer=way), data.scenes)) for way in ways]
+    backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
+    assert isinstance(backend, Rendering)
+    return spec, look(backend, asked)
+
+
+def _show(spec: "Spec", seen: "Checkup") -> None:
+    card, what = spec.card, seen.identity
+    where = " on ".join(printable(what[key]) for key in ("dtype", "device") if what.get(key))
+    typer.echo(f"model        {printable(card.name)}  {card.engine}  {where}")
+    typer.echo(f"licence      {printable(card.licence or 'not in its card')}")
+    if seen.tokens is None:
+        typer.echo("tokens       not known here: the server renders the prompt and counts them")
+    else:
+        typer.echo(f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS")
+    typer.echo(f"thinking     {seen.thinking or 'as the server is set'}; "
+               f"{'asked' if spec.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
+    typer.echo(f"prompt       {PROMPT}, the ego of {DATASET}'s first scene")
     for line in seen.prompt.split("\n"):
         typer.echo(f"  | {printable(line, 1000)}")
-    typer.echo(f"answer     {printable(answer.error or repr(answer.text))}")
-    if answer.seconds is not None:
-        typer.echo(
-            f"time       {answer.seconds * 1000:.1f} ms for {answer.completion_tokens} tokens, "
-            f"asked alone, {answer.finish_reason}"
-        )
+    for line in _token_lines(seen.tokens or []):
+        typer.echo(f"  # {line}")
+    for way, answer in seen.answers.items():
+        if answer.error:
+            typer.echo(f"{way:<13}no answer: {printable(answer.error, 300)}")
+            continue
+        took = "" if answer.seconds is None else f"{answer.seconds * 1000:.1f} ms, "
+        tokens = "" if answer.completion_tokens is None else f"{answer.completion_tokens} tokens, "
+        typer.echo(f"{way:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
+
+
+def _token_lines(tokens: list[tuple[int, str]]) -> list[str]:
+    """Ids with their pieces, as many to a line as fit."""
+    lines = [""]
+    for number, piece in tokens:
+        shown = f"{number} {printable(repr(piece), 60)}"
+        if lines[-1] and len(lines[-1]) + len(shown) > _WIDTH:
+            lines.append("")
+        lines[-1] += f"  {shown}" if lines[-1] else shown
+    return [line for line in lines if line]

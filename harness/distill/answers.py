@@ -14,12 +14,24 @@ HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which ris
 
 
 def evidence(view: Mapping[str, Any]) -> str:
-    """What a viewer reports: the nearest vehicle on a path that crosses the ego's, or what it cannot see."""
-    if view["conflicts"]:
-        first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
-        return f"{first['with']} from {first['sector']} {first['other']['arc_m']:.0f} m from the ego's path"
+    """What a viewer reports: who comes closest to the ego where their paths cross, or what it cannot see.
+
+    The gap is by how many seconds that vehicle is later there than the ego.
+    """
+    gaps = [(_gap_s(c), c) for c in view["conflicts"]]
+    moving = [(gap, c) for gap, c in gaps if gap is not None]
+    if moving:
+        gap, first = min(moving, key=lambda pair: abs(pair[0]))
+        return f"{first['with']} from {first['sector']}, gap {gap:+.1f} s"
+    if gaps:
+        return f"{gaps[0][1]['with']} from {gaps[0][1]['sector']}, one of us stands"
     hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
-    return f"nothing on the ego's path, hidden {' '.join(hidden) or 'none'}"
+    return f"nothing crosses, hidden {' '.join(hidden) or 'none'}"
+
+
+def _gap_s(conflict: Mapping[str, Any]) -> float | None:
+    ours, theirs = conflict["ego"]["time_s"], conflict["other"]["time_s"]
+    return None if ours is None or theirs is None else float(theirs - ours)
 
 
 def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from harness.arrays import Floats
 
 STAGES = ("alone", "messages", "answers")
+PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
 LOG_STEPS = 50  # the loss is averaged over so many steps
 KEEP_S = 60.0  # a killed run loses at most so much
 
@@ -164,7 +165,7 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
     """KL of the read-out to its target (nats), plus cross-entropy of the answer's tokens, each a mean."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.model.embed_tokens.weight, hidden.device, batch[0].shared
-    total = hidden.new_zeros(())
+    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch)
     targets = [s.target for s in batch]
     reading = [i for i, t in enumerate(targets) if t is not None]
     if reading:
@@ -186,6 +187,16 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
         logits = hidden[torch.from_numpy(rows), torch.from_numpy(columns - shared - 1)] @ weight.T
         total = total + F.cross_entropy(logits, said.to(device)) * len(writing) / len(batch)
     return total
+
+
+def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample]) -> Any:
+    """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers."""
+    shared = batch[0].shared
+    ids = _padded([s.ids[shared:] for s in batch]).to(hidden.device)
+    places = torch.arange(ids.shape[1])
+    ends = torch.tensor([s.answer_at - shared for s in batch])
+    there = (places[None, 1:] < ends[:, None]).to(hidden.device)
+    return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
 
 
 def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> Floats:

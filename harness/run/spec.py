@@ -76,7 +76,7 @@ class Spec:
             if value is not None and self.card.engine not in WEIGHTED:
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
-                    "(engine transformers has); leave it out"
+                    f"(engines {' and '.join(WEIGHTED)} have); leave it out"
                 )
 
     def settings(self) -> dict[str, Any]:

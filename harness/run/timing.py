@@ -95,9 +95,9 @@ def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked or no time is known.
 
-    Where each answer's own time counts, one that failed or comes from the cache has none and takes its
-    role's median.
-    What an answer is declared to be slower than its card comes on top of the card's.
+    Where each answer's own time counts, one that has none, since it comes from the cache or its engine
+    failed, takes its role's median. What an answer is declared to be slower than its card comes on top of
+    the card's.
     """
     asked = np.array([[a is not None for a in row] for row in answers])
     fixed = latency["inference_s"]

@@ -1,6 +1,7 @@
 """What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,11 +9,13 @@ from typing import get_args
 
 import pytest
 from evaluating import run, spec_of
+from misbehaving import completion, serving
 
 from harness import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.registry import missing, open_backend
 from harness.dataset.load import load
+from harness.files import digest
 from harness.gguf_export import export
 from harness.run.asking import requests
 
@@ -30,13 +33,15 @@ def model_free() -> list[str]:
 
 
 ENGINES = [
-    *((name, "json") for name in (*model_free(), "replay")),
+    *((name, "json") for name in (*model_free(), "replay", "openai")),
     *((engine, answer) for engine in cards.WEIGHTED for answer in get_args(AnswerMode)),
 ]
 
 
 @pytest.fixture(scope="module", params=ENGINES, ids="-".join)
-def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+def case(
+    request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Case]:
     folder = tmp_path_factory.mktemp("conformance")
     model, answer = request.param
     data = load(small_path, limit=1)
@@ -48,22 +53,31 @@ def case(request: pytest.FixtureRequest, small_path: Path, tmp_path_factory: pyt
             pytest.skip("needs the transformers extra")
         import tiny_qwen3
 
-        model = str(tiny_qwen3.build(folder / "tiny", context_tokens=2048))
-    spec = spec_of(data, model, answer=answer)
-    if request.param[0] == "llama-cpp":
+        tiny_qwen3.build(folder / "tiny", context_tokens=2048)
+    if model == "transformers":
+        model = str(folder / "tiny")
+    if model == "openai":
+        with serving(lambda asked: asked.reply(completion(digest(asked.body)))) as there:
+            card = cards.load("openai-example")
+            assert card.server is not None
+            card = replace(card, server=replace(card.server, base_url=there.url))
+            yield Case(open_backend(card, batch_size=3), tuple(requests(spec_of(data), data.scenes[:5]))[:5])
+        return
+    if model == "llama-cpp":
         if find_spec("llama_cpp") is None:
             pytest.skip("needs the llama-cpp extra")
         export(folder / "tiny", folder / "tiny.gguf", "F32")
-        spec = replace(spec, card=replace(spec.card, engine="llama-cpp", weights=str(folder / "tiny.gguf")))
+        model = str(folder / "tiny.gguf")
+    spec = spec_of(data, model, answer=answer)
     asked = list(requests(spec, data.scenes[:5]))
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
     device = "cpu" if spec.card.engine in cards.WEIGHTED else None
-    return Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
+    yield Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", *cards.WEIGHTED}
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *cards.WEIGHTED}
     assert tried == set(cards.Engine.__args__)
     assert all(missing(cards.load(name)) is None for name in model_free())
 

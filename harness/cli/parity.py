@@ -1,0 +1,64 @@
+"""`harness parity`: one model through two engines."""
+
+import json
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.parity import Finding
+
+
+def parity(
+    model: str = typer.Argument(help="Card or directory that names a checkpoint and a GGUF file."),
+    prompt: str = typer.Option("v2", help="Prompt version."),
+    dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
+    prompts: int = typer.Option(64, help="How many, spread over scenes and viewers."),
+    as_json: bool = typer.Option(False, "--json", help="Print what was found as JSON."),
+) -> None:
+    """Run the same prompts through transformers and llama.cpp. Exit code 1 if they differ too much."""
+    from harness import cards
+    from harness import prompts as versions
+    from harness.backends.registry import missing
+    from harness.cli.progress import bar
+    from harness.dataset import load
+    from harness.operating_point import POINTS
+    from harness.parity import PASSES, compare
+    from harness.run.asking import requests
+    from harness.run.spec import Spec
+
+    if prompts < 1:
+        raise UserError(f"--prompts {prompts}: give 1 or more")
+    reference, gguf = cards.resolve(model, "transformers"), cards.resolve(model, "llama-cpp")
+    for card in (reference, gguf):
+        if lack := missing(card):
+            raise UserError(
+                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
+            )
+    data = load.load(load.find(dataset))
+    spec = Spec(reference, versions.load(prompt), data, tuple(POINTS.values()), (0,))
+    asked = list(requests(spec, data.scenes))
+    asked = asked[:: max(1, len(asked) // prompts)][:prompts]
+    ids = {request.id for request in asked}
+    letters = [r for r in requests(replace(spec, answer="readout"), data.scenes) if r.id in ids]
+    with bar(f"comparing {printable(reference.name, 30)}", PASSES, quiet=as_json) as progress:
+        found = compare(reference, gguf, asked, letters, progress)
+    holds = all(finding.holds for finding in found)
+    if as_json:
+        typer.echo(json.dumps({"holds": holds, "findings": [asdict(f) for f in found]}, indent=1))
+    else:
+        _print(found, holds, len(asked))
+    raise typer.Exit(0 if holds else 1)
+
+
+def _print(found: "list[Finding]", holds: bool, n: int) -> None:
+    for f in found:
+        limit = "" if f.allowed is None else f"{f.allowed:g}"
+        typer.echo(f"{'ok  ' if f.holds else 'FAIL'} {f.what:<52}{f.measured:>10.5g} {limit:>8}")
+        for difference in f.differences:
+            typer.echo(f"       {printable(difference, 200)}")
+    verdict = "the engines agree" if holds else "the engines differ"
+    typer.echo(f"{verdict}: {n} prompts; measured, and what is allowed")
