@@ -11,8 +11,8 @@ import typer
 
 from harness.errors import UserError, printable
 
-SAMPLES = "120000,16000,36000"
-BATCH = 32
+SAMPLES = "72000,8000,24000"
+BATCH = 16
 LINE_S = 60.0
 
 

@@ -12,7 +12,7 @@ import torch
 from harness import readout
 from harness.arrays import Floats
 from harness.dataset.load import Dataset
-from harness.distill.answers import answer
+from harness.distill.answers import answer, evidence
 from harness.distill.examples import Question, alone, kl_nats, split, with_messages
 from harness.distill.model import new_model
 from harness.distill.text import END, PAD, chat, train_tokenizer
@@ -77,8 +77,9 @@ class Student:
         return list(with_messages(data, self.prompts, dict(zip((k for k, _ in spoke), intents, strict=True))))
 
     def alone_stage(self) -> list[Sample]:
-        """Every viewer's read-out."""
-        return self.asked
+        """Every viewer's read-out, and what it reports in words: what to look at, and how near it comes."""
+        reports = [self._sample(q.messages, evidence(q.graph) + END, None) for q in self.questions]
+        return self.asked + reports
 
     def messages_stage(self) -> list[Sample]:
         """The ego's read-out with messages, and as many of the first stage."""

@@ -1,11 +1,13 @@
 """Training in three stages, each from the weights of the one before.
 
-1. `alone`: the read-out (one letter) of every viewer, KL to the outcome table's soft label.
+1. `alone`: the read-out (one letter) of every viewer, KL to the outcome table's soft label; and its report in
+   words, which names the gap between two arrivals.
 2. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 1 is rehearsed.
 3. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
    their mode, not their mean.
 
-A batch shares its system message, which is computed once for all of it.
+All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the numbers
+in it has to come from somewhere. A batch shares its system message, which is computed once for all of it.
 """
 
 import math
@@ -60,7 +62,7 @@ class Plan:
     """
 
     samples: dict[str, int]
-    batch: int = 32
+    batch: int = 16
     muon_lr: float = 3e-3
     adam_lr: float = 3e-3
     seed: int = 0
