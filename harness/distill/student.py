@@ -17,6 +17,7 @@ from harness.distill.examples import Question, alone, kl_nats, split, with_messa
 from harness.distill.model import new_model
 from harness.distill.text import END, PAD, chat, train_tokenizer
 from harness.distill.train import Plan, Sample, read_out, run_stage, save
+from harness.files import replacing
 from harness.prompts import Prompt
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -73,7 +74,12 @@ class Student:
             for question, sample in zip(self.questions, self.asked, strict=True)
             if question.graph["role"] == "helper" and question.key.split("/")[0] in ids
         ]
-        intents = self.read([sample for _, sample in spoke])
+        # Kept: a killed run must go on with what was said then, not with what a later stage would say.
+        kept = self.work / "heard.npy"
+        if not kept.is_file():
+            with replacing(kept) as part, part.open("wb") as file:
+                np.save(file, self.read([sample for _, sample in spoke]))
+        intents = np.load(kept)
         return list(with_messages(data, self.prompts, dict(zip((k for k, _ in spoke), intents, strict=True))))
 
     def alone_stage(self) -> list[Sample]:
