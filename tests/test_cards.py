@@ -363,6 +363,7 @@ def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
         ("./no/such/dir", ["'./no/such/dir'", "no directory", ".gguf", "hub id"]),
         ("./no/such.gguf", ["'./no/such.gguf'", "no .gguf file"]),
         ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),
+        ("no/such.gguf", ["'no/such.gguf'", "no .gguf file"]),  # and no hub id, though it could be one
         ("replay:", ["'replay:'", "no such run directory"]),
         ("../models/proxy", ["'../models/proxy'", "no directory"]),
     ],
