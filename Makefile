@@ -10,7 +10,7 @@ LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIV
 .PHONY: eval test check bench clean
 
 eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
-	$(BIN)/harness eval --model proxy --prompt v2
+	$(BIN)/harness eval --model swarm-tiny --prompt v2
 
 test: check ## every check and every test
 	$(BIN)/python -m pytest -n 2
@@ -30,7 +30,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(PYTHON) -m venv .venv
 
 .venv/base: .venv/bin/python pyproject.toml requirements.lock
-	$(INSTALL) --editable .
+	$(LLAMA_CPP) $(INSTALL) --editable '.[llama-cpp]'
 	touch $@
 
 .venv/dev: .venv/bin/python pyproject.toml requirements.lock

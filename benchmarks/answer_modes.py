@@ -1,12 +1,13 @@
 """Decisions a second of each answer mode, against a plain `generate` loop and lm-evaluation-harness.
 
-    python benchmarks/answer_modes.py [--model swarm-tiny] [--shape tiny|0.6b] [--prompts 32] [--batch-size 8]
+    python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8]
+    python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4
 
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
 `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
-(left out where `lm_eval` is not installed). `--shape 0.6b` takes random weights of Qwen3-0.6B's shape with
-the model's tokenizer: such weights never stop, so every free answer is as long as Qwen's tokens make it. CPU
-seconds of this process; what llama.cpp does in its own process is its answers' wall time.
+(left out where `lm_eval` is not installed). `--shape` takes random weights of a Qwen3's shape and Qwen's
+vocabulary: such weights never stop, so every free answer is given the tokens of a JSON answer. CPU seconds of
+this process (wall on CUDA); what llama.cpp does in its own process is its answers' wall time.
 """
 
 import argparse
@@ -17,6 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import shapes
 
 from harness import cards, prompts
 from harness.backends.base import Request
@@ -34,7 +37,9 @@ def main() -> None:
     """Print the rates as a table and as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--model", default="swarm-tiny")
-    arguments.add_argument("--shape", choices=["own", "0.6b"], default="own")
+    arguments.add_argument("--shape", choices=sorted(shapes.SHAPES))
+    arguments.add_argument("--tokenizer", type=Path, help="tokenizer.json or GGUF with Qwen's vocabulary")
+    arguments.add_argument("--device", default="cpu")
     arguments.add_argument("--dtype", default="float32")
     arguments.add_argument("--prompts", type=int, default=32)
     arguments.add_argument("--batch-size", type=int, default=8)
@@ -45,18 +50,19 @@ def main() -> None:
 
     torch.set_num_threads(given.threads)
     with tempfile.TemporaryDirectory() as folder:
-        card = cards.resolve(given.model, "transformers")
-        if given.shape == "0.6b":
-            card = cards.resolve(str(shaped(card, Path(folder) / "shape")), "transformers")
+        model = given.model
+        if given.shape:
+            model = str(shapes.build(given.shape, given.tokenizer, Path(folder) / "shape"))
+        card = cards.resolve(model, "transformers")
         rates = measure(card, given)
-        if given.shape == "own":
+        if not given.shape:
             rates |= of_llama(cards.resolve(given.model, "llama-cpp"), given)
     base = rates["a: generate, batch 1"]
     for name, rate in rates.items():
         print(f"{name:<40}{rate:9.2f} decisions/s   {rate / base:6.1f} of (a)")
     ratios = {mode: rates[f"{mode}, batch {given.batch_size}"] / base for mode in ("json", *AIMS)}
     print("; ".join(f"{mode} {ratios[mode]:.1f}x, aim {aim:g}x" for mode, aim in AIMS.items()))
-    print(json.dumps({"rates": rates, "ratios": ratios, **vars(given)}))
+    print(json.dumps({"rates": rates, "ratios": ratios, **vars(given)}, default=str))
 
 
 def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[Request]:
@@ -70,9 +76,9 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
 
 def measure(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
     """Rates of transformers, plain, by lm-evaluation-harness and by ours."""
-    most = JSON_TOKENS if given.shape == "0.6b" else None
+    most = JSON_TOKENS if given.shape else None
     free = asked_of(card, "json", given.prompts, most)
-    backend = open_backend(card, device="cpu", dtype=given.dtype, batch_size=given.batch_size)
+    backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
     chat, model = backend.chat, backend.engine.model  # type: ignore[attr-defined]
     texts = [chat.render(r.messages, thinking=False) for r in free]
     found = {"a: generate, batch 1": rate(len(free), lambda: plain(model, chat, texts, free))}
@@ -81,7 +87,7 @@ def measure(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
         found[f"b: lm-evaluation-harness, batch {given.batch_size}"] = rate(len(free), by_others)
     for size in (1, given.batch_size):
         for mode in ("json", *AIMS):
-            fresh = open_backend(card, device="cpu", dtype=given.dtype, batch_size=size)
+            fresh = open_backend(card, device=given.device, dtype=given.dtype, batch_size=size)
             asked = asked_of(card, mode, given.prompts, most)
             found[f"{mode}, batch {size}"] = rate(len(asked), lambda b=fresh, a=asked: b.complete(a))
     return found
@@ -100,11 +106,14 @@ def of_llama(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
 
 
 def rate(count: int, work: Callable[[], Any]) -> float:
-    """Decisions a CPU second, after one round to warm up."""
+    """Decisions a second, after one round to warm up."""
+    import torch
+
+    clock = time.perf_counter if torch.cuda.is_available() else time.process_time
     work()
-    start = time.process_time()
+    start = clock()
     work()
-    return count / (time.process_time() - start)
+    return count / (clock() - start)
 
 
 def plain(model: Any, chat: Any, texts: Sequence[str], asked: Sequence[Request]) -> None:
@@ -112,7 +121,7 @@ def plain(model: Any, chat: Any, texts: Sequence[str], asked: Sequence[Request])
     import torch
 
     for text, request in zip(texts, asked, strict=True):
-        ids = torch.tensor([chat.encode(text)])
+        ids = torch.tensor([chat.encode(text)], device=model.device)
         with torch.inference_mode():
             model.generate(
                 ids, attention_mask=torch.ones_like(ids), do_sample=False, max_new_tokens=request.max_tokens,
@@ -136,26 +145,6 @@ def lm_eval(
         for i, text in enumerate(texts)
     ]
     return lambda: wrapped.generate_until(instances, disable_tqdm=True)
-
-
-def shaped(card: cards.Card, folder: Path) -> Path:
-    """Random weights of Qwen3-0.6B's shape, with the tokenizer of another checkpoint."""
-    import torch
-    from transformers import AutoTokenizer, Qwen3Config, Qwen3ForCausalLM
-
-    from harness.backends import checkpoint
-
-    tokenizer = AutoTokenizer.from_pretrained(checkpoint.find(card))
-    torch.manual_seed(0)
-    config = Qwen3Config(
-        vocab_size=151936, hidden_size=1024, intermediate_size=3072, num_hidden_layers=28,
-        num_attention_heads=16, num_key_value_heads=8, head_dim=128, tie_word_embeddings=True,
-        max_position_embeddings=4096, eos_token_id=151645, pad_token_id=tokenizer.pad_token_id,
-        bos_token_id=None,
-    )  # fmt: skip
-    Qwen3ForCausalLM(config).to(torch.bfloat16).save_pretrained(folder)
-    tokenizer.save_pretrained(folder)
-    return folder
 
 
 if __name__ == "__main__":

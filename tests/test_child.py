@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -146,6 +147,15 @@ SCRIPT = textwrap.dedent("""
 """)
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """A shell's background job ignores Ctrl-C, and so would all that it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Signals) -> None:
     """Ctrl-C goes to all processes of a terminal: the engine's hears nothing, and says nothing."""
@@ -169,6 +179,7 @@ def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Sign
     until_dead(pid)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_in_an_answer_leaves_a_child_that_answers_the_next_question(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     pid = child.call("pid")

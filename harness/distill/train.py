@@ -6,8 +6,8 @@
 3. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
    their mode, not their mean.
 
-All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the numbers
-in it has to come from somewhere. A batch shares its system message, which is computed once for all of it.
+All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
+numbers in it has to come from somewhere. A batch shares its system message, which is computed once.
 """
 
 import math
