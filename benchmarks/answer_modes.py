@@ -1,4 +1,4 @@
-"""Decisions a second of each way of answering, against a plain `generate` loop and lm-evaluation-harness.
+"""Decisions a second of each answer mode, against a plain `generate` loop and lm-evaluation-harness.
 
     python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8]
     python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4

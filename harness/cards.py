@@ -160,7 +160,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
         return _of_directory(text, where, engine)
     if where is not None and where.suffix == ".gguf":
         return _made(where.stem, "llama-cpp", str(where), "Local GGUF file", _gguf_thinking(where))
-    if _HUB_ID.fullmatch(text):
+    if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
         return _made(text, "transformers", text, "Hub model without a card")
     if "/" in text:
         raise UserError(

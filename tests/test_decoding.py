@@ -1,4 +1,4 @@
-"""The three ways of answering, held to naive forwards of a real tiny Qwen3: uncached, unbatched, whole."""
+"""The three answer modes, held to naive forwards of a real tiny Qwen3: uncached, unbatched, whole."""
 
 import json
 import math

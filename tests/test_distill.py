@@ -13,8 +13,10 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from harness import prompts, readout
+from harness.cli import app
 from harness.dataset.load import Dataset, load, shared
 from harness.distill import teacher
 from harness.distill.answers import answer, message
@@ -177,6 +179,40 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         distill(few, VERSIONS, PLAN, tmp_path / "m", stop, "cpu")
     with pytest.raises(UserError, match=r"begun with another dataset, prompt, seed or samples"):
         distill(few, VERSIONS, replace(PLAN, seed=1), tmp_path / "m", stop, "cpu")
+
+
+def test_too_few_sequences_for_a_message_are_refused(few: Dataset, tmp_path: Path) -> None:
+    plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
+    with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
+        distill(few, VERSIONS, plan, tmp_path / "m", lambda stage, seen, loss: None, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--samples", "1,2"], "--samples 1,2: give three whole numbers"),
+        (["--samples", "a,b,c"], "--samples a,b,c: give three whole numbers"),
+        (["--samples", "64,64,15"], "16 or more each"),
+        (["--samples", "64,64,7", "--batch", "1"], "8 or more each"),  # four for each of two prompts
+        (["--batch", "0"], "--batch 0: give 1 or more"),
+        (["--samples", "64,64,64", "--batch", "100000"], "100000 or more each"),
+        (["--threads", "0"], "--threads 0: give 1 or more"),
+        (["--seed", "-1"], "--seed -1: give 0 or more"),
+        (["--prompt", "v9"], "unknown prompt 'v9'"),
+        (["--apart-from", "{data}"], "share 24 scenes; build the one with other seeds"),
+    ],
+)
+def test_bad_input_writes_nothing(options: list[str], said: str, small_path: Path, tmp_path: Path) -> None:
+    given = [option.format(data=small_path) for option in options]
+    with pytest.raises(UserError) as caught:
+        CliRunner().invoke(
+            app,
+            ["distill", str(small_path), "--out", str(tmp_path / "m"), *given],
+            standalone_mode=False,
+            catch_exceptions=False,
+        )
+    assert said in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- data that stay apart ---------------------------------------------------------------------------

@@ -158,6 +158,8 @@ def refused(spec: Spec, out: Path) -> str:
     [
         ({"prompt": "v1"}, "was asked 00000-0/v1 with another prompt or dataset; replay it with that run's"),
         ({"thinking": True}, "was run with thinking off; leave --thinking out"),
+        ({"answer": "constrained"}, "was run with --answer json; replay it with the same"),
+        ({"answer": "readout"}, "was run with --answer json; replay it with the same"),
     ],
 )
 def test_a_replay_of_other_questions_is_refused(

@@ -44,7 +44,7 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
     """Hex digest of all that decides an answer; no prompt and no secret can be read out of it.
 
     How many requests went through the engine together is left out: in float32 company changes no answer. In
-    bfloat16 it may move one by rounding, with a cache or without; the identity holds the number format.
+    16 bits it may move one by rounding, with a cache or without; the identity holds the number format.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": _code_sha256()})

@@ -19,7 +19,7 @@ class Checkup:
         tokens: its token ids, each with its text; None where only a server knows them.
         bos_tokens: how many of them begin a sequence; more than one harms most models.
         thinking: what the model's own template can do, whatever its card says; None where a server has it.
-        answers: one answer a way of answering, asked alone after a warm-up; its seconds are batch-1 seconds.
+        answers: one answer an answer mode, asked alone after a warm-up; its seconds are batch-1 seconds.
         identity: as in a run's manifest.
     """
 
@@ -32,7 +32,7 @@ class Checkup:
 
 
 def check(backend: Rendering, asked: Sequence[Request]) -> Checkup:
-    """Look at a model by some questions, one a way of answering."""
+    """Look at a model by some questions, one an answer mode."""
     [prompt] = backend.rendered(asked[:1])
     chat: Chat | None = getattr(backend, "chat", None)
     ids = chat.encode(prompt) if chat else []
@@ -54,6 +54,6 @@ def _answer(backend: Rendering, request: Request) -> Completion:
         other = {**last, "content": f"Another scene. {last['content']}"}
         backend.complete([replace(request, messages=(*head, other))])
         [completion] = backend.complete([request])
-    except UserError as error:  # the tokenizer or the server leaves no room for this way of answering
+    except UserError as error:  # the tokenizer or the server leaves no room for this answer mode
         return Completion(request.id, "", None, None, "error", None, 1, str(error))
     return completion

@@ -1,4 +1,4 @@
-"""The three ways of answering, each written once, over any engine. All of them greedy.
+"""The three answer modes, each written once, over any engine. All of them greedy.
 
 `json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout`: it is asked
 for one letter, and the letters' probabilities are the answer.
@@ -48,7 +48,7 @@ class Decoding:
         """Most tokens that the answer takes behind the prompt.
 
         Raises:
-            UserError: the tokenizer or the request's `max_tokens` leaves no room for this way of answering.
+            UserError: the tokenizer or the request's `max_tokens` leaves no room for this answer mode.
         """
         if request.answer == "constrained":
             return self._skeleton(request).most_tokens

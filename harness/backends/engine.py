@@ -1,6 +1,6 @@
 """What a language model's engine can do: go forward over tokens, and say which comes next.
 
-The ways of answering are written once, on top of this; an engine knows nothing of JSON, letters or roles.
+The answer modes are written once, on top of this; an engine knows nothing of JSON, letters or roles.
 """
 
 from collections.abc import Sequence

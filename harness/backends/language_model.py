@@ -43,7 +43,7 @@ class LanguageModel:
         A batch that fails is asked again, one request at a time.
 
         Raises:
-            UserError: the tokenizer or `max_tokens` leaves no room for the way of answering, or the template
+            UserError: the tokenizer or `max_tokens` leaves no room for the answer mode, or the template
                 refuses the messages.
         """
         done: dict[int, Completion] = {}

@@ -64,6 +64,9 @@ class Replay:
             raise UserError(
                 f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
             )
+        # Free and constrained answers have the same prompt. A run of an older version has no answer mode.
+        if (mode := self.manifest.get("answer", "json")) != request.answer:
+            raise UserError(f"{shown} was run with --answer {printable(mode)}; replay it with the same")
         if answer["prompt_sha256"] != digest(request.messages):
             raise UserError(
                 f"{shown} was asked {request.id} with another prompt or dataset; "

@@ -38,10 +38,12 @@ def distill(
         raise UserError(
             f"harness distill needs {package}; run `pip install 'swarmdrive-harness[transformers]'`"
         )
-    counts = _counts(samples)
-    if batch < 1 or (threads is not None and threads < 1):
-        raise UserError(f"--batch {batch}, --threads {threads}: give 1 or more")
+    for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
+        if value is not None and value < least:
+            raise UserError(f"{flag} {value}: give {least} or more")
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
+    # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
+    counts = _counts(samples, max(batch, 4 * len(versions)))
     data = load.load(load.find(dataset))
     other = load.load(load.find(apart_from))
     if both := load.shared(data, other):
@@ -67,14 +69,16 @@ def distill(
     )
 
 
-def _counts(text: str) -> list[int]:
-    """Three numbers of sequences."""
+def _counts(text: str, least: int) -> list[int]:
+    """Three numbers of sequences, none below `least`."""
     try:
         counts = [int(part) for part in text.split(",")]
     except ValueError:
         counts = []
-    if len(counts) != 3 or min(counts) < 1:
-        raise UserError(f"--samples {printable(text)}: give three whole numbers, such as {SAMPLES}")
+    if len(counts) != 3 or min(counts) < least:
+        raise UserError(
+            f"--samples {printable(text)}: give three whole numbers, such as {SAMPLES}, {least} or more each"
+        )
     return counts
 
 

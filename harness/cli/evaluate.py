@@ -175,6 +175,8 @@ def _table(done: "Evaluated") -> None:
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
     if m.get("cached_answers"):
         console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
+    if m.get("engine_errors"):
+        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
     for role in ("ego", "helper"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:

@@ -69,7 +69,7 @@ def check(
     dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
     as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
 ) -> None:
-    """Load a model, show the prompt that it reads, and time one decision in each way of answering."""
+    """Load a model, show the prompt that it reads, and time one decision in each answer mode."""
     from harness import cards
 
     card = cards.resolve(name, engine)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import transformers
 
 from harness.dataset.load import Dataset
 from harness.distill.card import model_card
@@ -64,6 +65,7 @@ def distill(
         "curves": curves,
     }  # fmt: skip
     student.model.eval()
+    transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
     student.model.save_pretrained(out)
     save_tokenizer(student.tokenizer, out)
     export(out, out / f"{out.absolute().name}-f16.gguf")

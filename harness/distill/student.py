@@ -17,7 +17,7 @@ from harness.distill.examples import Question, alone, kl_nats, split, with_messa
 from harness.distill.model import new_model
 from harness.distill.text import END, PAD, chat, train_tokenizer
 from harness.distill.train import Plan, Sample, read_out, run_stage, save
-from harness.files import replacing
+from harness.errors import UserError
 from harness.prompts import Prompt
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -65,7 +65,11 @@ class Student:
 
     @cached_property
     def heard(self) -> list[Question]:
-        """The ego's questions with messages in some of the scenes, as the model reads helpers out by now."""
+        """The ego's questions with messages in some scenes, as the first stage's model reads helpers out.
+
+        Raises:
+            UserError: in the scenes that are taken no message reaches the ego.
+        """
         most = self.plan.samples["messages"] // (4 * len(self.prompts))
         data = replace(self.data, scenes=tuple(self.some(self.data.scenes, most)))
         ids = {scene.id for scene in data.scenes}
@@ -74,13 +78,18 @@ class Student:
             for question, sample in zip(self.questions, self.asked, strict=True)
             if question.graph["role"] == "helper" and question.key.split("/")[0] in ids
         ]
-        # Kept: a killed run must go on with what was said then, not with what a later stage would say.
-        kept = self.work / "heard.npy"
-        if not kept.is_file():
-            with replacing(kept) as part, part.open("wb") as file:
-                np.save(file, self.read([sample for _, sample in spoke]))
-        intents = np.load(kept)
-        return list(with_messages(data, self.prompts, dict(zip((k for k, _ in spoke), intents, strict=True))))
+        kept = self.work / "heard.pt"
+        if not kept.is_file():  # a later stage's model, after a kill, would read otherwise
+            save({"intents": torch.from_numpy(self.read([sample for _, sample in spoke]))}, kept)
+        intents = torch.load(kept, weights_only=True)["intents"].numpy()
+        said = dict(zip((key for key, _ in spoke), intents, strict=True))
+        heard = list(with_messages(data, self.prompts, said)) if said else []
+        if not heard:
+            raise UserError(
+                f"--samples: {self.plan.samples['messages']} sequences of the stage messages take too few "
+                "scenes: no message reaches the ego in them; give more, or a dataset with more helpers"
+            )
+        return heard
 
     def alone_stage(self) -> list[Sample]:
         """Every viewer's read-out, and what it reports in words: what to look at, and how near it comes."""

@@ -59,6 +59,11 @@ class Run:
     rows: tuple[Row, ...]
 
     @property
+    def answer(self) -> str:
+        """Its answer mode; runs of older versions name none, and had one."""
+        return str(self.config.get("answer", "json"))
+
+    @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the operating points, in the run's order."""
         return tuple(str(condition["name"]) for condition in self.config["conditions"])

@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness import prompts as versions
+from harness import readout
 from harness.dataset.load import Scene
 from harness.drawing.scene import draw
 from harness.errors import UserError, printable
@@ -66,7 +67,12 @@ def prompts_of(run: Run) -> Prompts | None:
     prompt = versions.load(version)
     if prompt.sha256 != run.config["prompt"]["sha256"]:
         return None
-    return lambda scene, viewer: prompt.render(scene.record["graphs"][viewer], actions)
+
+    def sent(scene: Scene, viewer: str) -> Sequence[Mapping[str, str]]:
+        messages = prompt.render(scene.record["graphs"][viewer], actions)
+        return readout.asked(messages, actions) if run.answer == "readout" else messages
+
+    return sent
 
 
 def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -> str:

@@ -91,6 +91,7 @@ def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, An
         "identity": begun["identity"],
         "latency": begun["latency"],
         "cached_answers": sum(answer["cached"] for answer in by_id.values()),
+        "engine_errors": sum(answer["error"] is not None for answer in by_id.values()),
         "delay_allowance_s": laid.allowance_s,
         "versions": versions(),
     }
@@ -109,7 +110,7 @@ def _finished(spec: Spec, out: Path) -> Evaluated:
         manifest = json.loads((out / "run.json").read_text())
         _same(spec.settings(), manifest, out)
         # Names stay text: a model may be called "null" and a prompt "1".
-        text = dict.fromkeys(("model", "prompt", "condition", "metric", "interval"), str)
+        text = dict.fromkeys(("model", "prompt", "answer", "condition", "metric", "interval"), str)
         result = pd.read_csv(
             out / "summary.csv",
             dtype=text,

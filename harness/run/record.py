@@ -106,7 +106,7 @@ def episodes(spec: Spec, laid: Table, runs: Sequence[Scored]) -> "pd.DataFrame":
             return np.nansum(laid_out, axis=1) if sums else known_mean(laid_out, axis=1)
 
         frames.append(pd.DataFrame({
-            "model": spec.card.name, "prompt": spec.prompt.version,
+            "model": spec.card.name, "prompt": spec.prompt.version, "answer": spec.answer,
             "condition": run.point.name, "seed": run.seed,
             "episode": laid.episodes, "danger": [r["danger"]["sector"] or "none" for r in first],
             "success": verdict.success, "failure": _failures(spec, laid, run),

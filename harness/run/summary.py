@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = (
-    "model", "prompt", "condition", "metric", "value", "ci_low", "ci_high", "n", "n_excluded", "interval",
+    "model", "prompt", "answer", "condition", "metric", "value", "ci_low", "ci_high", "n", "n_excluded",
+    "interval",
 )  # fmt: skip
 ALL = "all"  # stands for the condition where a figure does not depend on it
 BASELINE = "single-local"
@@ -37,9 +38,9 @@ def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> 
 
     rows = [
         {
-            "model": spec.card.name, "prompt": spec.prompt.version, "condition": condition, "metric": metric,
-            "value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n, "n_excluded": e.n_excluded,
-            "interval": interval,
+            "model": spec.card.name, "prompt": spec.prompt.version, "answer": spec.answer,
+            "condition": condition, "metric": metric, "value": e.value, "ci_low": e.low, "ci_high": e.high,
+            "n": e.n, "n_excluded": e.n_excluded, "interval": interval,
         }
         for condition, metric, e, interval in _estimates(spec, laid, known, runs)
     ]  # fmt: skip
@@ -72,10 +73,11 @@ def _estimates(
                 hits = np.array([float(v == verdict) for v in verdicts])
                 yield ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers"
     for role, column in (("ego", slice(0, 1)), ("helper", slice(1, None))):
-        for what in ("prompt_tokens", "completion_tokens"):
+        for what in ("prompt_tokens", "completion_tokens", "label_mass"):
             counts = [a[what] for row in known.answers for a in row[column] if a and a[what] is not None]
             if counts:
-                yield ALL, f"{what}_{role}", episode_interval(np.array(counts, dtype=float)), "answers"
+                estimate = episode_interval(np.array(counts, dtype=float))
+                yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"
 
 
 def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
@@ -122,6 +124,6 @@ def _over_episodes(name: str, values: Floats) -> Estimate:
 
 def _in_range(name: str, e: Estimate) -> Estimate:
     """A share ends at 0 and at 1, which Student's t does not know."""
-    if not name.endswith(("_rate", "_loss")):
+    if not name.endswith(("_rate", "_loss", "_mass")):
         return e
     return replace(e, low=float(np.maximum(e.low, 0.0)), high=float(np.minimum(e.high, 1.0)))

@@ -13,11 +13,14 @@ import typer
 from sample_run import write_run
 from typer.testing import CliRunner
 
+from harness import prompts
 from harness.cli.report import command
 from harness.errors import UserError
 from harness.report.folder import Score, read
 from harness.report.page import visible, write_report
 from harness.report.words import headline, latency_source
+
+V2 = prompts.load("v2")
 
 
 class Page(HTMLParser):
@@ -79,6 +82,25 @@ def test_prompts_are_those_given_and_said_to_be_missing_where_none_are(run, page
     assert "I am v3." in page.text
     assert "prompt: not rendered" not in page.text
     assert "prompt: not rendered" in Page(write_report(run, tmp_path / "bare.html").read_text()).text
+
+
+def test_a_page_names_the_answer_mode_and_shows_the_prompt_of_a_read_out(dataset, tmp_path):
+    change = {"label_mass": 0.25, "retries": 2, "cached": True}
+    run = write_run(tmp_path / "run", dataset, change=lambda scene, viewer, answer: {**answer, **change})
+    before = Page(write_report(run).read_text()).text
+    assert "prompt v2, answers json" in before  # as runs of older versions, which name none
+    asks = f"Answer with one letter: A {dataset.actions[0]}"
+    assert asks not in before
+    config = json.loads((run / "run.json").read_text())
+    config |= {"answer": "readout", "cached_answers": 48, "prompt": {"version": "v2", "sha256": V2.sha256}}
+    (run / "run.json").write_text(json.dumps(config))
+    page = Page(write_report(run).read_text())
+    assert "prompt v2, answers readout" in page.text
+    assert "48 answers came from the cache" in page.text
+    assert "25.00 % of the probability on the letters; 2 failed attempts before; from the cache" in page.text
+    prompts = [piece for piece in page.pieces if piece.startswith("EGO")]
+    assert prompts
+    assert all(asks in prompt for prompt in prompts)
 
 
 def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, page):
