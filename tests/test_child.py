@@ -56,16 +56,16 @@ def test_answers_come_from_another_process_with_its_seconds_and_identity(tmp_pat
     child.close()
 
 
-def test_who_kills_the_engine_twice_is_an_error_and_the_others_are_answered(tmp_path: Path) -> None:
+def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_answered(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     first, killer, last = child.complete([ask("first", "a"), ask("die", "b"), ask("last", "c")])
     assert (first.text, last.text) == ("first", "last")
     assert (first.batch_size, last.batch_size) == (1, 1)
     assert (killer.request_id, killer.finish_reason, killer.text) == ("b", "error", "")
     assert (killer.error, killer.seconds) == ("engine died: signal 11", None)
-    assert born(tmp_path) == 3, "one for the chunk, one for the killer alone, one for whoever came after"
+    assert born(tmp_path) == 4, "two for the chunk, one for the killer alone, one for the last"
     assert [c.text for c in child.complete([ask("next")])] == ["next"]
-    assert born(tmp_path) == 3
+    assert born(tmp_path) == 4
     child.close()
 
 

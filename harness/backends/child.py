@@ -29,8 +29,9 @@ class _Died(Exception):
 class Child:
     """The backend that an opener returns, opened and asked in a child process.
 
-    Seconds are measured by the backend, where it is. A death costs the requests that were under way: they are
-    asked again, one at a time, and the one that kills the engine again is a completion with an error.
+    Seconds are measured by the backend, where it is. After a death the requests that were under way are asked
+    again together, as company may move an answer by rounding. If that kills the engine too, they are asked one
+    at a time, and the one that kills it then is a completion with an error.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
@@ -52,11 +53,11 @@ class Child:
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in the same order."""
-        try:
-            answers: list[Completion] = self._ask("complete", requests)
-        except _Died:
-            answers = [self._alone(request) for request in requests]
-        return answers
+        for _ in range(2):
+            with suppress(_Died):
+                answers: list[Completion] = self._ask("complete", requests)
+                return answers
+        return [self._alone(request) for request in requests]
 
     def identity(self) -> dict[str, Any]:
         """The backend's own."""
