@@ -29,7 +29,7 @@ class _Died(Exception):
 class Child:
     """The backend that an opener returns, opened and asked in a child process.
 
-    Seconds are measured by the backend, where it is. After a death the requests that were under way are asked
+    Seconds are measured by the backend, where it is. After a death what was under way is asked
     again together, as company may move an answer by rounding. If that kills the engine too, they are asked one
     at a time, and the one that kills it then is a completion with an error.
     """
