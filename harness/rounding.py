@@ -1,18 +1,17 @@
-"""Probabilities with few decimals that still sum to 1."""
+"""Probabilities in whole parts that still sum to 1."""
 
 from collections.abc import Sequence
 
 
-def rounded(p: Sequence[float], decimals: int = 2) -> list[float]:
-    """The distribution with so many decimals; the last units go where rounding took most (largest remainder).
+def rounded(p: Sequence[float], parts: int = 100) -> list[float]:
+    """The distribution in so many equal parts; the last go where rounding took most (largest remainder).
 
     Args:
         p: probabilities that sum to 1.
-        decimals: two is what a prompt asks for.
+        parts: hundredths are what a prompt asks for.
     """
-    one = 10**decimals
-    floor = [int(x * one + 1e-9) for x in p]
-    short = one - sum(floor)
-    for i in sorted(range(len(p)), key=lambda i: floor[i] - p[i] * one)[:short]:
+    floor = [int(x * parts + 1e-9) for x in p]
+    short = parts - sum(floor)
+    for i in sorted(range(len(p)), key=lambda i: floor[i] - p[i] * parts)[:short]:
         floor[i] += 1
-    return [n / one for n in floor]
+    return [n / parts for n in floor]

@@ -126,7 +126,7 @@ class Decoding:
             logs = [float(row[column[token]]) for token in self._letter_tokens(request.actions)]
             most = max(logs)
             weights = [math.exp(x - most) for x in logs]
-            p = rounded([w / sum(weights) for w in weights], decimals=6)
+            p = rounded([w / sum(weights) for w in weights], parts=10**6)
             text = canonical_json({"action_distribution": dict(zip(request.actions, p, strict=True))})
             answers.append(Answer(text, 1, "stop", min(1.0, math.exp(most) * sum(weights))))
         return answers

@@ -154,7 +154,7 @@ def _read_out(
     missing = [letter for letter in names if letter not in tokens]
     left = max(0.0, 1.0 - math.fsum(p))
     shares = [min(min(p), left / len(missing)) if x in missing else found[x] for x in names]
-    rounded_shares = rounded([share / math.fsum(shares) for share in shares], decimals=6)
+    rounded_shares = rounded([share / math.fsum(shares) for share in shares], parts=10**6)
     text = canonical_json({"action_distribution": dict(zip(request.actions, rounded_shares, strict=True))})
     return Said(text, "stop", prompt_tokens, completion_tokens, min(1.0, mass))
 

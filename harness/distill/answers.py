@@ -10,6 +10,7 @@ from harness.files import canonical_json
 from harness.prompts import Prompt
 from harness.rounding import rounded
 
+PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
 
 
@@ -36,7 +37,7 @@ def _gap_s(conflict: Mapping[str, Any]) -> float | None:
 
 def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> dict[str, Any]:
     """A helper's message that states an intent, with what any prompt may show of it."""
-    stated = rounded(intent.tolist())
+    stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
     braking = stated[0]  # meta-actions come in the environment's order, the most careful first
     return {
