@@ -4,9 +4,12 @@ Letters, because labels may begin with the same token (`LANE_LEFT` and `LANE_RIG
 vocabulary), so that the first token of a label says nothing of which one it is.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 from harness.errors import UserError
+from harness.files import canonical_json
+from harness.rounding import rounded
 
 LETTERS = "ABCDEFGHIJ"
 
@@ -23,3 +26,10 @@ def asked(messages: Sequence[Mapping[str, str]], actions: Sequence[str]) -> tupl
     options = ", ".join(f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True))
     *head, last = messages
     return (*head, {**last, "content": f"{last['content']}\nAnswer with one letter: {options}."})
+
+
+def stated(actions: Sequence[str], shares: Sequence[float]) -> str:
+    """A read-out as an answer's text: the actions' shares, divided by their sum, in millionths."""
+    whole = math.fsum(shares)
+    p = rounded([share / whole for share in shares], parts=10**6)
+    return canonical_json({"action_distribution": dict(zip(actions, p, strict=True))})

@@ -13,9 +13,7 @@ from harness.backends.base import FinishReason, Request
 from harness.backends.engine import Engine, Session
 from harness.backends.skeleton import Skeleton, finished, tokens_after
 from harness.errors import UserError, printable
-from harness.files import canonical_json
-from harness.readout import letters
-from harness.rounding import rounded
+from harness.readout import letters, stated
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,7 @@ class Decoding:
             logs = [float(row[column[token]]) for token in self._letter_tokens(request.actions)]
             most = max(logs)
             weights = [math.exp(x - most) for x in logs]
-            p = rounded([w / sum(weights) for w in weights], parts=10**6)
-            text = canonical_json({"action_distribution": dict(zip(request.actions, p, strict=True))})
+            text = stated(request.actions, weights)
             answers.append(Answer(text, 1, "stop", min(1.0, math.exp(most) * sum(weights))))
         return answers
 

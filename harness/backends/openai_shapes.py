@@ -14,8 +14,7 @@ from harness.answer_schema import answer_schema
 from harness.backends.base import FinishReason, Request
 from harness.cards import Card
 from harness.files import canonical_json
-from harness.readout import letters
-from harness.rounding import rounded
+from harness.readout import letters, stated
 from harness.servers import Kind, Server
 
 TOP = 20  # most log-probabilities that servers give for one token
@@ -154,9 +153,7 @@ def _read_out(
     missing = [letter for letter in names if letter not in tokens]
     left = max(0.0, 1.0 - math.fsum(p))
     shares = [min(min(p), left / len(missing)) if x in missing else found[x] for x in names]
-    rounded_shares = rounded([share / math.fsum(shares) for share in shares], parts=10**6)
-    text = canonical_json({"action_distribution": dict(zip(request.actions, rounded_shares, strict=True))})
-    return Said(text, "stop", prompt_tokens, completion_tokens, min(1.0, mass))
+    return Said(stated(request.actions, shares), "stop", prompt_tokens, completion_tokens, min(1.0, mass))
 
 
 def _count(value: Any) -> int | None:

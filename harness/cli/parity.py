@@ -20,7 +20,7 @@ def parity(
     as_json: bool = typer.Option(False, "--json", help="Print what was found as JSON."),
 ) -> None:
     """Run the same prompts through transformers and llama.cpp. Exit code 1 if they differ too much."""
-    from harness import cards
+    from harness import cards, readout
     from harness import prompts as versions
     from harness.backends.registry import missing
     from harness.cli.progress import bar
@@ -42,8 +42,7 @@ def parity(
     spec = Spec(reference, versions.load(prompt), data, tuple(POINTS.values()), (0,))
     asked = list(requests(spec, data.scenes))
     asked = asked[:: max(1, len(asked) // prompts)][:prompts]
-    ids = {request.id for request in asked}
-    letters = [r for r in requests(replace(spec, answer="readout"), data.scenes) if r.id in ids]
+    letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]
     with bar(f"comparing {printable(reference.name, 30)}", PASSES, quiet=as_json) as progress:
         found = compare(reference, gguf, asked, letters, progress)
     holds = all(finding.holds for finding in found)
