@@ -40,7 +40,7 @@ def tokenizer(source: Path) -> Any:
 
 def _from_gguf(file: Path) -> Any:
     from gguf import GGUFReader
-    from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers
+    from tokenizers import AddedToken, models
 
     reader = GGUFReader(file)
 
@@ -55,7 +55,18 @@ def _from_gguf(file: Path) -> Any:
     merges = [(left, right) for left, right in (p.split(" ") for p in texts("tokenizer.ggml.merges"))]
     types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
              for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
-    built = Tokenizer(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
+    built = byte_level(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
+    # Control tokens, and words that a text holds whole, such as `<think>`.
+    added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
+    built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
+    return built
+
+
+def byte_level(model: Any) -> Any:
+    """A `tokenizers.Tokenizer` of a BPE model over bytes, which splits text as Qwen2 does."""
+    from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
+
+    built = Tokenizer(model)
     built.pre_tokenizer = pre_tokenizers.Sequence(
         [
             pre_tokenizers.Split(Regex(QWEN2_SPLIT), "isolated"),
@@ -63,9 +74,6 @@ def _from_gguf(file: Path) -> Any:
         ]
     )
     built.decoder = decoders.ByteLevel()
-    # Control tokens, and words that a text holds whole, such as `<think>`.
-    added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
-    built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built
 
 

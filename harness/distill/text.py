@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.tokens import QWEN2_SPLIT
+from harness.tokens import byte_level
 
 # 512 entries leave a prompt a third longer (371 tokens against 282, prompt v2, ego); merges end at 819.
 VOCABULARY = 768
@@ -17,16 +17,9 @@ TEMPLATE = (
 
 def train_tokenizer(texts: Iterable[str]) -> Any:
     """A byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
-    from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
+    from tokenizers import AddedToken, models, pre_tokenizers, trainers
 
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
-        [
-            pre_tokenizers.Split(Regex(QWEN2_SPLIT), "isolated"),
-            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
-        ]
-    )
-    tokenizer.decoder = decoders.ByteLevel()
+    tokenizer = byte_level(models.BPE())
     special = [AddedToken(t, special=True, normalized=False) for t in (PAD, START, END)]
     trainer = trainers.BpeTrainer(
         vocab_size=VOCABULARY - len(special),
