@@ -11,7 +11,7 @@ import typer
 
 from harness.errors import UserError, printable
 
-SAMPLES = "72000,8000,24000"
+SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
 LINE_S = 60.0
 
@@ -20,7 +20,9 @@ def distill(
     dataset: str = typer.Argument(help="A dataset's folder: what it learns from.", metavar="DIR"),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
     prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
-    samples: str = typer.Option(SAMPLES, help="Sequences of the stages alone, messages and answers."),
+    samples: str = typer.Option(
+        SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers."
+    ),
     seed: int = typer.Option(0, help="Of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
     apart_from: str = typer.Option(
@@ -70,14 +72,14 @@ def distill(
 
 
 def _counts(text: str, least: int) -> list[int]:
-    """Three numbers of sequences, none below `least`."""
+    """Four numbers of sequences, none below `least`."""
     try:
         counts = [int(part) for part in text.split(",")]
     except ValueError:
         counts = []
-    if len(counts) != 3 or min(counts) < least:
+    if len(counts) != len(SAMPLES.split(",")) or min(counts) < least:
         raise UserError(
-            f"--samples {printable(text)}: give three whole numbers, such as {SAMPLES}, {least} or more each"
+            f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or more each"
         )
     return counts
 

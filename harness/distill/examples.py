@@ -1,7 +1,7 @@
 """What each viewer of each scene is asked, and what it should have intended."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,14 @@ def alone(dataset: Dataset, prompts: Sequence[Prompt]) -> Iterator[Question]:
             for prompt in prompts:
                 sent = prompt.render(graph, dataset.actions)
                 yield Question(_key(scene, viewer, prompt), prompt, graph, sent, label)
+
+
+def excerpts(questions: Sequence[Question], actions: tuple[str, ...]) -> Iterator[Question]:
+    """The same questions with nothing in them but the conflicts; those that have any."""
+    for q in questions:
+        if q.graph["conflicts"]:
+            graph = {**q.graph, "nodes": [], "sectors": []}
+            yield replace(q, graph=graph, messages=q.prompt.render(graph, actions))
 
 
 def with_messages(

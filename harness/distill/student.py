@@ -13,7 +13,7 @@ from harness import readout
 from harness.arrays import Floats
 from harness.dataset.load import Dataset
 from harness.distill.answers import answer, evidence
-from harness.distill.examples import Question, alone, kl_nats, split, with_messages
+from harness.distill.examples import Question, alone, excerpts, kl_nats, split, with_messages
 from harness.distill.model import new_model
 from harness.distill.text import END, PAD, chat, train_tokenizer
 from harness.distill.train import Plan, Sample, read_out, run_stage, save
@@ -47,8 +47,15 @@ class Student:
         self._shared: dict[str, Any] = {}
 
     def reading(self, questions: Sequence[Question]) -> list[Sample]:
-        """Samples that end where one letter is asked for."""
-        return [self._sample(readout.asked(q.messages, self.actions), "", q.label) for q in questions]
+        """Samples where one letter is asked for; drawn by the label, it is followed by a report in words."""
+        rng, letters = np.random.default_rng(self.plan.seed), readout.letters(self.actions)
+        drawn = [letters[rng.choice(len(letters), p=q.label)] for q in questions]
+        return [
+            self._sample(
+                readout.asked(q.messages, self.actions), f"{letter}: {evidence(q.graph)}{END}", q.label
+            )
+            for q, letter in zip(questions, drawn, strict=True)
+        ]
 
     def writing(self, questions: Sequence[Question], intents: Floats) -> list[Sample]:
         """Samples whose answer states a distribution."""
@@ -60,7 +67,7 @@ class Student:
 
     @cached_property
     def asked(self) -> list[Sample]:
-        """The questions, each ending where one letter is asked for."""
+        """The questions, each asking for one letter."""
         return self.reading(self.questions)
 
     @cached_property
@@ -91,10 +98,13 @@ class Student:
             )
         return heard
 
+    def excerpts_stage(self) -> list[Sample]:
+        """The read-out and the report of prompts that show nothing but conflicts."""
+        return self.reading(list(excerpts(self.questions, self.actions)))
+
     def alone_stage(self) -> list[Sample]:
-        """Every viewer's read-out, and what it reports in words: what to look at, and how near it comes."""
-        reports = [self._sample(q.messages, evidence(q.graph) + END, None) for q in self.questions]
-        return self.asked + reports
+        """Every viewer's read-out and report: what to look at, and how near it comes."""
+        return self.asked
 
     def messages_stage(self) -> list[Sample]:
         """The ego's read-out with messages, and as many of the first stage."""
@@ -163,7 +173,7 @@ class Student:
 
         file = self.work / "tokenizer.json"
         if not file.is_file():
-            some = self.questions[:: max(1, len(self.questions) // 5000)]
+            some = self.some(self.questions, 5000)
             texts = ["".join(chat(readout.asked(q.messages, self.actions))) for q in some]
             texts += [answer(q.prompt, q.graph, q.label, self.actions) for q in some]
             train_tokenizer(texts).save(str(file))

@@ -1,9 +1,11 @@
-"""Training in three stages, each from the weights of the one before.
+"""Training in four stages, each from the weights of the one before.
 
-1. `alone`: the read-out (one letter) of every viewer, KL to the outcome table's soft label; and its report in
-   words, which names the gap between two arrivals.
-2. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 1 is rehearsed.
-3. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
+1. `excerpts`: prompts that show nothing but the conflicts, so that reading the numbers is learnt on short
+   sequences. The read-out (one letter) is fitted to the outcome table's soft label by KL, and a report in
+   words follows it, which names the gap between two arrivals.
+2. `alone`: the same with whole prompts, of every viewer.
+3. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 2 is rehearsed.
+4. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
    their mode, not their mean.
 
 All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
@@ -13,7 +15,7 @@ numbers in it has to come from somewhere. A batch shares its system message, whi
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from harness.arrays import Floats
+from harness.distill.muon import Muon
 
-STAGES = ("alone", "messages", "answers")
+STAGES = ("excerpts", "alone", "messages", "answers")
 PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
+TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
 LOG_STEPS = 50  # the loss is averaged over so many steps
 KEEP_S = 60.0  # a killed run loses at most so much
 
@@ -38,8 +42,8 @@ class Sample:
         ids: token ids, the shared beginning included.
         shared: how many of them are the system message, equal in all samples of a `kind`.
         kind: names that system message.
-        answer_at: where the answer starts; the length where it is read out.
-        target: what the read-out should be, (A,); None where the text is learnt.
+        answer_at: where the answer starts.
+        target: what the read-out there should be, (A,); None where the answer is a text from its first token.
     """
 
     ids: NDArray[np.int32]
@@ -73,7 +77,7 @@ def optimizers(model: Any, plan: Plan) -> list[Any]:
     blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
     rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
     return [
-        torch.optim.Muon(blocks, lr=plan.muon_lr, weight_decay=0.05, adjust_lr_fn="match_rms_adamw"),
+        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
         torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
     ]
 
@@ -168,26 +172,25 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
     hidden = hidden_states(model, batch)
     weight, device, shared = model.model.embed_tokens.weight, hidden.device, batch[0].shared
     total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch)
-    targets = [s.target for s in batch]
-    reading = [i for i, t in enumerate(targets) if t is not None]
-    if reading:
-        at = torch.tensor([len(batch[i].ids) - shared - 1 for i in reading], device=device)
-        logits = hidden[torch.tensor(reading, device=device), at] @ weight[letters].T
-        target = torch.from_numpy(np.stack([t for t in targets if t is not None])).to(logits)
-        kl = F.kl_div(F.log_softmax(logits, -1), target, reduction="batchmean")
+    targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
+    if targets:
+        reading = list(targets)
+        at = torch.tensor([batch[i].answer_at - shared - 1 for i in reading], device=device)
+        logits = hidden[torch.tensor(reading, device=device), at] @ weight.T
+        target = torch.from_numpy(np.stack(list(targets.values()))).to(logits)
+        kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
         # Beside the letters nothing should be likely where a letter is asked for.
-        mass = hidden[torch.tensor(reading, device=device), at] @ weight.T
-        outside = torch.logsumexp(mass, -1) - torch.logsumexp(logits, -1)
+        outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
         total = total + (kl + 0.1 * outside.mean()) * len(reading) / len(batch)
-    writing = [i for i, s in enumerate(batch) if s.target is None]
+    said = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
+    writing = [(i, start, end) for i, start, end in said if start < end]
     if writing:
-        rows = np.concatenate([np.full(len(batch[i].ids) - batch[i].answer_at, i) for i in writing])
-        columns = np.concatenate([np.arange(batch[i].answer_at, len(batch[i].ids)) for i in writing])
-        said = torch.from_numpy(
-            np.concatenate([batch[i].ids[batch[i].answer_at :] for i in writing]).astype(np.int64)
-        )
+        rows = np.concatenate([np.full(end - start, i) for i, start, end in writing])
+        columns = np.concatenate([np.arange(start, end) for _, start, end in writing])
+        ids = np.concatenate([batch[i].ids[start:end] for i, start, end in writing]).astype(np.int64)
         logits = hidden[torch.from_numpy(rows), torch.from_numpy(columns - shared - 1)] @ weight.T
-        total = total + F.cross_entropy(logits, said.to(device)) * len(writing) / len(batch)
+        text = F.cross_entropy(logits, torch.from_numpy(ids).to(device))
+        total = total + TEXT_WEIGHT * text * len(writing) / len(batch)
     return total
 
 
@@ -207,15 +210,16 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
     device = next(model.parameters()).device
     weight = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
     found = np.zeros((len(samples), len(letters)))
-    order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, len(samples[i].ids)))
+    order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
     start = 0
     while start < len(order):
         kind = samples[order[start]].kind
         some = [i for i in order[start : start + batch] if samples[i].kind == kind]
         start += len(some)
         with torch.no_grad():
-            hidden = hidden_states(model, [samples[i] for i in some])
-        last = torch.tensor([len(samples[i].ids) - samples[i].shared - 1 for i in some], device=device)
+            asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
+            hidden = hidden_states(model, asked)
+        last = torch.tensor([samples[i].answer_at - samples[i].shared - 1 for i in some], device=device)
         logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
         found[some] = torch.softmax(logits.detach().float(), -1).cpu().numpy()
     return found
