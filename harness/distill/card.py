@@ -31,7 +31,8 @@ that fits beside the source; it says nothing about Qwen3-4B or any other model, 
 |---|---|---|---|
 {losses}
 
-`alone` fits the probabilities of one letter an action, `messages` the same with helpers' messages in the
-ego's prompt, `answers` the JSON text, which states the read-out's own distribution. Curves are in
-`training.json`.
+`alone` fits the probabilities of one letter an action and a report in words; `excerpts` before it does so
+on prompts that show nothing but the conflicts, `messages` after it with helpers' messages in the ego's
+prompt. `answers` is the JSON text, which states the read-out's own distribution. The losses are of different
+sums and compare within a stage only; curves are in `training.json`.
 """
