@@ -1,5 +1,8 @@
 """CPU seconds from the start of a process to the first `complete`, and for `harness --help`.
 
+And wall seconds from typing `harness eval --model swarm-tiny` to its first decision, one ego and three
+helpers answered by llama.cpp: that works in a process of its own.
+
     python benchmarks/startup.py [DATASET] [--repeats 5]
 
 The limit is what a process with these libraries cannot do without: the interpreter, and imports of NumPy,
@@ -12,11 +15,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from harness.dataset import load
 
-AIMS_S = {"help": 0.15, "first_call": 0.7}
+AIMS_S = {"help": 0.15, "first_call": 0.7, "first_decision_wall": 2.0}
 
 # Each ends by printing the CPU seconds of its own process; CPU time starts with the process.
 HELP = """
@@ -41,6 +45,20 @@ Proxy.complete = complete
 sys.argv = ["harness", "eval", "--model", "proxy", *sys.argv[1:]]
 main()
 """
+FIRST_DECISION = """
+import os, sys
+from harness.cli import main
+from harness.run import asking
+
+def _ask(backend, chunk, file, answers):
+    said = backend.complete(chunk[:4])
+    assert [c.finish_reason for c in said] == ["stop"] * 4, said
+    os._exit(0)
+
+asking._ask = _ask
+sys.argv = ["harness", "eval", "--model", "swarm-tiny", "--no-cache", *sys.argv[1:]]
+main()
+"""
 LIMIT = "import time, numpy, jinja2.sandbox, typer; print(time.process_time())"
 
 
@@ -52,16 +70,18 @@ def main() -> None:
     given = arguments.parse_args()
     dataset = str(load.find(given.dataset).resolve())
 
-    found: dict[str, list[float]] = {"help": [], "first_call": [], "first_call_one_episode": [], "limit": []}
+    names = ("help", "first_call", "first_call_one_episode", "first_decision_wall", "limit")
+    found: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(given.repeats):
         with tempfile.TemporaryDirectory() as folder:
-            run, short = (
+            run, short, first = (
                 ["--dataset", dataset, "--out", str(Path(folder) / name), *options]
-                for name, options in (("all", []), ("one", ["--limit", "1"]))
+                for name, options in (("all", []), ("one", ["--limit", "1"]), ("first", []))
             )
             found["help"].append(cpu_s(HELP))
             found["first_call"].append(cpu_s(FIRST_CALL, *run))
             found["first_call_one_episode"].append(cpu_s(FIRST_CALL, *short))
+            found["first_decision_wall"].append(wall_s(FIRST_DECISION, *first))
             found["limit"].append(cpu_s(LIMIT))
     medians = {name: statistics.median(values) for name, values in found.items()}
     for name, median_s in medians.items():
@@ -78,6 +98,13 @@ def cpu_s(program: str, *arguments: str) -> float:
         [sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True
     )
     return float(done.stdout.splitlines()[-1])
+
+
+def wall_s(program: str, *arguments: str) -> float:
+    """How long a new process runs a program."""
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True)
+    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

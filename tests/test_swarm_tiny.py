@@ -1,0 +1,61 @@
+"""The model that ships is a model: what its documents say of it holds on part of the shipped dataset.
+
+The bars are those of the whole dataset, where the README's table has the intervals.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluating import decisions, figure, rows_of, run, spec_of
+
+from harness.dataset.load import DEFAULT, Dataset, find, load
+from harness.run.evaluate import Evaluated
+
+pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+
+EPISODES = 48
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Dataset:
+    return load(find(DEFAULT), limit=EPISODES)
+
+
+@pytest.fixture(scope="module")
+def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    return run(spec_of(shipped, "swarm-tiny", seeds=(0, 1, 2, 3, 4)), tmp_path_factory.mktemp("r") / "run")
+
+
+def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
+    said = [answer["verdict"] for row in rows_of(done.out) for answer in row["answers"].values()]
+    assert len(said) > 1000
+    assert said.count("strict") >= 0.98 * len(said)
+
+
+def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
+    """Hidden: some action crashes into a vehicle that the ego does not see. Clear: nothing is hidden, and
+    no action crashes."""
+    hidden, clear = [], []
+    said = decisions(rows_of(done.out), "single-local")[::5]  # one seed: nothing of it depends on luck
+    for scene, decision in zip(shipped.scenes, said, strict=True):
+        graph = scene.record["graphs"][scene.state.ego.id]
+        crashes = [o["result"] == "collision" for o in scene.record["outcomes"].values()]
+        seen = scene.record["danger"]["vehicle"] in {node["id"] for node in graph["nodes"]}
+        if scene.record["danger"]["vehicle"] and any(crashes) and not seen:
+            hidden.append(decision["entropy_nats"])
+        elif not any(crashes) and not any(sector["occluded"] for sector in graph["sectors"]):
+            clear.append(decision["entropy_nats"])
+    assert len(hidden) >= 10
+    assert len(clear) >= 20
+    assert np.mean(hidden) > np.mean(clear) + 0.05
+
+
+def test_its_helpers_messages_help(done: Evaluated) -> None:
+    alone, helped = (figure(done, c, "success_rate").value for c in ("single-local", "6g"))
+    assert helped - alone >= 0.08
+
+
+def test_it_is_small(done: Evaluated) -> None:
+    folder = Path(__file__).parents[1] / "models" / "swarm-tiny"
+    assert sum(file.stat().st_size for file in folder.iterdir()) <= 10e6
