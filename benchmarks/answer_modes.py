@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.dataset import load
 from harness.operating_point import POINTS
+from harness.resources import DATASET
 from harness.run.asking import requests
 from harness.run.spec import Spec
 
@@ -67,7 +69,7 @@ def main() -> None:
 
 def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[Request]:
     """The ego's requests, spread over the shipped dataset."""
-    dataset = load.load(load.find(load.DEFAULT))
+    dataset = load.load(load.find(DATASET))
     spec = Spec(card, prompts.load("v2"), dataset, tuple(POINTS.values()), (0,), answer=mode)  # type: ignore[arg-type]
     scenes = dataset.scenes[:: max(1, len(dataset.scenes) // count)][:count]
     egos = [r for r in requests(spec, scenes) if r.role == "ego"]
@@ -89,7 +91,7 @@ def measure(card: cards.Card, given: argparse.Namespace) -> dict[str, float]:
         for mode in ("json", *AIMS):
             fresh = open_backend(card, device=given.device, dtype=given.dtype, batch_size=size)
             asked = asked_of(card, mode, given.prompts, most)
-            found[f"{mode}, batch {size}"] = rate(len(asked), lambda b=fresh, a=asked: b.complete(a))
+            found[f"{mode}, batch {size}"] = rate(len(asked), partial(fresh.complete, asked))
     return found
 
 

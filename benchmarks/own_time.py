@@ -13,7 +13,7 @@ import hashlib
 import json
 import statistics
 import tempfile
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -28,6 +28,7 @@ from harness.dataset import load
 from harness.files import canonical_json
 from harness.operating_point import POINTS
 from harness.prompts import Prompt
+from harness.resources import DATASET
 from harness.run import asking, evaluate, intents, record
 from harness.run.spec import Spec
 
@@ -47,7 +48,7 @@ LIMIT = "limit"
 def main() -> None:
     """Print the slopes as a table and as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("dataset", nargs="?", default=load.DEFAULT)
+    arguments.add_argument("dataset", nargs="?", default=DATASET)
     arguments.add_argument("--sizes", nargs=2, type=int, default=[1000, 5000])
     arguments.add_argument("--repeats", type=int, default=3)
     arguments.add_argument("--prompt", default="v2")
@@ -121,7 +122,7 @@ def run(spec: Spec, parts: list[str]) -> dict[str, float]:
     """CPU seconds of one evaluation: its parts, all its own time, and the limit for its record."""
     fresh = replace(spec, dataset=replace(spec.dataset, scenes=tuple(map(again, spec.dataset.scenes))))
     with tempfile.TemporaryDirectory() as folder:
-        spent: Counter[str] = Counter()
+        spent: defaultdict[str, float] = defaultdict(float)
         with ExitStack() as clocks:
             for part in parts:
                 for owner, name in PARTS[part]:
@@ -160,7 +161,7 @@ def limit_s(spec: Spec, rows: list[str]) -> float:
 
 
 @contextmanager
-def clocked(owner: Any, name: str, spent: Counter[str], part: str) -> Iterator[None]:
+def clocked(owner: Any, name: str, spent: defaultdict[str, float], part: str) -> Iterator[None]:
     """While open, the CPU time of calls of `owner.name` goes to a part. A generator is run out at once."""
     function: Callable[..., Any] = getattr(owner, name)
 

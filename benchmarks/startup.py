@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 
 from harness.dataset import load
+from harness.resources import DATASET
 
 AIMS_S = {"help": 0.15, "first_call": 0.7, "first_decision_wall": 2.0}
 
@@ -65,7 +66,7 @@ LIMIT = "import time, numpy, jinja2.sandbox, typer; print(time.process_time())"
 def main() -> None:
     """Print the medians as a table and as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("dataset", nargs="?", default=load.DEFAULT)
+    arguments.add_argument("dataset", nargs="?", default=DATASET)
     arguments.add_argument("--repeats", type=int, default=5)
     given = arguments.parse_args()
     dataset = str(load.find(given.dataset).resolve())

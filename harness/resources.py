@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+DATASET = "occluded-intersection-v1"  # the one that ships
+
 _PACKAGE = Path(__file__).resolve().parent
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from evaluating import decisions, figure, rows_of, run, spec_of
 
-from harness.dataset.load import DEFAULT, Dataset, find, load
+from harness.dataset.load import Dataset, find, load
+from harness.resources import DATASET
 from harness.run.evaluate import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -19,7 +20,7 @@ EPISODES = 48
 
 @pytest.fixture(scope="module")
 def shipped() -> Dataset:
-    return load(find(DEFAULT), limit=EPISODES)
+    return load(find(DATASET), limit=EPISODES)
 
 
 @pytest.fixture(scope="module")

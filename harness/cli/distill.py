@@ -9,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from harness import resources
 from harness.errors import UserError, printable
 
 SAMPLES = "60000,110000,16000,40000"
@@ -26,7 +27,7 @@ def distill(
     seed: int = typer.Option(0, help="Of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
     apart_from: str = typer.Option(
-        "occluded-intersection-v1", help="Dataset that it will be evaluated on: no scene may be in both."
+        resources.DATASET, help="Dataset that it will be evaluated on: no scene may be in both."
     ),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
+from harness import resources
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def evaluate(
     ),
     engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
-    dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
+    dataset: str = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder."),
     condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
     seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
     limit: int | None = typer.Option(None, help="Only the dataset's first so many episodes."),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import typer
 
 from harness.errors import printable
+from harness.resources import DATASET
 
 if TYPE_CHECKING:
     from harness.backends.checkup import Checkup
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="List models, fetch one, or look at one before a run.", no_args_is_help=True)
 
-PROMPT, DATASET = "v2", "occluded-intersection-v1"  # what a check asks
+PROMPT = "v2"  # what a check asks
 _WIDTH = 100  # of lines of tokens
 
 

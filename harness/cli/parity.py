@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from harness import resources
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 def parity(
     model: str = typer.Argument(help="Card or directory that names a checkpoint and a GGUF file."),
     prompt: str = typer.Option("v2", help="Prompt version."),
-    dataset: str = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder."),
+    dataset: str = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder."),
     prompts: int = typer.Option(64, help="How many, spread over scenes and viewers."),
     as_json: bool = typer.Option(False, "--json", help="Print what was found as JSON."),
 ) -> None:

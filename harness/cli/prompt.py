@@ -6,13 +6,14 @@ from typing import Any
 
 import typer
 
+from harness import resources
 from harness.errors import UserError, printable
 
 app = typer.Typer(
     help="List prompt versions, show what a model is sent, check or release one.", no_args_is_help=True
 )
 
-DATASET = typer.Option("occluded-intersection-v1", help="Shipped dataset, or a dataset's folder.")
+DATASET = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder.")
 
 
 @app.command("list")
