@@ -46,17 +46,22 @@ Proxy.complete = complete
 sys.argv = ["harness", "eval", "--model", "proxy", *sys.argv[1:]]
 main()
 """
+# The first answers are those that latency is measured by: one to warm up, then a scene's ego and its helpers.
 FIRST_DECISION = """
 import os, sys
+from harness.backends.child import Child
 from harness.cli import main
-from harness.run import asking
 
-def _ask(backend, chunk, file, answers):
-    said = backend.complete(chunk[:4])
-    assert [c.finish_reason for c in said] == ["stop"] * 4, said
-    os._exit(0)
+answered, complete = [], Child.complete
 
-asking._ask = _ask
+def count(self, requests):
+    answered.extend(complete(self, requests))
+    if len(answered) >= 5:
+        assert all(c.finish_reason == "stop" for c in answered), answered
+        os._exit(0)
+    return answered[-len(requests):]
+
+Child.complete = count
 sys.argv = ["harness", "eval", "--model", "swarm-tiny", "--no-cache", *sys.argv[1:]]
 main()
 """
