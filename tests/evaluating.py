@@ -82,7 +82,8 @@ def sure(action: str, role: str = "ego") -> str:
 
 def ask(spec: Spec, backend: Backend, folder: Path) -> Intents:
     """Every answer asked for and read."""
-    return intents(spec, ask_all(spec, backend, folder / "answers.jsonl", lambda done: None))
+    by_id = ask_all(spec, backend, folder / "answers.jsonl", lambda done: None)
+    return intents(spec.dataset, by_id, spec.answer, spec.thinking)
 
 
 def scored(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from harness.report.folder import Row
+from harness.run.folder import Row
 
 FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
     "first failure",

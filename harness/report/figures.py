@@ -20,8 +20,8 @@ from harness.drawing.pictures import (
     styled,
 )
 from harness.errors import printable
-from harness.report.folder import Run, Score
 from harness.report.words import LATENCY, SUCCESS
+from harness.run.folder import Run, Score
 
 REACTION_MS = (150.0, 250.0)  # the paper's reaction window in an urban intersection
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)

@@ -22,7 +22,7 @@ from harness.errors import UserError, printable
 from harness.files import write_whole
 from harness.report import figures, words
 from harness.report.choose import Pick, decisions_of, pick
-from harness.report.folder import Row, Run, dataset_of, read
+from harness.run.folder import Row, Run, dataset_of, read
 
 DECISIONS = 60
 TEMPLATES = Path(__file__).parent / "templates"

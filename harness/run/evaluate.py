@@ -75,7 +75,7 @@ def evaluate(
 @uncollected()
 def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, Any]) -> Evaluated:
     """Score the answers and write the run's files; `begun` is what its manifest says of its beginning."""
-    known, laid = intents(spec, by_id), table(spec.dataset)
+    known, laid = intents(spec.dataset, by_id, spec.answer, spec.thinking), table(spec.dataset)
     seconds = inference_s(begun["latency"], known.answers)
     drawn = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
     runs = [

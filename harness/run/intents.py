@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import Bools, Floats
+from harness.dataset.load import Dataset
 from harness.files import canonical_json
 from harness.parse import Parsed, parse
 from harness.run.asking import Answer
-from harness.run.spec import Spec
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,29 @@ class Intents:
     payload_bits: Floats
 
 
-def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
-    """Parse every answer. A failed one is NaN and keeps its status."""
-    scenes, actions = spec.dataset.scenes, spec.dataset.actions
+def intents(dataset: Dataset, by_id: Mapping[str, Answer], answer: str, thinking: bool) -> Intents:
+    """Parse every answer. A failed one is NaN and keeps its status.
+
+    Args:
+        dataset: the scenes.
+        by_id: answers by request id.
+        answer: the answer mode that they were given in.
+        thinking: whether the model was asked to think first.
+    """
+    scenes, actions = dataset.scenes, dataset.actions
+
+    def parsed_of(a: Answer, role: str) -> Parsed:
+        # A read-out is a bare distribution, whoever gives it.
+        asked_as = "ego" if answer == "readout" else role
+        return parse(
+            a["raw"], role=asked_as, actions=actions, thinking=thinking,
+            finish_reason=a["finish_reason"], error=a["error"],
+        )  # fmt: skip
+
     width = max(len(scene.viewers) for scene in scenes)
     answers = [_padded([by_id.get(f"{s.id}/{v}") for v in s.viewers], width) for s in scenes]
     parsed = [
-        [_parsed(spec, a, "ego" if j == 0 else "helper") if a else None for j, a in enumerate(row)]
+        [parsed_of(a, "ego" if j == 0 else "helper") if a else None for j, a in enumerate(row)]
         for row in answers
     ]
     p = np.full((len(scenes), width, len(actions)), np.nan)
@@ -64,19 +80,6 @@ def intents(spec: Spec, by_id: Mapping[str, Answer]) -> Intents:
                 bits[i, j - 1] = payload_bits(viewer, at[viewer], said) if said else 0
     valid = ~np.isnan(p[:, 1:]).any(axis=-1)
     return Intents(answers, parsed, p[:, 0], p[:, 1:], valid, distance, reach, bits)
-
-
-def _parsed(spec: Spec, answer: Answer, role: str) -> Parsed:
-    return parse(
-        answer["raw"],
-        role="ego"
-        if spec.answer == "readout"
-        else role,  # a read-out is a bare distribution, whoever gives it
-        actions=spec.dataset.actions,
-        thinking=spec.thinking,
-        finish_reason=answer["finish_reason"],
-        error=answer["error"],
-    )
 
 
 def payload_bits(viewer: str, xy_m: tuple[float, float], said: Parsed) -> int:

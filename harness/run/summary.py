@@ -53,12 +53,12 @@ def _estimates(
     by_condition: dict[str, dict[str, Floats]] = {}
     for point in spec.points:
         mine = [r for r in runs if r.point == point]
-        by_seed = [_metrics(laid, r) for r in mine]
+        by_seed = [by_episode(laid, r) for r in mine]
         metrics = {name: np.stack([m[name] for m in by_seed]) for name in by_seed[0]}
         by_condition[point.name] = metrics
         for name, values in metrics.items():  # (seeds, episodes)
-            yield point.name, name, _over_seeds(name, values), "seed means"
-            yield point.name, name, _over_episodes(name, values), "episodes"
+            yield point.name, name, over_seeds(name, values), "seed means"
+            yield point.name, name, over_episodes(name, values), "episodes"
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
     if BASELINE in by_condition:
@@ -80,7 +80,7 @@ def _estimates(
                 yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"
 
 
-def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
+def by_episode(laid: Table, r: Scored) -> dict[str, Floats]:
     """Each metric by episode, (E,): a share or a mean over its decisions."""
     c = r.coordination
 
@@ -107,12 +107,12 @@ def _metrics(laid: Table, r: Scored) -> dict[str, Floats]:
     }
 
 
-def _over_seeds(name: str, values: Floats) -> Estimate:
+def over_seeds(name: str, values: Floats) -> Estimate:
     """Interval over seeds of a metric's values (seeds, episodes)."""
     return _in_range(name, seed_interval(known_mean(values, axis=1)))
 
 
-def _over_episodes(name: str, values: Floats) -> Estimate:
+def over_episodes(name: str, values: Floats) -> Estimate:
     """Interval over episodes of a metric's values (seeds, episodes)."""
     each = known_mean(values, axis=0)
     settled = each[~np.isnan(each)]

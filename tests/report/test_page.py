@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from harness import prompts
 from harness.cli.report import command
 from harness.errors import UserError
-from harness.report.folder import Score, read
 from harness.report.page import visible, write_report
 from harness.report.words import headline, latency_source
+from harness.run.folder import Score, read
 
 V2 = prompts.load("v2")
 

@@ -1,4 +1,4 @@
-"""A run folder, read for its report."""
+"""A run folder, read again: for its report, and to be coordinated otherwise."""
 
 import csv
 import json
