@@ -39,4 +39,65 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
     return pooled
 
 
-RULES: dict[str, Callable[[Floats, Floats], Floats]] = {"linear": linear_pool}
+def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
+    """Weighted geometric mean of intents, `(..., A)` (the logarithmic opinion pool of Genest 1984).
+
+    A probability below `floor` counts as that much, so that one rounded 0 is no veto; an ego that hears
+    nobody keeps its intent as it is.
+    """
+    row_weights = weights[..., None]
+    logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
+    pooled = np.exp(np.sum(row_weights * logs, axis=-2))
+    alone = weights[..., :1] == 1
+    return np.where(alone, p[..., 0, :], pooled / np.sum(pooled, axis=-1, keepdims=True))
+
+
+def median(p: Floats, weights: Floats) -> Floats:
+    """Weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
+
+    Where half of the weight lies exactly on either side, the mean of the two in the middle. All medians can
+    be 0, if every vehicle is sure of another action than the others; then the linear pool stands in.
+    """
+    values, below = _sorted(p, weights)
+    low = _pick(values, below >= 0.5 - 1e-12)
+    high = _pick(values, below > 0.5 + 1e-12)
+    return _scaled((low + high) / 2, p, weights)
+
+
+def trimmed_mean(p: Floats, weights: Floats) -> Floats:
+    """Weighted mean of each action's probability less the lowest and highest quarter of weight, `(..., A)`.
+
+    Scaled to sum to 1. Between the median, which trims all, and the linear pool, which trims nothing.
+    """
+    values, below = _sorted(p, weights)
+    inside = np.clip(below, 0.25, 0.75)
+    kept = np.diff(inside, axis=-2, prepend=0.25)
+    return _scaled(np.sum(kept * values, axis=-2) / 0.5, p, weights)
+
+
+def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Each action's probabilities in order, `(..., 1+H, A)`, and the weight up to and with each."""
+    heard = np.where(weights[..., None] > 0, p, np.inf)  # who is not heard comes last, with weight 0
+    order = np.argsort(heard, axis=-2, kind="stable")
+    below = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], p.shape), order, -2), axis=-2)
+    values = np.take_along_axis(heard, order, -2)
+    return np.where(np.isinf(values), 0.0, values), below
+
+
+def _pick(values: Floats, reached: Bools) -> Floats:
+    """The first value where `reached`, `(..., A)`."""
+    first = np.argmax(reached, axis=-2)[..., None, :]
+    return np.take_along_axis(values, first, -2)[..., 0, :]
+
+
+def _scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
+    total = np.sum(pooled, axis=-1, keepdims=True)
+    return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))
+
+
+RULES: dict[str, Callable[[Floats, Floats], Floats]] = {
+    "linear": linear_pool,
+    "log-pool": log_pool,
+    "median": median,
+    "trimmed-mean": trimmed_mean,
+}
