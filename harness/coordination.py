@@ -16,7 +16,7 @@ The paper counts the whole exchange as the decision's latency even when it outla
 does this. Everything here is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -113,13 +113,15 @@ def coordinate(
         luck: the channel's draws.
     """
     profile = NO_CHANNEL if point.profile is None else PROFILES[point.profile]
+    if point.profile is not None and point.latency_s is not None:
+        profile = replace(profile, latency_s=point.latency_s)
     own_failed = np.any(np.isnan(own), axis=-1)
     own = np.where(own_failed[..., None], fallback_intent(point.fallback, own.shape[-1]), own)
     asks = triggered(own, point.tau_nats) & (point.profile is not None)
 
     in_radius = valid & (range_m <= point.radius_m)
     asked = asks[..., None] & nearest(in_radius, range_m, point.max_helpers)
-    loss = crossing_loss(point, profile, in_radius)
+    loss = crossing_loss(point, profile, in_radius, triggered(helpers, point.tau_nats))
     delivered = asked & link_up(luck.link, loss, point.roadside_edge)
 
     request_s = infer_s[..., :1]
@@ -170,13 +172,17 @@ def nearest(candidates: Bools, range_m: Floats, most: int) -> Bools:
     return candidates & (rank < most)
 
 
-def crossing_loss(point: OperatingPoint, profile: Profile, in_radius: Bools) -> Floats:
+def crossing_loss(point: OperatingPoint, profile: Profile, in_radius: Bools, unsure: Bools) -> Floats:
     """Probability that one crossing is lost, `(...)`: the point's, the swarm's or the profile's.
 
     Under density coupling every valid helper in the radius `(..., H)` is an active vehicle, asked or
-    not, and so is the ego.
+    not, and so is the ego. Where helpers open rounds of their own, those that are unsure `(..., H)` are
+    active beside the ego, and the loss is that of so many if it is the larger.
     """
     if point.profile is not None and point.density_coupled:
         return density_coupled_loss(1 + np.sum(in_radius, axis=-1))
     overridden = point.profile is not None and point.loss is not None
-    return np.full(in_radius.shape[:-1], point.loss if overridden else profile.loss)
+    loss = np.full(in_radius.shape[:-1], point.loss if overridden else profile.loss)
+    if point.profile is not None and point.helper_rounds:
+        loss = np.maximum(loss, density_coupled_loss(1 + np.sum(in_radius & unsure, axis=-1)))
+    return loss

@@ -29,7 +29,9 @@ class OperatingPoint:
             the first action, which is the most conservative one.
         consensus: consensus rule.
         loss: probability that one crossing is lost, in place of the profile's; None keeps the profile's.
+        latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
+        helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
         roadside_edge: replies travel over a roadside edge node as well (`channel.link_up`).
     """
 
@@ -43,7 +45,9 @@ class OperatingPoint:
     fallback: str = "uniform"
     consensus: str = "linear"
     loss: float | None = None
+    latency_s: float | None = None
     density_coupled: bool = False
+    helper_rounds: bool = False
     roadside_edge: bool = False
 
     def __post_init__(self) -> None:
@@ -61,9 +65,11 @@ class OperatingPoint:
         self._number("min_distance_m", "metres above 0")
         if self.loss is not None:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
+        if self.latency_s is not None:
+            self._number("latency_s", "seconds, 0 or more", zero=True)
         if type(self.max_helpers) is not int or self.max_helpers < 0:
             raise self._wrong("max_helpers", "a whole number, 0 or more")
-        for flag in ("density_coupled", "roadside_edge"):
+        for flag in ("density_coupled", "helper_rounds", "roadside_edge"):
             if type(getattr(self, flag)) is not bool:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
