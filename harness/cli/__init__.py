@@ -8,7 +8,19 @@ from typing import Any
 
 import typer
 
-from harness.cli import dataset, distill, evaluate, model, parity, parse, prompt, report, scenario
+from harness.cli import (
+    campaign,
+    dataset,
+    distill,
+    evaluate,
+    model,
+    parity,
+    parse,
+    prompt,
+    report,
+    scenario,
+    sweep,
+)
 from harness.errors import UserError, printable
 
 app = typer.Typer(
@@ -27,6 +39,8 @@ app.add_typer(model.app, name="model")
 app.command("report")(report.command)
 app.command("parse")(parse.command)
 app.command("distill")(distill.distill)
+app.command("sweep")(sweep.sweep)
+app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
 
 # typer carries a click of its own and exports of its errors only this one's children.

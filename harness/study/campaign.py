@@ -1,0 +1,62 @@
+"""`harness campaign paper`: plays the panels, draws the figures, and writes everything to one folder."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.files import write_whole
+from harness.run.spec import versions
+from harness.study import figures
+from harness.study.calibrated import Calibrated
+from harness.study.ledger import ledger
+from harness.study.page import page
+from harness.study.paper import SEEDS, Panel
+from harness.study.play import play
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT = "swarmdrive-study/1"
+
+
+def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None]) -> "pd.DataFrame":
+    """Play the paper's panels with the calibrated proxy.
+
+    Writes `conditions.csv`, `episodes.csv`, `ledger.csv`, `study.json`, the Figures A and B as SVG, PDF and
+    PNG, and `index.html`.
+
+    Returns:
+        The ledger.
+    """
+    import pandas as pd
+
+    sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
+    played = [play(sources[p.episodes], p.name, p.settings, SEEDS, progress) for p in panels]
+    summary = pd.concat([p.summary for p in played], ignore_index=True)
+    found = ledger(summary)
+    manifest = {
+        "format": FORMAT,
+        "study": "paper",
+        "seeds": list(SEEDS),
+        "episodes_per_seed": {p.name: p.episodes for p in panels},
+        "source": next(iter(sources.values())).manifest(),
+        "panels": {
+            p.name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in p.settings]
+            for p in panels
+        },
+        "versions": versions(),
+    }
+    core, *sweeps = (p.summary for p in played)
+    drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps, best_band=True)}
+    out.mkdir(parents=True, exist_ok=True)
+    for stem, figure in drawn.items():
+        figures.save_all(figure, out / stem)
+    write_whole(out / "conditions.csv", summary.to_csv(index=False))
+    episodes = pd.concat([p.episodes for p in played], ignore_index=True)
+    write_whole(out / "episodes.csv", episodes.to_csv(index=False))
+    write_whole(out / "ledger.csv", found.to_csv(index=False))
+    write_whole(out / "study.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    write_whole(out / "index.html", page(manifest, found, out))
+    return found

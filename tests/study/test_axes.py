@@ -1,0 +1,55 @@
+"""Grids as typed."""
+
+import pytest
+
+from harness.consensus import RULES
+from harness.errors import UserError
+from harness.operating_point import POINTS
+from harness.study.axes import AXES, axis_of, grid
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("0,10,20", (0, 10, 20)),
+        ("0:50:10", (0, 10, 20, 30, 40, 50)),
+        ("0:0.3:0.1", (0, 0.1, 0.2, 0.3)),
+        ("5", (5,)),
+        ("1:3", (1, 2, 3)),
+        ("0, 20:30:5, 20", (0, 20, 25, 30)),
+    ],
+)
+def test_lists_and_ranges_with_both_ends(text: str, values: tuple[float, ...]) -> None:
+    assert grid(AXES["loss"], text) == pytest.approx(values)
+
+
+@pytest.mark.parametrize("text", ["", "a", "1:2:0", "3:1", "1:2:3:4", "nan", "0:inf", "0:1e9:1"])
+def test_what_is_no_grid_is_refused(text: str) -> None:
+    with pytest.raises(UserError, match="--grid"):
+        grid(AXES["loss"], text or ",")
+
+
+def test_vehicles_are_whole() -> None:
+    with pytest.raises(UserError, match="whole numbers of vehicles"):
+        grid(AXES["size"], "1.5")
+
+
+def test_every_axis_has_a_usual_grid_that_its_point_allows() -> None:
+    for axis in AXES.values():
+        for value in grid(axis):
+            axis.at(POINTS["6g"], value)
+
+
+def test_values_take_the_axis_unit() -> None:
+    point = POINTS["6g"]
+    assert AXES["loss"].at(point, 10.0).loss == pytest.approx(0.1)
+    assert AXES["window"].at(point, 250.0).window_s == pytest.approx(0.25)
+    assert AXES["latency"].at(point, 25.0).latency_s == pytest.approx(0.025)
+    assert AXES["consensus"].at(point, "median").consensus == "median"
+
+
+def test_unknown_axes_and_rules_name_what_there_is() -> None:
+    with pytest.raises(UserError, match="--over"):
+        axis_of("speed")
+    with pytest.raises(UserError, match=next(iter(RULES))):
+        grid(AXES["consensus"], "mode")

@@ -1,0 +1,88 @@
+"""A run's stored answers at other operating points."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from evaluating import figure, run, spec_of
+
+from harness.dataset.load import Dataset
+from harness.errors import UserError
+from harness.run.evaluate import Evaluated
+from harness.study.axes import AXES, grid
+from harness.study.stored import Stored
+from harness.study.sweep import run_sweep, settings
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    return run(spec_of(small), tmp_path_factory.mktemp("sweep") / "run")
+
+
+@pytest.fixture(scope="module")
+def source(done: Evaluated) -> Stored:
+    return Stored(done.out)
+
+
+def swept(source: Stored, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
+    axis = AXES[name]
+    points = settings([source], axis, grid(axis, text), "6g")
+    return run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
+
+
+def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
+    rows = summary[(summary.value == at) & (summary.metric == metric) & (summary.interval == "episodes")]
+    return float(rows["mean"].item())
+
+
+def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
+    done: Evaluated, source: Stored, tmp_path: Path
+) -> None:
+    summary = swept(source, tmp_path, "tau", "0.7")
+    for metric in ("success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode"):
+        assert value(summary, 0.7, metric) == pytest.approx(figure(done, "6g", metric).value)
+
+
+def test_without_others_or_trigger_a_vehicle_is_alone(
+    done: Evaluated, source: Stored, tmp_path: Path
+) -> None:
+    alone = figure(done, "single-local", "success_rate").value
+    assert value(swept(source, tmp_path / "a", "size", "1"), 1, "success_rate") == pytest.approx(alone)
+    assert value(swept(source, tmp_path / "b", "tau", "1.2"), 1.2, "success_rate") == pytest.approx(alone)
+    assert value(swept(source, tmp_path / "c", "loss", "100"), 100, "success_rate") == pytest.approx(alone)
+
+
+def test_every_axis_gives_its_panels(source: Stored, tmp_path: Path) -> None:
+    panels = {name: settings([source], axis, grid(axis), "6g") for name, axis in AXES.items()}
+    summary = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
+    assert set(summary.panel) == set(AXES)
+    names = {"conditions.csv", "episodes.csv", "sweep.json", "sweep.svg", "sweep.pdf", "sweep.png"}
+    assert {p.name for p in tmp_path.iterdir()} == names
+    assert json.loads((tmp_path / "sweep.json").read_text())["grid"]["consensus"][0] == "linear"
+
+
+def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None:
+    """The same answers under another prompt's name see the same luck."""
+    other = Stored(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
+    axis = AXES["loss"]
+    points = settings([source, other], axis, (0.0, 50.0), "6g")
+    made = run_sweep([source, other], {"loss": points}, (0, 1), tmp_path / "out", lambda n: None)
+    assert len(set(made.source)) == 2
+    assert not made[made.metric == "success_rate"]["mean"].isna().any()
+
+
+@pytest.mark.parametrize(
+    ("axis", "values", "condition", "said"),
+    [
+        ("tau", (0.7,), "5g", "unknown condition"),
+        ("tau", (0.7,), "single-local", "has no channel"),
+        ("size", (9,), "6g", "9 vehicles; the run's scenes have"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    source: Stored, axis: str, values: tuple[float, ...], condition: str, said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        settings([source], AXES[axis], values, condition)
