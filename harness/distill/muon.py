@@ -2,7 +2,7 @@
 
 After Jordan et al., "Muon: an optimizer for hidden layers in neural networks" (2024), with the step size of
 Liu et al., "Muon is scalable for LLM training" (2025). PyTorch's own computes in bfloat16, which
-a CPU without such arithmetic emulates: there it took 41 % of a training step.
+a CPU without such arithmetic emulates: much of a training step goes there.
 """
 
 from collections.abc import Callable, Iterable
