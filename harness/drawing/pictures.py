@@ -1,5 +1,6 @@
 """What pictures share: the look, colours that the colour-blind can tell apart, the same bytes every time."""
 
+import base64
 import io
 import warnings
 from pathlib import Path
@@ -27,6 +28,8 @@ BLUE, SKY, GREEN, ORANGE, VERMILLION, PURPLE = (
     "#CC79A7",
 )
 INK, GREY, PALE = "#222222", "#777777", "#DDDDDD"
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)  # of series, in their order
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -77,3 +80,8 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
         write_whole(out, data.getvalue())
     else:
         out.write(data.getvalue())
+
+
+def uri(svg: bytes) -> str:
+    """A picture as what an `img` of a page that stands alone takes."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()

@@ -6,26 +6,12 @@ from collections.abc import Mapping
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from harness.drawing.pictures import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PALE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    save,
-    styled,
-)
+from harness.drawing.pictures import BLUE, COLOURS, GREY, INK, MARKERS, ORANGE, PALE, save, styled
 from harness.errors import printable
 from harness.report.words import LATENCY, SUCCESS
 from harness.run.folder import Run, Score
 
 REACTION_MS = (150.0, 250.0)  # the paper's reaction window in an urban intersection
-COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 VERDICTS = {"strict": (BLUE, ""), "recovered": (ORANGE, "////"), "failed": ("white", "xxxx")}
 
 

@@ -4,7 +4,6 @@ Whatever a model, a prompt or a file name says is text: templates escape everyth
 nothing or turn the line around are spelt out, and the page's own policy forbids scripts and requests.
 """
 
-import base64
 import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +16,7 @@ from markupsafe import Markup
 from harness import prompts as versions
 from harness import readout
 from harness.dataset.load import Scene
+from harness.drawing.pictures import uri
 from harness.drawing.scene import draw
 from harness.errors import UserError, printable
 from harness.files import write_whole
@@ -100,9 +100,9 @@ def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -
         points=_table(run.config["conditions"]),
         metrics=_metrics(run, run.conditions),
         answers=_metrics(run, ["all"]),
-        chart=chart and _uri(chart),
+        chart=chart and uri(chart),
         statuses=_count(run.rows, "status"),
-        verdicts=_uri(figures.verdicts(by_verdict)),
+        verdicts=uri(figures.verdicts(by_verdict)),
         decisions=decisions,
     )  # fmt: skip
 
@@ -128,10 +128,6 @@ def visible(value: Any) -> Any:
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
-
-
-def _uri(svg: bytes) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -173,7 +169,7 @@ def _decision(chosen: Pick, scene: Scene, run: Run, prompts: Prompts | None) -> 
     return {
         "scene": scene,
         "why": chosen.why,
-        "picture": _uri(picture.getvalue()),
+        "picture": uri(picture.getvalue()),
         "outcomes": outcomes,
         "avoidable": any(row["safe"]),
         "choices": [{**d, "bars": _bars(actions, d["fused"])} for d in decisions_of(row)],

@@ -28,7 +28,6 @@ from harness.run.scoring import Scored, score
 VERSION = "1"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 ACTIONS = 3
-MOST_VEHICLES = 16
 CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
@@ -39,7 +38,7 @@ PAYLOAD_BITS = 800.0  # declared: an intent, a position and a few words
 
 @dataclass(frozen=True)
 class Parameters:
-    """All that is fitted, by `harness/study/fit.py`; nothing of it knows a panel or a grid point.
+    """All that is fitted (`harness/study/fit.py`); nothing of it knows a panel or a grid point.
 
     Attributes:
         left_share: share of episodes whose danger comes from the approach that the nearest helper watches.
@@ -107,11 +106,9 @@ class Calibrated:
 
     Attributes:
         name: what reports call it.
-        vehicles: most vehicles it can play, the ego included.
     """
 
     name = "calibrated proxy"
-    vehicles = MOST_VEHICLES
 
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()

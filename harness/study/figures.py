@@ -6,27 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
-from harness.drawing.pictures import (
-    BLUE,
-    FORMATS,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PALE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    save,
-    styled,
-)  # fmt: skip
+from harness.drawing.pictures import COLOURS, FORMATS, GREY, INK, MARKERS, PALE, save, styled
 from harness.study.axes import AXES
 
 if TYPE_CHECKING:
     import pandas as pd
 
-COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
 BEST_BAND = (0.65, 0.70)  # the paper's
 
@@ -106,22 +91,21 @@ def _along(axes: Any, panel: "pd.DataFrame", best_band: bool) -> None:
         mine = panel[(panel.source == source) & (panel.condition == condition)]
         name = condition if len(set(panel.source)) == 1 else f"{source}, {condition}"
         x = list(dict.fromkeys(mine.value))
+        marker = MARKERS[n % len(MARKERS)]
         for where, what, style in ((axes, "success_rate", "-"), (second, metric, ":")):
             if where is None:
                 continue
             at = mine[(mine.metric == what) & (mine.interval == _interval(mine))]
             mean, low, high = (100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high"))
             shown = f"success, {name}" if where is axes else f"{label}, {name}"
+            colour = COLOURS[n % len(COLOURS)] if where is axes else GREY
             if named:
                 where.errorbar(
                     [i + 0.12 * n for i in range(len(x))], mean, yerr=[mean - low, high - mean], capsize=2,
-                    linestyle="none", marker=MARKERS[n % 7], color=COLOURS[n % 7], markersize=4, label=shown,
+                    linestyle="none", marker=marker, color=colour, markersize=4, label=shown,
                 )  # fmt: skip
                 continue
-            colour = COLOURS[n % 7] if where is axes else GREY
-            where.plot(
-                x, mean, style, color=colour, marker=MARKERS[n % 7], markersize=3, linewidth=1.2, label=shown
-            )
+            where.plot(x, mean, style, color=colour, marker=marker, markersize=3, linewidth=1.2, label=shown)
             where.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
         if named:
             axes.set_xticks(range(len(x)), x, rotation=30, ha="right", fontsize=7)
@@ -170,9 +154,7 @@ def _lettered(drawn: Any, letters: str) -> None:
         axes.set_title(f"({letter})", loc="left", fontsize=8)
 
 
-def save_all(figure: Figure, stem: Path) -> list[Path]:
+def save_all(figure: Figure, stem: Path) -> None:
     """Write a figure in every format, each whole or not at all."""
-    files = [stem.with_name(f"{stem.name}.{kind}") for kind in FORMATS]
-    for file, kind in zip(files, FORMATS, strict=True):
-        save(figure, file, kind, dpi=300)
-    return files
+    for kind in FORMATS:
+        save(figure, stem.with_name(f"{stem.name}.{kind}"), kind, dpi=300)

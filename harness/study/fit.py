@@ -2,8 +2,9 @@
 
     python -m harness.study.fit
 
-Its mechanism can be solved for each parameter. A witness is heard with probability (1 - l)^2, so that success
-is guess + share x (know - guess) x (1 - l)^2, where `share` is the part of the dangers that helpers watch.
+Its mechanism can be solved for all but the helpers' entropies, which are set by hand. A witness is heard with
+probability (1 - l)^2, so that success is guess + share x (know - guess) x (1 - l)^2, where `share` is the
+part of the dangers that helpers watch.
 """
 
 import numpy as np

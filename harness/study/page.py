@@ -1,12 +1,13 @@
 """The page of the paper's study: figures, every number, what was fitted."""
 
-import base64
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from harness.drawing.pictures import uri
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,8 +23,7 @@ def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> s
     rows = [shown(row) for row in ledger.itertuples()]
     totals = tally(ledger)
     pictures = {
-        key: base64.b64encode((folder / f"{key.replace('_', '-')}.svg").read_bytes()).decode()
-        for key in ("figure_a", "figure_b")
+        key: uri((folder / f"{key.replace('_', '-')}.svg").read_bytes()) for key in ("figure_a", "figure_b")
     }
     misses = [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["misses"]]
     return environment.get_template("paper.html.j2").render(

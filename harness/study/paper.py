@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from harness.operating_point import POINTS
+from harness.operating_point import POINTS, OperatingPoint
 from harness.study.axes import AXES, Value, grid
 from harness.study.play import Setting
 
@@ -42,6 +42,6 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     ]  # fmt: skip
 
 
-def _along(name: str, point: object, values: Sequence[Value]) -> Iterator[Setting]:
+def _along(name: str, point: OperatingPoint, values: Sequence[Value]) -> Iterator[Setting]:
     for value in values:
-        yield Setting("6g", AXES[name].at(point, value), VEHICLES, name, value)  # type: ignore[arg-type]
+        yield Setting("6g", AXES[name].at(point, value), VEHICLES, name, value)

@@ -30,17 +30,11 @@ class Source(Protocol):
 
     Attributes:
         name: what figures call it.
-        vehicles: most vehicles it can play, the ego included.
     """
 
     @property
     def name(self) -> str:
         """What figures call it."""
-        ...
-
-    @property
-    def vehicles(self) -> int:
-        """Most vehicles, the ego included."""
         ...
 
     def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
