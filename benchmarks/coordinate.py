@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination import Luck, coordinate
+from harness.coordination import coordinate
+from harness.exchange import Luck
 from harness.operating_point import POINTS
 
 AIM_S = 1.0

@@ -96,7 +96,7 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 def rate_interval(outcomes_by_episode: Floats, level: float = 0.95) -> Estimate:
     """Share of ones among 0/1 outcomes `(E,)` with Wilson's score interval (Wilson 1927)."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     outcomes = outcomes_by_episode[~np.isnan(outcomes_by_episode)]
     n = len(outcomes)
@@ -104,7 +104,7 @@ def rate_interval(outcomes_by_episode: Floats, level: float = 0.95) -> Estimate:
     if n == 0:
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
     rate = float(np.mean(outcomes))
-    z = float(norm.ppf(0.5 + level / 2))
+    z = float(ndtri(0.5 + level / 2))
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     # At 0 and 1 the end is the rate itself; only rounding says otherwise.
@@ -125,7 +125,7 @@ def paired_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
 
 
 def _student(values: Floats, level: float) -> Estimate:
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     known = values[~np.isnan(values)]
     n = len(known)
@@ -133,5 +133,5 @@ def _student(values: Floats, level: float) -> Estimate:
     if n < 2:
         return Estimate(float(known[0]) if n else math.nan, math.nan, math.nan, n, n_excluded)
     mean = float(np.mean(known))
-    half = float(t.ppf(0.5 + level / 2, n - 1) * np.std(known, ddof=1) / math.sqrt(n))
+    half = float(stdtrit(n - 1, 0.5 + level / 2) * np.std(known, ddof=1) / math.sqrt(n))
     return Estimate(mean, mean - half, mean + half, n, n_excluded)

@@ -33,6 +33,7 @@ class OperatingPoint:
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
         roadside_edge: replies travel over a roadside edge node as well (`channel.link_up`).
+        on_demand: a helper infers when it is asked, and not in parallel with the ego.
     """
 
     name: str
@@ -49,6 +50,7 @@ class OperatingPoint:
     density_coupled: bool = False
     helper_rounds: bool = False
     roadside_edge: bool = False
+    on_demand: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -69,7 +71,7 @@ class OperatingPoint:
             self._number("latency_s", "seconds, 0 or more", zero=True)
         if type(self.max_helpers) is not int or self.max_helpers < 0:
             raise self._wrong("max_helpers", "a whole number, 0 or more")
-        for flag in ("density_coupled", "helper_rounds", "roadside_edge"):
+        for flag in ("density_coupled", "helper_rounds", "roadside_edge", "on_demand"):
             if type(getattr(self, flag)) is not bool:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:

@@ -10,7 +10,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from harness.coordination import Coordination, Luck, coordinate
+from harness.coordination import Coordination, coordinate
+from harness.exchange import Luck
 from harness.operating_point import POINTS, OperatingPoint
 
 DOUBT = (0.3, 0.4, 0.3)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination import Coordination, Luck, coordinate
+from harness.coordination import Coordination, coordinate
+from harness.exchange import Luck
 from harness.operating_point import POINTS, OperatingPoint
 
 COOPERATIVE = [POINTS["v2x"], POINTS["6g"], replace(POINTS["6g"], density_coupled=True)]

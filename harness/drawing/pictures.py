@@ -65,17 +65,16 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
     with warnings.catch_warnings():
         # A name in a script that the measuring font lacks is still text in the SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        # `savefig` would draw everything twice, the first time to find what sticks out, which is not asked.
         if format == "svg":
-            FigureCanvasSVG(figure)
-            figure.savefig(data, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+            nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+            FigureCanvasSVG(figure).print_svg(data, metadata=nothing)  # type: ignore[no-untyped-call]
         elif format == "pdf":
-            FigureCanvasPdf(figure)
-            figure.savefig(
-                data, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None}
-            )
+            nothing = dict.fromkeys(("CreationDate", "Producer", "Creator"))
+            FigureCanvasPdf(figure).print_pdf(data, metadata=nothing)  # type: ignore[no-untyped-call]
         else:
-            FigureCanvasAgg(figure)
-            figure.savefig(data, format="png", dpi=dpi, metadata={"Software": None})
+            figure.set_dpi(dpi)
+            FigureCanvasAgg(figure).print_png(data, metadata={"Software": None})  # type: ignore[no-untyped-call]
     if isinstance(out, Path):
         write_whole(out, data.getvalue())
     else:

@@ -7,9 +7,9 @@ import numpy as np
 
 from harness import luck
 from harness.arrays import Bools, Floats
-from harness.coordination import Coordination, Luck, coordinate
+from harness.coordination import Coordination, Merge, coordinate
+from harness.exchange import Luck
 from harness.frozen import Table, Verdict, judge_choices
-from harness.metrics import brier, negative_log_likelihood, safe_target
 from harness.operating_point import OperatingPoint
 from harness.run.intents import Intents
 
@@ -25,8 +25,6 @@ class Scored:
         safe: (n,) whether the action taken is safe.
         delay_s: (n,) its delay.
         verdict: what became of the episodes; arrays (E,).
-        brier: (n,) of the fused policy against the safe actions.
-        nll: (n,) of the fused policy.
     """
 
     point: OperatingPoint
@@ -35,8 +33,6 @@ class Scored:
     safe: Bools
     delay_s: Floats
     verdict: Verdict
-    brier: Floats
-    nll: Floats
 
 
 def score(
@@ -46,24 +42,27 @@ def score(
     point: OperatingPoint,
     seed: int,
     drawn: Luck,
+    merge: Merge | None = None,
 ) -> Scored:
     """Coordinate every decision at one operating point with one seed's luck, and look up what comes of it.
 
     `inference_s` is (n, 1+H), the ego first. Where the ego's is unknown (NaN), so is the decision's latency.
-    `drawn` is the luck of that seed, for every point the same.
+    `drawn` is the luck of that seed, for every point the same. `merge` is the ego's second answers, if the
+    point needs them.
     """
     result = coordinate(
         point, known.own, known.helpers, known.valid, known.distance_m, known.range_m,
-        known.payload_bits, np.nan_to_num(inference_s), drawn,
+        known.payload_bits, np.nan_to_num(inference_s), drawn, merge,
     )  # fmt: skip
     result = replace(result, latency_s=np.where(np.isnan(inference_s[:, 0]), np.nan, result.latency_s))
-    rows = np.arange(len(result.action))
-    safe, delay_s = laid.safe[rows, result.action], laid.delay_s[rows, result.action]
-    verdict = judge_choices(laid, result.action)
-    return Scored(
-        point, seed, result, safe, delay_s, verdict,
-        brier(result.fused, safe_target(laid.safe)), negative_log_likelihood(result.fused, laid.safe),
-    )  # fmt: skip
+    return outcome(laid, point, seed, result)
+
+
+def outcome(laid: Table, point: OperatingPoint, seed: int, made: Coordination) -> Scored:
+    """What comes of the actions taken."""
+    rows = np.arange(len(made.action))
+    safe, delay_s = laid.safe[rows, made.action], laid.delay_s[rows, made.action]
+    return Scored(point, seed, made, safe, delay_s, judge_choices(laid, made.action))
 
 
 def draw(laid: Table, seed: int, shape: tuple[int, ...]) -> Luck:

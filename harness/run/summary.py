@@ -7,7 +7,7 @@ Wilson for yes/no outcomes that no seed changes, else Student's t. Both are cond
 answers the model gave.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,16 @@ import numpy as np
 
 from harness.arrays import Floats
 from harness.frozen import Table
-from harness.metrics import Estimate, episode_interval, known_mean, rate_interval, seed_interval
+from harness.metrics import (
+    Estimate,
+    brier,
+    episode_interval,
+    known_mean,
+    negative_log_likelihood,
+    rate_interval,
+    safe_target,
+    seed_interval,
+)  # fmt: skip
 from harness.run.intents import Intents
 from harness.run.scoring import Scored, statuses
 from harness.run.spec import Spec
@@ -30,6 +39,35 @@ COLUMNS = (
 ALL = "all"  # stands for the condition where a figure does not depend on it
 BASELINE = "single-local"
 YES_OR_NO = ("success_rate", "unsafe_rate", "late_rate")  # what an episode has or has not
+PERCENTILES = (50, 95, 99)
+
+
+def _observed_loss(laid: Table, r: Scored) -> Any:
+    c = r.coordination
+    return np.where(c.messages > 0, c.lost / np.maximum(c.messages, 1), np.nan)
+
+
+PER_EPISODE: dict[str, Callable[[Table, Scored], Any]] = {  # values (E,)
+    "success_rate": lambda laid, r: r.verdict.success,
+    "unsafe_rate": lambda laid, r: r.verdict.unsafe,
+    "late_rate": lambda laid, r: r.verdict.late,
+    "messages_per_episode": lambda laid, r: laid.by_episode(r.coordination.messages, fill=0).sum(axis=1),
+}
+PER_DECISION: dict[str, Callable[[Table, Scored], Any]] = {  # values (n,), of which an episode has the mean
+    "latency_proxy_ms": lambda laid, r: r.coordination.latency_s * 1000,
+    "deadline_miss_rate": lambda laid, r: np.where(
+        np.isnan(r.coordination.latency_s), np.nan, r.coordination.deadline_missed
+    ),
+    "trigger_rate": lambda laid, r: r.coordination.triggered,
+    "effective_loss": lambda laid, r: np.where(r.coordination.triggered, r.coordination.loss, np.nan),
+    "observed_reply_loss": _observed_loss,
+    "entropy_nats": lambda laid, r: r.coordination.entropy_nats,
+    "normalised_entropy": lambda laid, r: r.coordination.normalised_entropy,
+    "brier": lambda laid, r: brier(r.coordination.fused, safe_target(laid.safe)),
+    "negative_log_likelihood": lambda laid, r: negative_log_likelihood(r.coordination.fused, laid.safe),
+    "fallback_rate": lambda laid, r: r.coordination.own_failed,
+}
+METRICS = (*PER_EPISODE, *PER_DECISION)
 
 
 def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> "pd.DataFrame":
@@ -59,6 +97,7 @@ def _estimates(
         for name, values in metrics.items():  # (seeds, episodes)
             yield point.name, name, over_seeds(name, values), "seed means"
             yield point.name, name, over_episodes(name, values), "episodes"
+        yield from ((point.name, *found) for found in latency_percentiles(mine))
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
     if BASELINE in by_condition:
@@ -80,31 +119,25 @@ def _estimates(
                 yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"
 
 
-def by_episode(laid: Table, r: Scored) -> dict[str, Floats]:
-    """Each metric by episode, (E,): a share or a mean over its decisions."""
-    c = r.coordination
+def by_episode(laid: Table, r: Scored, names: Iterable[str] = METRICS) -> dict[str, Floats]:
+    """Metrics by episode, (E,): a share or a mean over its decisions."""
 
-    def mean(values: Any) -> Floats:
-        return known_mean(laid.by_episode(np.asarray(values, dtype=float)), axis=1)
+    def values(name: str) -> Floats:
+        if name in PER_EPISODE:
+            return np.asarray(PER_EPISODE[name](laid, r), dtype=float)
+        return known_mean(laid.by_episode(np.asarray(PER_DECISION[name](laid, r), dtype=float)), axis=1)
 
-    with np.errstate(invalid="ignore", divide="ignore"):
-        observed = np.where(c.messages > 0, c.lost / c.messages, np.nan)
-    return {
-        "success_rate": r.verdict.success.astype(float),
-        "unsafe_rate": r.verdict.unsafe.astype(float),
-        "late_rate": r.verdict.late.astype(float),
-        "latency_proxy_ms": mean(c.latency_s * 1000),
-        "deadline_miss_rate": mean(np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed)),
-        "trigger_rate": mean(c.triggered),
-        "messages_per_episode": mean(c.messages) * (laid.index >= 0).sum(axis=1),
-        "effective_loss": mean(np.where(c.triggered, c.loss, np.nan)),
-        "observed_reply_loss": mean(observed),
-        "entropy_nats": mean(c.entropy_nats),
-        "normalised_entropy": mean(c.normalised_entropy),
-        "brier": mean(r.brier),
-        "negative_log_likelihood": mean(r.nll),
-        "fallback_rate": mean(c.own_failed),
-    }
+    return {name: values(name) for name in names}
+
+
+def latency_percentiles(runs: Sequence[Scored]) -> Iterator[tuple[str, Estimate, str]]:
+    """Percentiles over all decisions of a seed, for each of `PERCENTILES`, with an interval over seeds."""
+    latency_ms = np.stack([r.coordination.latency_s for r in runs]) * 1000  # (seeds, decisions)
+    known = ~np.isnan(latency_ms).all(axis=1)
+    for percent in PERCENTILES:
+        each = np.full(len(latency_ms), np.nan)
+        each[known] = np.nanpercentile(latency_ms[known], percent, axis=1)
+        yield f"latency_p{percent}_ms", over_seeds("latency", each[:, None]), "seed means"
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:

@@ -19,11 +19,12 @@ import numpy as np
 
 from harness import luck
 from harness.arrays import Bools, Floats, Ints
-from harness.coordination import Luck, coordinate
+from harness.coordination import fuse
+from harness.exchange import Luck, exchange
 from harness.frozen import Table
 from harness.operating_point import OperatingPoint
 from harness.run.intents import Intents
-from harness.run.scoring import Scored, score
+from harness.run.scoring import Scored, outcome
 
 VERSION = "1"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
@@ -133,16 +134,23 @@ class Calibrated:
         """
         drawn = self._draw(seed, vehicles - 1)
         known, infer_s = drawn.known, np.full(drawn.known.distance_m.shape, self.parameters.inference_s)
-        if point.profile is not None and vehicles > 1:
-            first = coordinate(
-                point, known.own, known.helpers, known.valid, known.distance_m, known.range_m,
-                known.payload_bits, infer_s, drawn.links,
-            )  # fmt: skip
-            # Who asks and who is heard depends on entropies, which knowing does not change.
-            heard = np.any(first.on_time & drawn.witness, axis=1).reshape(self.episodes, STEPS)
-            before = np.insert(np.logical_or.accumulate(heard, axis=1)[:, :-1], 0, False, axis=1)
-            known = replace(known, own=np.where(before.reshape(-1, 1), drawn.told, known.own))
-        return drawn.laid, score(drawn.laid, known, infer_s, point, seed, drawn.links)
+        heard = exchange(
+            point,
+            known.own,
+            known.helpers,
+            known.valid,
+            known.range_m,
+            known.payload_bits,
+            infer_s,
+            drawn.links,
+        )
+        # Who asks and who is heard depends on entropies, which knowing does not change.
+        told = np.any(heard.on_time & drawn.witness, axis=1).reshape(self.episodes, STEPS)
+        knew = np.insert(np.logical_or.accumulate(told, axis=1)[:, :-1], 0, False, axis=1).reshape(-1, 1)
+        heard = replace(heard, own=np.where(knew, drawn.told, heard.own))
+        return drawn.laid, outcome(
+            drawn.laid, point, seed, fuse(point, heard, known.helpers, known.distance_m)
+        )
 
     def _drawn(self, seed: int, helpers: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""

@@ -156,5 +156,8 @@ def _lettered(drawn: Any, letters: str) -> None:
 
 def save_all(figure: Figure, stem: Path) -> None:
     """Write a figure in every format, each whole or not at all."""
+    # Where things go is found once and not for every format: it is half of the work.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     for kind in FORMATS:
         save(figure, stem.with_name(f"{stem.name}.{kind}"), kind, dpi=300)

@@ -11,7 +11,7 @@ from harness.frozen import Table
 from harness.metrics import Estimate
 from harness.operating_point import OperatingPoint
 from harness.run.scoring import Scored
-from harness.run.summary import by_episode, over_episodes, over_seeds
+from harness.run.summary import by_episode, latency_percentiles, over_episodes, over_seeds
 from harness.study.axes import Value
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ METRICS = (
     "success_rate", "unsafe_rate", "late_rate", "latency_proxy_ms", "deadline_miss_rate", "trigger_rate",
     "messages_per_episode", "effective_loss", "observed_reply_loss",
 )  # fmt: skip
-PERCENTILES = (50, 95, 99)
 PLACE = ("source", "panel", "condition", "variable", "value")
 
 
@@ -96,7 +95,7 @@ def play(
             source.name, panel, setting.condition, setting.variable, setting.value,
         ), strict=True))  # fmt: skip
         scored = [source.scored(setting.point, setting.vehicles, seed) for seed in seeds]
-        per_seed = [by_episode(laid, made) for laid, made in scored]
+        per_seed = [by_episode(laid, made, METRICS) for laid, made in scored]
         metrics = {name: np.stack([m[name] for m in per_seed]) for name in METRICS}
         rows += [
             {**place, "metric": metric, "mean": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n,
@@ -123,7 +122,4 @@ def _estimates(
         yield name, over_seeds(name, values), "seed means"
         if same:
             yield name, over_episodes(name, values), "episodes"
-    latency_ms = np.stack([made.coordination.latency_s for _, made in scored]) * 1000  # (seeds, decisions)
-    for percent in PERCENTILES:
-        each = np.nanpercentile(latency_ms, percent, axis=1)
-        yield f"latency_p{percent}_ms", over_seeds("latency", each[:, None]), "seed means"
+    yield from latency_percentiles([made for _, made in scored])

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from harness.arrays import Bools
-from harness.coordination import Luck, nearest
 from harness.errors import UserError, printable
+from harness.exchange import Luck, nearest
 from harness.frozen import Table, table
 from harness.operating_point import OperatingPoint
 from harness.run.folder import Run, dataset_of, read

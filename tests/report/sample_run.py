@@ -8,7 +8,8 @@ from dataclasses import asdict
 import numpy as np
 
 from harness import luck
-from harness.coordination import Luck, coordinate
+from harness.coordination import coordinate
+from harness.exchange import Luck
 from harness.metrics import episode_interval, rate_interval, seed_interval
 from harness.operating_point import POINTS
 
