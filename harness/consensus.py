@@ -1,6 +1,7 @@
 """How intents become one policy. Vehicle 0 is the ego and is always heard.
 
-A new rule is one function of (p, weights) and one entry in `RULES`.
+A new rule is one function of (p, weights) and one entry in `RULES`. `ego-prompt` is no rule: the ego's model
+is asked again, with the messages in its prompt (the paper's section III-C).
 """
 
 from collections.abc import Callable
@@ -101,3 +102,5 @@ RULES: dict[str, Callable[[Floats, Floats], Floats]] = {
     "median": median,
     "trimmed-mean": trimmed_mean,
 }
+EGO_PROMPT = "ego-prompt"
+NAMES = (*RULES, EGO_PROMPT)

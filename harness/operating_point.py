@@ -2,11 +2,11 @@
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from harness.channel import PROFILES
-from harness.consensus import RULES
+from harness.consensus import EGO_PROMPT, NAMES
 from harness.errors import UserError, printable, unknown
 
 FALLBACKS = ("uniform", "brake")
@@ -27,7 +27,7 @@ class OperatingPoint:
         min_distance_m: lower bound of d in the paper's Eq. 2.
         fallback: what a failed ego answer becomes: `uniform`, all actions alike, or `brake`, all mass on
             the first action, which is the most conservative one.
-        consensus: consensus rule.
+        consensus: consensus rule, or `ego-prompt`.
         loss: probability that one crossing is lost, in place of the profile's; None keeps the profile's.
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
@@ -59,8 +59,8 @@ class OperatingPoint:
             raise unknown("channel profile", str(self.profile), PROFILES, "; leave it out to disable V2V")
         if self.fallback not in FALLBACKS:
             raise unknown("fallback", str(self.fallback), FALLBACKS)
-        if str(self.consensus) not in RULES:
-            raise unknown("consensus rule", str(self.consensus), RULES)
+        if str(self.consensus) not in NAMES:
+            raise unknown("consensus", str(self.consensus), NAMES)
         self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
         self._number("window_s", "seconds above 0")
         self._number("radius_m", "metres above 0")
@@ -91,6 +91,11 @@ class OperatingPoint:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
+    @property
+    def asks_again(self) -> bool:
+        """Whether the ego's model merges the messages, and so is asked a second time."""
+        return self.profile is not None and self.consensus == EGO_PROMPT
+
     def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
         value = getattr(self, key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
@@ -115,8 +120,35 @@ POINTS = {
 }
 
 
-def named_point(name: str) -> OperatingPoint:
-    """One of the paper's operating points. Raises UserError if there is none of that name."""
+def named_point(text: str) -> OperatingPoint:
+    """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
+
+    The text is its name. Raises UserError if there is no such point or setting, or a value is not allowed.
+    """
+    name, colon, settings = text.partition(":")
     if name not in POINTS:
         raise unknown("operating point", name, POINTS)
-    return POINTS[name]
+    changed: dict[str, Any] = {}
+    for setting in settings.split(",") if colon else ():
+        key, _, value = setting.partition("=")
+        if key not in SETTINGS:
+            raise unknown(f"setting of operating point {name}", key, SETTINGS, f"; as in {name}:window_s=0.3")
+        if key in changed:
+            raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
+        changed[key] = _value(getattr(POINTS[name], key), value)
+    return replace(POINTS[name], name=text, **changed) if changed else POINTS[name]
+
+
+SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
+
+
+def _value(usual: object, text: str) -> object:
+    """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
+    if isinstance(usual, bool):
+        return {"true": True, "false": False}.get(text, text)
+    if isinstance(usual, str):
+        return text
+    try:
+        return int(text) if isinstance(usual, int) else float(text)
+    except ValueError:
+        return text

@@ -13,7 +13,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.dataset.load import Dataset
 from harness.frozen import Table, table
 from harness.operating_point import POINTS, OperatingPoint
-from harness.run.asking import ask_all
+from harness.run.asking import ask_all, requests
 from harness.run.evaluate import Evaluated, evaluate
 from harness.run.intents import Intents, intents
 from harness.run.scoring import Scored, draw, score
@@ -82,7 +82,9 @@ def sure(action: str, role: str = "ego") -> str:
 
 def ask(spec: Spec, backend: Backend, folder: Path) -> Intents:
     """Every answer asked for and read."""
-    by_id = ask_all(spec, backend, folder / "answers.jsonl", lambda done: None)
+    by_id = ask_all(
+        spec, backend, requests(spec, spec.dataset.scenes), folder / "answers.jsonl", lambda done: None
+    )
     return intents(spec.dataset, by_id, spec.answer, spec.thinking)
 
 

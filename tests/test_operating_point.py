@@ -43,7 +43,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ({"profile": "v2v"}, "unknown channel profile 'v2v'; did you mean 'v2x'? known: 6g, v2x"),
         ({"profile": ["v2x"]}, "unknown channel profile"),
         ({"fallback": "break"}, "unknown fallback 'break'; did you mean 'brake'?"),
-        ({"consensus": "log"}, "unknown consensus rule 'log'"),
+        ({"consensus": "log"}, "unknown consensus 'log'"),
         ({"tau_nats": -0.1}, "tau_nats is -0.1; it must be a finite number of nats, 0 or more"),
         ({"tau_nats": math.nan}, "tau_nats is nan"),
         ({"tau_nats": math.inf}, "tau_nats is inf"),

@@ -11,7 +11,7 @@ from harness.backends.registry import open_backend
 from harness.dataset.load import Dataset
 from harness.errors import UserError
 from harness.files import alone
-from harness.run.asking import ask_all, read_kept
+from harness.run.asking import ask_all, read_kept, requests
 from harness.run.evaluate import evaluate
 
 RESULT = {*FILES, "run.json"}
@@ -68,7 +68,13 @@ def unfinished(spec, out: Path, kept: bytes) -> Path:
 def answers(small: Dataset, tmp_path: Path) -> bytes:
     """All answers of a run, as they are kept while it goes on."""
     spec = spec_of(small)
-    ask_all(spec, open_backend(spec.card), tmp_path / "answers.jsonl", lambda done: None)
+    ask_all(
+        spec,
+        open_backend(spec.card),
+        requests(spec, spec.dataset.scenes),
+        tmp_path / "answers.jsonl",
+        lambda done: None,
+    )
     return (tmp_path / "answers.jsonl").read_bytes()
 
 
@@ -88,7 +94,9 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
     """Killed twice: the answers of the second try stand on lines of their own."""
     kept, spec = tmp_path / "answers.jsonl", spec_of(small)
     kept.write_bytes(answers[:5000])
-    again = ask_all(spec, open_backend(spec.card), kept, lambda done: None)
+    again = ask_all(
+        spec, open_backend(spec.card), requests(spec, spec.dataset.scenes), kept, lambda done: None
+    )
     assert read_kept(kept) == again
     assert len(again) == 4 * 24
 

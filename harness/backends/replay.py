@@ -34,7 +34,8 @@ def open(card: Card, **_: Any) -> "Replay":
             for number, text in enumerate(lines, 1):
                 line = f"rows.jsonl line {number}"
                 row = json.loads(text)
-                stored.update({f"{row['scene']}/{viewer}": a for viewer, a in row["answers"].items()})
+                answers = {**row["answers"], **row.get("merged", {})}
+                stored.update({f"{row['scene']}/{viewer}": a for viewer, a in answers.items()})
     except (ValueError, KeyError, TypeError, AttributeError):
         raise UserError(f"{shown}: {line} is not of a run; run it again") from None
     return Replay(run, manifest, stored)
@@ -63,6 +64,7 @@ class Replay:
         if answer is None:
             raise UserError(
                 f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
+                + (", whose conditions delivered the same messages" if "+" in request.id else "")
             )
         # Free and constrained answers have the same prompt. A run of an older version has no answer mode.
         if (mode := self.manifest.get("answer", "json")) != request.answer:

@@ -14,7 +14,7 @@ from harness.errors import UserError, printable
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
     from harness.run.evaluate import Evaluated
-    from harness.run.spec import Spec
+    from harness.run.spec import Latency, Spec
 
 MOST_SEEDS = 1000
 
@@ -26,7 +26,10 @@ def evaluate(
     engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
     dataset: str = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder."),
-    condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
+    condition: list[str] = typer.Option(
+        [],
+        help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all.",
+    ),
     seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
     limit: int | None = typer.Option(None, help="Only the dataset's first so many episodes."),
     thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
@@ -34,6 +37,10 @@ def evaluate(
     batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
     device: str | None = typer.Option(None, help="cpu or cuda."),
     dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
+    latency: str | None = typer.Option(
+        None,
+        help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's.",
+    ),
     out: Path | None = typer.Option(
         None, help="The run's folder. Default: reports/<model>-<prompt>-<dataset>."
     ),
@@ -63,6 +70,7 @@ def evaluate(
         batch_size=batch_size,
         device=device,
         dtype=dtype,
+        latency=cast("Latency | None", latency),
     )
     if dry_run:
         _dry_run(spec, tokenizer, as_json)
@@ -77,7 +85,8 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool) -
     from harness.run.evaluate import evaluate as evaluate_run
 
     with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
-        done = evaluate_run(spec, out, resume, progress, None if no_cache else default_file())
+        cache = None if no_cache else default_file()
+        done = evaluate_run(spec, out, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
     page = write(out, None, quiet=as_json)
@@ -142,7 +151,7 @@ def _table(done: "Evaluated") -> None:
     rows = done.summary[done.summary.interval != "seed means"]
     figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
     table = Table(box=None, width=80, pad_edge=False)
-    table.add_column("condition", no_wrap=True)
+    table.add_column("condition", overflow="fold")
     for heading in ("success % [95 % CI]", "gain, points", "latency", "trigger", "msgs"):
         table.add_column(heading, justify="right", no_wrap=True)
     for point in done.manifest["conditions"]:
@@ -178,7 +187,7 @@ def _table(done: "Evaluated") -> None:
         console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
     if m.get("engine_errors"):
         console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
-    for role in ("ego", "helper"):
+    for role in ("ego", "helper", "merge"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)

@@ -3,13 +3,26 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Called with how many are newly done; `more` is called with how many more turn out to be owed."""
+
+    advance: Callable[[int], None] = lambda done: None
+    more: Callable[[int], None] = lambda count: None
+
+    def __call__(self, done: int) -> None:
+        """So many are newly done."""
+        self.advance(done)
 
 
 @contextmanager
-def bar(label: str, total: int, quiet: bool = False) -> Iterator[Callable[[int], None]]:
-    """Yields a function to call with how many are newly done. Nothing is drawn where nobody watches."""
+def bar(label: str, total: int, quiet: bool = False) -> Iterator[Bar]:
+    """A bar to tell how many are done. Nothing is drawn where nobody watches."""
     if quiet or not sys.stderr.isatty():
-        yield lambda done: None
+        yield Bar()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -24,4 +37,11 @@ def bar(label: str, total: int, quiet: bool = False) -> Iterator[Callable[[int],
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(label, total=total)
-        yield lambda done: progress.advance(task, done)
+        owed = total
+
+        def more(count: int) -> None:
+            nonlocal owed
+            owed += count
+            progress.update(task, total=owed)
+
+        yield Bar(lambda done: progress.advance(task, done), more)

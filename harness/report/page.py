@@ -27,7 +27,8 @@ from harness.run.folder import Row, Run, dataset_of, read
 DECISIONS = 60
 TEMPLATES = Path(__file__).parent / "templates"
 
-Prompts = Callable[[Scene, str], Sequence[Mapping[str, str]]]
+Messages = Sequence[Mapping[str, Any]]
+Prompts = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
 
 
 def write_report(
@@ -41,8 +42,8 @@ def write_report(
     Args:
         run: the run's folder.
         out: file to replace; None for `report.html` in the run's folder.
-        prompts: gives the chat messages that a viewer was sent in a scene; None renders the run's own
-            prompt version, where it is here and unchanged.
+        prompts: gives the chat messages that a viewer was sent in a scene, with what it had heard; None
+            renders the run's own prompt version, where it is here and unchanged.
         progress: called with the number of decisions just drawn, `DECISIONS` at most in all.
 
     Returns:
@@ -68,8 +69,8 @@ def prompts_of(run: Run) -> Prompts | None:
     if prompt.sha256 != run.config["prompt"]["sha256"]:
         return None
 
-    def sent(scene: Scene, viewer: str) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions)
+    def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
+        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
         return readout.asked(messages, actions) if run.answer == "readout" else messages
 
     return sent
@@ -153,7 +154,7 @@ def _count(rows: Iterable[Row], key: str) -> dict[str, Counter[str]]:
     """How many answers have which `status` or `verdict`, by role."""
     counts: dict[str, Counter[str]] = {}
     for row in rows:
-        for answer in row["answers"].values():
+        for answer in (*row["answers"].values(), *row.get("merged", {}).values()):
             counts.setdefault(answer["role"], Counter())[answer[key]] += 1
     return counts
 
@@ -178,11 +179,17 @@ def _decision(chosen: Pick, scene: Scene, run: Run, prompts: Prompts | None) -> 
                 **answer,
                 "viewer": viewer,
                 "bars": _bars(actions, answer.get("intent")),
-                "prompt": prompts(scene, viewer) if prompts else None,
+                "prompt": prompts(scene, viewer.partition("+")[0], _heard(row, viewer)) if prompts else None,
             }
-            for viewer, answer in row["answers"].items()
+            for viewer, answer in (*row["answers"].items(), *row.get("merged", {}).items())
         ],
     }
+
+
+def _heard(row: Row, viewer: str) -> Messages:
+    """What an ego that answered a second time had heard, from its key in `merged`: itself and the senders."""
+    said = {sender: row["answers"][sender] for sender in viewer.split("+")[1:] if sender in row["answers"]}
+    return [{"sender": s, "intent": a["intent"], **(a["message"] or {})} for s, a in said.items()]
 
 
 def _bars(actions: Sequence[str], p: Sequence[float] | None) -> list[tuple[str, float]]:

@@ -13,13 +13,18 @@ MEANINGS = {
     "unsafe_rate": "episodes with a decision that leads to a collision or a forced failure",
     "late_rate": "episodes with all decisions safe, but delays beyond the allowance",
     "collision_rate": "episodes that end in a collision",
-    LATENCY: "start of the decision to the end of the whole exchange, inference included",
+    LATENCY: "start of the decision to the end of the whole exchange and of fusion, inference included",
+    "latency_p50_ms": "half of all decisions are as fast",
+    "latency_p95_ms": "95 % of all decisions are as fast",
+    "latency_p99_ms": "99 % of all decisions are as fast",
+    "fusion_ms": "part of it that fusion takes: 0 for a rule, which is arithmetic; ego-prompt infers again",
+    "merge_failed_rate": "second answers that could not be read; the ego kept its own intent",
     "trigger_rate": "decisions in which the ego asked",
     "messages_per_episode": "replies scheduled; the request is none",
     "message_count": "replies scheduled in the whole run; the request is none",
     "effective_loss": "probability that one crossing was lost",
     "observed_reply_loss": "scheduled replies that did not arrive; request and reply must both cross",
-    "deadline_miss_rate": "decisions whose exchange outlasted the decision window",
+    "deadline_miss_rate": "decisions that took longer than the decision window",
     "entropy_nats": "of the ego's own intent",
     "normalised_entropy": "of the ego's own intent; 1 is undecided",
     "brier": "of the fused policy against the safe actions; 0 best, 2 worst",
@@ -102,10 +107,11 @@ def latency_source(latency: Mapping[str, Any]) -> str:
     source = {
         "measured": "measured where it ran, one answer at a time",
         "card": "stated by the model card, not measured here",
-        "declared": "declared by whoever started the run, not measured",
+        "paper": "the paper's, not measured here",
     }.get(latency["source"], latency["source"])
     seconds = latency["inference_s"]
     by_role = dict(seconds) if isinstance(seconds, Mapping) else {"each vehicle": seconds}
+    by_role["ego with messages"] = latency.get("merge_s")
     known = [f"{role} {s * 1000:.0f} ms" for role, s in by_role.items() if s is not None]
     return f"{', '.join(known) or 'each answer has its own time'}; {source} ({latency['basis']})"
 

@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
@@ -57,12 +57,15 @@ def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], 
     return readout.asked(rendered, spec.dataset.actions) if spec.answer == "readout" else rendered
 
 
-def ask_all(spec: Spec, backend: Backend, kept: Path, progress: Callable[[int], None]) -> dict[str, Answer]:
+def ask_all(
+    spec: Spec, backend: Backend, asked: Iterable[Request], kept: Path, progress: Callable[[int], None]
+) -> dict[str, Answer]:
     """Ask what is still owed and keep each answer in a file at once.
 
     Args:
         spec: the evaluation.
         backend: who answers.
+        asked: the questions, in the same order whenever the run is taken up again.
         kept: JSON Lines file of answers so far; may be torn at its end by a kill.
         progress: called with the number of answers just had, those kept from before included.
 
@@ -73,7 +76,7 @@ def ask_all(spec: Spec, backend: Backend, kept: Path, progress: Callable[[int], 
     # Chunks begin at the same places in a resumed run, and a torn one is asked again whole: an engine may
     # answer with an eye on a request's company.
     size = spec.batch_size * math.ceil(CHUNK / spec.batch_size)
-    asked = requests(spec, spec.dataset.scenes)
+    asked = iter(asked)
     with kept.open("a", encoding="utf-8") as file:
         while chunk := list(islice(asked, size)):
             if any(request.id not in answers for request in chunk):

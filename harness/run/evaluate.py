@@ -2,27 +2,30 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.arrays import Floats
 from harness.backends.base import Rendering
 from harness.backends.cache import Cached
 from harness.backends.registry import open_backend
 from harness.errors import UserError, printable
+from harness.exchange import Luck
 from harness.files import alone, canonical_json, digest, write_whole
-from harness.frozen import table
+from harness.frozen import Table, table
 from harness.memory import uncollected
-from harness.run import record
-from harness.run.asking import Answer, ask_all
-from harness.run.intents import intents
+from harness.run import merging, record
+from harness.run.asking import Answer, ask_all, requests
+from harness.run.intents import Intents, intents
+from harness.run.merging import Merged
 from harness.run.scoring import draw, score
 from harness.run.spec import FORMAT, Spec, versions
 from harness.run.summary import summary
-from harness.run.timing import inference_s, measure, settled
+from harness.run.timing import inference_s, measure, merge_latency, merge_s, settled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,8 +43,23 @@ class Evaluated:
     summary: "pd.DataFrame"
 
 
+@dataclass(frozen=True)
+class Told:
+    """What the answers say, laid out to be scored: episodes, intents, seconds (n, 1+H), luck by seed."""
+
+    laid: Table
+    known: Intents
+    inference_s: Floats
+    lucks: Mapping[int, Luck]
+
+
 def evaluate(
-    spec: Spec, out: Path, resume: bool, progress: Callable[[int], None], cache: Path | None = None
+    spec: Spec,
+    out: Path,
+    resume: bool,
+    progress: Callable[[int], None],
+    cache: Path | None = None,
+    more: Callable[[int], None] = lambda count: None,
 ) -> Evaluated:
     """Evaluate a model with a prompt on a dataset and write the run's folder.
 
@@ -51,6 +69,7 @@ def evaluate(
         resume: go on with the run that a kill left there.
         progress: called with the number of answers just had, those kept from before included.
         cache: file of completions kept between runs, for language models; None to ask for every answer.
+        more: called with the number of second questions, once it is known how many there are.
 
     Raises:
         UserError: the folder holds something else, or the model cannot be had. Nothing is written then.
@@ -64,39 +83,55 @@ def evaluate(
         # Times are had from the backend itself: the cache answers in no time, which is nobody's.
         latency = measure(spec, backend, work / "latency.json")
         asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
-        by_id = ask_all(spec, asked, work / "answers.jsonl", progress)
+        kept = work / "answers.jsonl"
+        by_id = ask_all(spec, asked, requests(spec, spec.dataset.scenes), kept, progress)
         latency = settled(spec, backend, latency, by_id, work / "latency.json")
-        created = json.loads((work / CONFIG).read_text())["created"]
-        done = _scored(spec, out, by_id, {"created": created, "identity": identity, "latency": latency})
+        with uncollected():
+            told = _told(spec, by_id, latency)
+        codes = merging.delivered(told.known, told.inference_s, spec.points, told.lucks.values())
+        again = list(merging.requests(spec, told.known, codes))
+        more(len(again))
+        by_id = ask_all(spec, asked, again, kept, progress) if again else by_id
+        latency = merge_latency(spec, backend, latency, again, by_id, work / "latency.json")
+        answers = [by_id[request.id] for request in again]
+        second = merging.merged(spec, codes, answers, merge_s(latency, answers))
+        begun = json.loads((work / CONFIG).read_text())
+        done = _scored(spec, out, told, second, {
+            "created": begun["created"], "identity": identity, "latency": latency,
+            "cached_answers": sum(answer["cached"] for answer in by_id.values()),
+            "engine_errors": sum(answer["error"] is not None for answer in by_id.values()),
+        })  # fmt: skip
     _tidy(out)
     return done
 
 
+def _told(spec: Spec, by_id: Mapping[str, Answer], latency: Mapping[str, Any]) -> Told:
+    laid, known = table(spec.dataset), intents(spec.dataset, by_id, spec.answer, spec.thinking)
+    lucks = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
+    return Told(laid, known, inference_s(latency, known.answers), lucks)
+
+
 @uncollected()
-def _scored(spec: Spec, out: Path, by_id: dict[str, Answer], begun: dict[str, Any]) -> Evaluated:
-    """Score the answers and write the run's files; `begun` is what its manifest says of its beginning."""
-    known, laid = intents(spec.dataset, by_id, spec.answer, spec.thinking), table(spec.dataset)
-    seconds = inference_s(begun["latency"], known.answers)
-    drawn = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
+def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[str, Any]) -> Evaluated:
+    """Score the answers and write the run's files; `begun` is what its manifest says of its making."""
+    laid, known = told.laid, told.known
     runs = [
-        score(laid, known, seconds, point, seed, drawn[seed]) for point in spec.points for seed in spec.seeds
-    ]
-    result = summary(spec, laid, known, runs)
+        score(laid, known, told.inference_s, point, seed, told.lucks[seed], second)
+        for point in spec.points for seed in spec.seeds
+    ]  # fmt: skip
+    result = summary(spec, laid, known, runs, second)
     manifest = {
         "format": FORMAT,
         "name": out.name,
         "created": begun["created"],
         "command": spec.command(out),
         **spec.settings(),
-        "identity": begun["identity"],
-        "latency": begun["latency"],
-        "cached_answers": sum(answer["cached"] for answer in by_id.values()),
-        "engine_errors": sum(answer["error"] is not None for answer in by_id.values()),
+        **{key: begun[key] for key in ("identity", "latency", "cached_answers", "engine_errors")},
         "delay_allowance_s": laid.allowance_s,
         "versions": versions(),
     }
     manifest["dataset"]["path"] = str(spec.dataset.path)
-    write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs)))
+    write_whole(out / "rows.jsonl", "".join(record.rows(spec, laid, known, runs, second)))
     write_whole(out / "episodes.csv", record.episodes(spec, laid, runs).to_csv(index=False))
     write_whole(out / "summary.csv", result.to_csv(index=False))
     write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")

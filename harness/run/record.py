@@ -12,6 +12,7 @@ from harness.metrics import known_mean
 from harness.parse import Parsed
 from harness.run.asking import Answer
 from harness.run.intents import Intents
+from harness.run.merging import Merged, places_of, request_id
 from harness.run.scoring import Scored
 from harness.run.spec import Spec
 
@@ -19,8 +20,14 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def rows(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> Iterator[str]:
-    """Lines of `rows.jsonl`: a decision point, its answers, and what each condition and seed made of it."""
+def rows(
+    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
+) -> Iterator[str]:
+    """Lines of `rows.jsonl`: a decision point, its answers, and what each condition and seed made of it.
+
+    `merged` has the ego's second answers by whose messages it had, where there are any.
+    """
+    again = _second(spec, known, second) if second else {}
     scenes = spec.dataset.scenes
     helpers = [scene.viewers[1:] for scene in scenes]
     tables = [_decisions(run, helpers, spec.dataset.actions) for run in runs]
@@ -36,10 +43,22 @@ def rows(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> Ite
                 in enumerate(zip(scene.viewers, known.answers[i], known.parsed[i], strict=False))
                 if answer and parsed
             },
+            **({"merged": again[i]} if i in again else {}),
             "safe": laid.safe[i].tolist(),
             "delay_s": [_number(d) for d in laid.delay_s[i].tolist()],
             "decisions": made,
         }) + "\n"  # fmt: skip
+
+
+def _second(spec: Spec, known: Intents, second: Merged) -> dict[int, dict[str, Any]]:
+    """By scene."""
+    found: dict[int, dict[str, Any]] = {}
+    helpers = known.valid.shape[1]
+    for code, answer, parsed in zip(second.codes.tolist(), second.answers, second.parsed, strict=True):
+        i = code >> helpers
+        heard = request_id(spec.dataset.scenes[i], places_of(code, helpers)).partition("/")[2]
+        found.setdefault(i, {})[heard] = _answer(answer, parsed, "merge")
+    return found
 
 
 def _answer(answer: Answer, parsed: Parsed, role: str) -> dict[str, Any]:
@@ -76,7 +95,7 @@ def _decisions(
         messages = [
             {
                 "arrival_ms": _number(arrival_ms), "delivered": delivered, "from": viewer,
-                "on_time": on_time, "weight": weight,
+                "on_time": on_time, "weight": _number(weight),
             }
             for viewer, was_asked, delivered, on_time, arrival_ms, weight
             in zip(viewers, asked, *reply, weights[1:], strict=False) if was_asked
@@ -86,7 +105,7 @@ def _decisions(
             "action": actions[action], "condition": run.point.name,
             "deadline_missed": None if math.isnan(latency_ms) else missed, "delay_s": _number(delay_s),
             "entropy_nats": entropy, "fused": fused, "latency_ms": _number(latency_ms),
-            "messages": messages, "own_failed": failed, "own_weight": weights[0], "safe": safe,
+            "messages": messages, "own_failed": failed, "own_weight": _number(weights[0]), "safe": safe,
             "seed": run.seed, "triggered": triggered,
         }  # fmt: skip
 

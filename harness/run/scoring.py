@@ -12,6 +12,7 @@ from harness.exchange import Luck
 from harness.frozen import Table, Verdict, judge_choices
 from harness.operating_point import OperatingPoint
 from harness.run.intents import Intents
+from harness.run.merging import Merged
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,10 @@ def draw(laid: Table, seed: int, shape: tuple[int, ...]) -> Luck:
     return Luck(link, jitter)
 
 
-def statuses(known: Intents) -> Mapping[str, list[str]]:
-    """Parse verdicts by role, one an answer."""
-    ego: list[str] = [row[0].verdict for row in known.parsed if row[0]]
-    return {"ego": ego, "helper": [p.verdict for row in known.parsed for p in row[1:] if p]}
+def statuses(known: Intents, second: Merged | None = None) -> Mapping[str, list[str]]:
+    """Parse verdicts by role, one an answer; `merge` are the ego's second ones."""
+    return {
+        "ego": [row[0].verdict for row in known.parsed if row[0]],
+        "helper": [p.verdict for row in known.parsed for p in row[1:] if p],
+        "merge": [p.verdict for p in second.parsed] if second else [],
+    }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from harness import __version__
 from harness.backends.base import AnswerMode
@@ -17,6 +17,7 @@ from harness.operating_point import OperatingPoint
 from harness.prompts import Prompt
 
 FORMAT = "swarmdrive-run/1"
+Latency = Literal["card", "measured", "paper"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Spec:
         batch_size: most requests that go through the engine together.
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
+        latency: where inference times come from, or None for the card's choice.
     """
 
     card: Card
@@ -48,6 +50,7 @@ class Spec:
     batch_size: int = 8
     device: str | None = None
     dtype: str | None = None
+    latency: Latency | None = None
 
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
@@ -72,12 +75,37 @@ class Spec:
                 f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
                 "which only json leaves room for"
             )
+        self._check_latency()
+        for point in self.points:
+            if point.asks_again and (self.card.engine in ("proxy", "driver") or self.answer == "readout"):
+                raise UserError(
+                    f"condition {printable(point.name)}: "
+                    + ("a readout gives no messages to merge; use --answer json or constrained"
+                       if self.answer == "readout"
+                       else f"{printable(self.card.name)} is no language model and cannot merge messages")
+                )  # fmt: skip
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and self.card.engine not in WEIGHTED:
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
                     f"(engines {' and '.join(WEIGHTED)} have); leave it out"
                 )
+
+    def _check_latency(self) -> None:
+        shown, engine = f"--latency {printable(self.latency)}", self.card.engine
+        if self.latency is None:
+            return
+        if self.latency not in get_args(Latency):
+            raise unknown("--latency", self.latency, get_args(Latency))
+        if engine == "replay" and self.latency != "paper":
+            raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
+        if self.latency == "measured" and engine in ("proxy", "driver"):
+            raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
+        if self.latency == "card" and self.card.latency.inference_s is None:
+            raise UserError(
+                f"{shown}: the card of {printable(self.card.name)} declares no inference time; "
+                "use measured or paper, or add inference_s to the card"
+            )
 
     def settings(self) -> dict[str, Any]:
         """What a resumed run must have in common with the one it continues."""
@@ -96,6 +124,7 @@ class Spec:
             "answer": self.answer,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
+            "latency_source": self.latency,
         }  # fmt: skip
 
     def command(self, out: Path) -> str:
@@ -105,7 +134,8 @@ class Spec:
             ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size),
-            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype), ("--out", out),
+            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype),
+            ("--latency", self.latency), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])

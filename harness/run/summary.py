@@ -26,6 +26,7 @@ from harness.metrics import (
     seed_interval,
 )  # fmt: skip
 from harness.run.intents import Intents
+from harness.run.merging import Merged
 from harness.run.scoring import Scored, statuses
 from harness.run.spec import Spec
 
@@ -66,11 +67,17 @@ PER_DECISION: dict[str, Callable[[Table, Scored], Any]] = {  # values (n,), of w
     "brier": lambda laid, r: brier(r.coordination.fused, safe_target(laid.safe)),
     "negative_log_likelihood": lambda laid, r: negative_log_likelihood(r.coordination.fused, laid.safe),
     "fallback_rate": lambda laid, r: r.coordination.own_failed,
+    "fusion_ms": lambda laid, r: (r.coordination.latency_s - r.coordination.exchange_s) * 1000,
+    "merge_failed_rate": lambda laid, r: np.where(
+        r.coordination.on_time.any(axis=1) & r.point.asks_again, r.coordination.merge_failed, np.nan
+    ),
 }
 METRICS = (*PER_EPISODE, *PER_DECISION)
 
 
-def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> "pd.DataFrame":
+def summary(
+    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
+) -> "pd.DataFrame":
     """The long table of `summary.csv`."""
     import pandas as pd
 
@@ -80,13 +87,13 @@ def summary(spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]) -> 
             "condition": condition, "metric": metric, "value": e.value, "ci_low": e.low, "ci_high": e.high,
             "n": e.n, "n_excluded": e.n_excluded, "interval": interval,
         }
-        for condition, metric, e, interval in _estimates(spec, laid, known, runs)
+        for condition, metric, e, interval in _estimates(spec, laid, known, runs, second)
     ]  # fmt: skip
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def _estimates(
-    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored]
+    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
 ) -> Iterator[tuple[str, str, Estimate, str]]:
     by_condition: dict[str, dict[str, Floats]] = {}
     for point in spec.points:
@@ -106,14 +113,18 @@ def _estimates(
                 gain = metrics["success_rate"] - by_condition[BASELINE]["success_rate"]
                 yield name, f"success_gain_over_{BASELINE}", seed_interval(gain.mean(axis=1)), "seed means"
                 yield name, f"success_gain_over_{BASELINE}", episode_interval(gain.mean(axis=0)), "episodes"
-    for role, verdicts in statuses(known).items():
+    for role, verdicts in statuses(known, second).items():
         for verdict in ("strict", "recovered", "failed"):
             if verdicts:
                 hits = np.array([float(v == verdict) for v in verdicts])
                 yield ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers"
-    for role, column in (("ego", slice(0, 1)), ("helper", slice(1, None))):
+    given = {
+        "ego": [row[0] for row in known.answers], "helper": [a for row in known.answers for a in row[1:]],
+        "merge": second.answers if second else [],
+    }  # fmt: skip
+    for role, answers in given.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
-            counts = [a[what] for row in known.answers for a in row[column] if a and a[what] is not None]
+            counts = [a[what] for a in answers if a and a[what] is not None]
             if counts:
                 estimate = episode_interval(np.array(counts, dtype=float))
                 yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"

@@ -1,4 +1,4 @@
-"""Where a decision's inference time comes from: measured at batch 1, or declared by the model card."""
+"""Where a decision's inference time comes from: measured at batch 1, the model card, or the paper."""
 
 import json
 import statistics
@@ -16,6 +16,12 @@ from harness.files import canonical_json, write_whole
 from harness.run.asking import Answer, requests
 from harness.run.spec import Spec
 
+PAPER = {
+    "source": "paper",
+    "inference_s": {"ego": 0.145, "helper": 0.145},
+    "merge_s": 0.145,
+    "basis": "cited: SwarmDrive paper, single local 145.0 ms",
+}
 SAMPLE = 5  # scenes timed one request at a time where answers come in batches
 
 
@@ -23,14 +29,16 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
     """The latency a run will use, decided once and kept, so that a resumed run uses the same.
 
     Returns:
-        `source` (`card` or `measured`), `inference_s` by role (None where each answer's own time counts),
-        `basis`, and for a sample its `n` by role.
+        `source` (`card`, `measured` or `paper`), `inference_s` by role (None where each answer's own time
+        counts), `basis`, and for a sample its `n` by role. `merge_latency` adds `merge_s` where it is needed.
     """
+    if spec.latency == "paper":
+        return PAPER
     if isinstance(backend, Replay):  # whatever the decisions replayed were made with
         replayed: dict[str, Any] = backend.manifest["latency"]
         return replayed
     card = spec.card.latency
-    if card.source == "card":
+    if (spec.latency or card.source) == "card":
         return {
             "source": "card",
             "inference_s": dict.fromkeys(("ego", "helper"), card.inference_s),
@@ -70,6 +78,37 @@ def settled(
     latency = _timed(backend, list(requests(spec, _sample(spec.dataset.scenes))))
     write_whole(kept, canonical_json(latency))
     return latency
+
+
+def merge_latency(
+    spec: Spec, backend: Backend, latency: dict[str, Any], asked: Sequence[Request],
+    answers: Mapping[str, Answer], kept: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """The latency with `merge_s`, the seconds of the ego's second inference; None for each answer's own.
+
+    Declared like any other inference, or timed on a sample of the second questions `asked`, as the first ones
+    are.
+    """
+    if not asked or "merge_s" in latency:
+        return latency
+    if latency["source"] == "card":
+        return {**latency, "merge_s": latency["inference_s"]["ego"]}
+    if latency["inference_s"] is None and any(answers[r.id]["seconds"] is not None for r in asked):
+        return {**latency, "merge_s": None}
+    timed = _timed(backend, asked[:: max(1, len(asked) // SAMPLE)][:SAMPLE])
+    found = {**latency, "merge_s": timed["inference_s"]["ego"], "n_merge": timed["n"]["ego"]}
+    if kept:
+        write_whole(kept, canonical_json(found))
+    return found
+
+
+def merge_s(latency: Mapping[str, Any], answers: Sequence[Answer]) -> Floats:
+    """Seconds of each second inference, (K,), as `inference_s` has those of the first."""
+    own = np.array([a["seconds"] for a in answers], dtype=float)
+    fixed = latency["merge_s"] if answers else None
+    if fixed is None:
+        return np.where(np.isnan(own), _median(own), own)
+    return np.array([fixed + a["slow_s"] for a in answers])
 
 
 def _sample(scenes: Sequence[Scene]) -> Sequence[Scene]:

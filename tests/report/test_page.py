@@ -159,7 +159,7 @@ def test_nothing_that_a_model_a_prompt_or_a_file_says_becomes_markup(dataset, tm
         return answer | {"raw": payload, "detail": payload, "error": payload}
 
     run = write_run(tmp_path / "run", dataset, model=payload, change=change)
-    out = write_report(run, prompts=lambda scene, viewer: [{"role": payload, "content": payload}] * 2)
+    out = write_report(run, prompts=lambda scene, viewer, heard: [{"role": payload, "content": payload}] * 2)
     found = Page(out.read_text())
     assert "script" not in found.tags
     assert not any(name.startswith("on") for _, name, _ in found.attributes)
