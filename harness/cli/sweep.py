@@ -1,9 +1,14 @@
 """`harness sweep`: finished runs, coordinated otherwise."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
 COLUMNS = (
     ("trigger %", "trigger_rate", 100),
     ("msgs", "messages_per_episode", 1),
@@ -17,58 +22,85 @@ def sweep(
         help="Folders of finished runs; several are drawn together.", metavar="RUN..."
     ),
     over: list[str] = typer.Option(
-        ...,
-        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus; repeatable.",
+        [],
+        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus; repeatable. "
+        "Default: the paper's panels.",
     ),
     grid: list[str] = typer.Option(
         [],
         help="Values for each --over, in order: a list 0,10,20 or from:to:step. Default: the usual ones.",
     ),
-    condition: str = typer.Option("6g", help="Operating point that is varied."),
+    condition: list[str] = typer.Option(
+        ["6g"], help="Operating point that is varied, or a change of one: 6g:on_demand=true. Repeatable."
+    ),
     seeds: str | None = typer.Option(None, help="Seeds of the channel's luck. Default: the run's."),
+    latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
+    proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
     out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON."),
 ) -> None:
-    """Play stored answers at other operating points; no model is asked."""
-    from harness.cli.estimates import interval
+    """Play stored answers at other operating points. No model is asked, but for ego-prompt."""
     from harness.cli.evaluate import parse_seeds
     from harness.cli.progress import bar
-    from harness.errors import UserError, printable
+    from harness.errors import UserError, printable, unknown
+    from harness.run.again import Asking
     from harness.study.axes import axis_of
     from harness.study.axes import grid as values_of
+    from harness.study.calibrated import Calibrated
+    from harness.study.play import Source
     from harness.study.stored import Stored
-    from harness.study.sweep import run_sweep, settings
+    from harness.study.sweep import run_sweep, settings, usual
 
     axes = [axis_of(name) for name in dict.fromkeys(over)]
     if len(grid) > len(axes):
         raise UserError(f"--grid: {len(grid)} given for {len(axes)} of --over; give one for each, in order")
+    if latency not in ("run", "paper"):
+        raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*grid, *[None] * len(axes)], strict=False)]
-    sources = [Stored(run) for run in runs]
+    runs_read = [Stored(run, latency) for run in runs]
+    conditions = list(dict.fromkeys(condition))
     panels = {
-        axis.name: settings(sources, axis, values, condition)
+        axis.name: settings(runs_read, axis, values, conditions)
         for axis, values in zip(axes, grids, strict=True)
-    }
-    luck = parse_seeds(seeds) if seeds else sources[0].seeds
+    } or usual(runs_read, conditions)
+    luck = parse_seeds(seeds) if seeds else runs_read[0].seeds
     where = out or runs[0] / f"sweep-{'-'.join(panels)}"
-    total = len(sources) * sum(map(len, panels.values()))
-    with bar("grid points", total, quiet=as_json) as progress:
+    points = [setting for panel in panels.values() for setting in panel]
+    with bar("asking with messages", 0, quiet=as_json) as asked:
+        for run in runs_read:
+            run.prepare(points, luck, Asking(asked.more, asked))
+    sources: list[Source] = [*runs_read, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
+    with bar("grid points", len(sources) * len(points), quiet=as_json) as progress:
         summary = run_sweep(sources, panels, luck, where, progress)
     if as_json:
         typer.echo(summary.to_json(orient="records"))
         return
-    shown = summary[summary.interval == "episodes"]
-    for source, panel in dict.fromkeys(zip(shown["source"], shown["panel"], strict=True)):
-        rows = shown[(shown["source"] == source) & (shown["panel"] == panel)]
-        typer.echo(f"{printable(source)} · {condition} over {panel}")
-        typer.echo(
-            f"{panel:<14}{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
-        )
-        for value in dict.fromkeys(rows["value"]):
-            ours = rows[rows["value"] == value].to_dict("records")
-            of = {str(row["metric"]): row for row in ours}
-            success = of["success_rate"]
-            text = interval(success["mean"], success["ci_low"], success["ci_high"], 100)
-            at = value if isinstance(value, str) else f"{value:g}"
-            cells = "".join(f"{scale * of[metric]['mean']:>11.1f}" for _, metric, scale in COLUMNS)
-            typer.echo(f"{at:<14}{text:>22}{cells}")
+    _tables(summary)
     typer.echo(f"wrote {printable(where / 'sweep.svg')}")
+
+
+def _tables(summary: "pd.DataFrame") -> None:
+    from harness.cli.estimates import interval
+    from harness.errors import printable
+    from harness.study.sweep import CORE
+
+    heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
+    shown = ""
+    for place, rows in summary.groupby(["source", "panel", "condition", "value"], sort=False, dropna=False):
+        source, panel, condition, value = place
+        title = f"{printable(source)}" + ("" if panel == CORE else f" · {printable(condition)} over {panel}")
+        if title != shown:
+            typer.echo(f"{title}\n{'condition' if panel == CORE else panel:<14}{heads}")
+            shown = title
+        # Over episodes, but where a seed has episodes of its own.
+        of = {str(row["metric"]): row for row in sorted(rows.to_dict("records"), key=_over_episodes)}
+        success = of["success_rate"]
+        text = interval(success["mean"], success["ci_low"], success["ci_high"], 100)
+        at = condition if panel == CORE else value if isinstance(value, str) else f"{value:g}"
+        cells = "".join(f"{scale * of[metric]['mean']:>11.1f}" for _, metric, scale in COLUMNS)
+        label = printable(at) if len(str(at)) < 14 else f"{printable(at)}\n"
+        typer.echo(f"{label}{text:>{36 - len(label) if len(label) < 14 else 36}}{cells}")
+
+
+def _over_episodes(row: dict[Any, Any]) -> bool:
+    return bool(row["interval"] == "episodes")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.consensus import RULES
+from harness.consensus import NAMES, RULES
 from harness.errors import UserError, printable, unknown
 from harness.operating_point import OperatingPoint
 
@@ -71,8 +71,8 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.name == "consensus":
         for part in parts:
-            if part not in RULES:
-                raise unknown("--grid", part, RULES)
+            if part not in NAMES:
+                raise unknown("--grid", part, NAMES)
         return tuple(dict.fromkeys(parts))
     found = [value for part in parts for value in _values(axis, part)]
     if len(found) > MOST_POINTS:

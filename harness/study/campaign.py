@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ from harness.study.calibrated import Calibrated
 from harness.study.ledger import ledger
 from harness.study.page import page
 from harness.study.paper import SEEDS, Panel
-from harness.study.play import play
+from harness.study.play import described, play, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,8 +23,8 @@ FORMAT = "swarmdrive-study/1"
 def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None]) -> "pd.DataFrame":
     """Play the paper's panels with the calibrated proxy.
 
-    Writes `conditions.csv`, `episodes.csv`, `ledger.csv`, `study.json`, the Figures A and B as SVG, PDF and
-    PNG, and `index.html`.
+    Writes `conditions`, `episodes` and `ledger` as CSV and JSON Lines, `study.json`, the Figures A and B as
+    SVG, PDF and PNG, and `index.html`.
 
     Returns:
         The ledger.
@@ -42,10 +41,7 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
         "seeds": list(SEEDS),
         "episodes_per_seed": {p.name: p.episodes for p in panels},
         "source": next(iter(sources.values())).manifest(),
-        "panels": {
-            p.name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in p.settings]
-            for p in panels
-        },
+        "panels": described({p.name: p.settings for p in panels}),
         "versions": versions(),
     }
     core, *sweeps = (p.summary for p in played)
@@ -53,10 +49,9 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
     out.mkdir(parents=True, exist_ok=True)
     for stem, figure in drawn.items():
         figures.save_all(figure, out / stem)
-    write_whole(out / "conditions.csv", summary.to_csv(index=False))
-    episodes = pd.concat([p.episodes for p in played], ignore_index=True)
-    write_whole(out / "episodes.csv", episodes.to_csv(index=False))
-    write_whole(out / "ledger.csv", found.to_csv(index=False))
+    write_table(summary, out / "conditions")
+    write_table(pd.concat([p.episodes for p in played], ignore_index=True), out / "episodes")
+    write_table(found, out / "ledger")
     write_whole(out / "study.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     write_whole(out / "index.html", page(manifest, found, out))
     return found

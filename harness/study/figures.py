@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Patch
 
 from harness.drawing.pictures import COLOURS, FORMATS, GREY, INK, MARKERS, PALE, save, styled
 from harness.study.axes import AXES
@@ -13,22 +15,24 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
+SHORT = 13  # characters of a name that fit under a bar
 BEST_BAND = (0.65, 0.70)  # the paper's
 
 
 @styled
 def composite_a(core: "pd.DataFrame") -> Figure:
     """Latency, success and communication of the operating points, with 95 % intervals over seed means."""
-    figure = Figure(figsize=(7.2, 2.5), layout="constrained")
+    figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = figure.subplots(1, 3)
     names = list(dict.fromkeys(core.condition))
+    told_below = len(names) > 3 or max(map(len, names)) > SHORT
     for axes, metric, scale, label in (
         (latency, "latency_proxy_ms", 1.0, "latency of a decision, ms"),
         (success, "success_rate", 100.0, "success, %"),
     ):
         offset = metric == "latency_proxy_ms"
         for n, name in enumerate(names):
-            _bar(axes, n + offset, core, name, metric, scale, COLOURS[n])
+            _bar(axes, n + offset, core, name, metric, scale, COLOURS[n % len(COLOURS)])
         if offset:
             axes.bar(0, CLOUD_MS, width=0.65, color="white", edgecolor=GREY, hatch="////", linewidth=0.8)
             axes.text(0, CLOUD_MS + 8, f"{CLOUD_MS:.0f}", ha="center", va="bottom", fontsize=7)
@@ -37,14 +41,20 @@ def composite_a(core: "pd.DataFrame") -> Figure:
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
             )  # fmt: skip
         ticks = (["cloud"] if offset else []) + [name.replace("-", "-\n") for name in names]
-        axes.set_xticks(range(len(ticks)), ticks, fontsize=7)
+        axes.set_xticks(range(len(ticks)), [] if told_below else ticks, fontsize=7)
         axes.set_ylabel(label)
         axes.margins(y=0.14)
     success.set_ylim(0, 108)
     talking = [name for name in names if _value(core, name, "messages_per_episode")[0] > 0]
     for n, name in enumerate(talking):
-        _bar(talk, n, core, name, "messages_per_episode", 1.0, COLOURS[names.index(name)])
-    talk.set_xticks(range(len(talking)), talking, fontsize=7)
+        _bar(talk, n, core, name, "messages_per_episode", 1.0, COLOURS[names.index(name) % len(COLOURS)])
+    talk.set_xticks(range(len(talking)), [] if told_below else talking, fontsize=7)
+    if told_below:
+        key = [
+            Patch(facecolor=COLOURS[n % len(COLOURS)], edgecolor=INK, label=name)
+            for n, name in enumerate(names)
+        ]
+        figure.legend(handles=key, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
     talk.set_ylabel("messages an episode (bars)")
     talk.margins(y=0.25)
     rate = talk.twinx()
@@ -62,7 +72,7 @@ def composite_a(core: "pd.DataFrame") -> Figure:
 @styled
 def along(panels: "Sequence[pd.DataFrame]", best_band: bool = False) -> Figure:
     """Success along one axis a panel, several sources in one, with loss or trigger rate where it changes."""
-    figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout="constrained")
+    figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, panel in zip(drawn, panels, strict=True):
         _along(axes, panel, best_band)
@@ -139,7 +149,7 @@ def _bar(
     axes.bar(x, mean, width=0.65, color=colour, edgecolor=INK, linewidth=0.5)
     axes.errorbar(x, mean, yerr=[[down], [up]], color=INK, capsize=2.5, linewidth=1.0)
     axes.annotate(
-        f"{mean:.1f}", (x, mean + up), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=7
+        f"{mean:.1f}", (x, mean + up), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=6
     )
 
 

@@ -1,12 +1,14 @@
 """Plays a source of intents at every point of a panel, and tells what came of it with intervals."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from harness.arrays import Floats
+from harness.files import write_whole
 from harness.frozen import Table
 from harness.metrics import Estimate
 from harness.operating_point import OperatingPoint
@@ -34,6 +36,10 @@ class Source(Protocol):
     @property
     def name(self) -> str:
         """What figures call it."""
+        ...
+
+    def manifest(self) -> dict[str, Any]:
+        """What a reader needs to know of where the intents come from."""
         ...
 
     def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
@@ -123,3 +129,17 @@ def _estimates(
         if same:
             yield name, over_episodes(name, values), "episodes"
     yield from latency_percentiles([made for _, made in scored])
+
+
+def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
+    """The grid points, complete, for a manifest."""
+    return {
+        name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
+        for name, settings in panels.items()
+    }
+
+
+def write_table(table: "pd.DataFrame", stem: Path) -> None:
+    """Write a table as CSV and as JSON Lines."""
+    write_whole(stem.with_suffix(".csv"), table.to_csv(index=False))
+    write_whole(stem.with_suffix(".jsonl"), table.to_json(orient="records", lines=True))

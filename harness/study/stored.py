@@ -1,8 +1,10 @@
 """A finished run as a source: its answers are coordinated again, and no model is asked."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +13,17 @@ from harness.errors import UserError, printable
 from harness.exchange import Luck, nearest
 from harness.frozen import Table, table
 from harness.operating_point import OperatingPoint
+from harness.run.again import Asking, second_answers
 from harness.run.folder import Run, dataset_of, read
-from harness.run.intents import intents
+from harness.run.intents import Intents, intents
+from harness.run.merging import Merged, delivered
 from harness.run.scoring import Scored, draw, score
-from harness.run.timing import inference_s
+from harness.run.timing import PAPER, inference_s
+from harness.study.play import Setting
 
 
 class Stored:
-    """An evaluated run.
+    """An evaluated run, with its own inference times or the `paper`'s.
 
     Attributes:
         run: its folder.
@@ -28,7 +33,7 @@ class Stored:
         points: the run's operating points, by name.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, latency: str | None = None) -> None:
         self.run: Run = read(folder)
         config = self.run.config
         self.name = f"{config['model']['name']} · {config['prompt']['version']} · {self.run.answer}"
@@ -44,16 +49,45 @@ class Stored:
         by_id = {
             f"{scene}/{viewer}": a for scene, row in rows.items() for viewer, a in row["answers"].items()
         }
+        self._dataset = dataset
+        self._second: Merged | None = None
         self._known = intents(dataset, by_id, self.run.answer, bool(config["thinking"]))
         self._laid = table(dataset)
-        self._infer_s = inference_s(config["latency"], self._known.answers)
+        self._latency = PAPER if latency == "paper" else dict(config["latency"])
+        self._infer_s = inference_s(self._latency, self._known.answers)
         self.vehicles = self._known.distance_m.shape[1]
         self._draw = lru_cache(maxsize=64)(self._drawn)
 
+    def manifest(self) -> dict[str, Any]:
+        """The run, the digest of its dataset, and where its times come from."""
+        config = self.run.config
+        return {
+            "name": self.name, "run": str(self.run.path), "dataset_sha256": config["dataset"]["sha256"],
+            "latency": self._latency,
+        }  # fmt: skip
+
+    def prepare(self, settings: Iterable[Setting], seeds: Sequence[int], asking: Asking) -> None:
+        """Ask the model what these grid points need beyond the run's answers, if they need anything."""
+        asked_again = [s for s in settings if s.point.asks_again]
+        lucks = [self._draw(seed) for seed in seeds]
+        codes = [
+            delivered(self._with(s.vehicles), self._infer_s, [s.point], lucks) for s in asked_again
+        ]  # fmt: skip
+        if asked_again:
+            points, every = [s.point for s in asked_again], np.unique(np.concatenate(codes))
+            self._second, self._latency = second_answers(
+                self.run, self._dataset, self._known, points, every, self._latency, asking
+            )
+
     def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
         """Every decision at one operating point, with the ego and so many of the nearest vehicles."""
-        known = replace(self._known, valid=self._known.valid & self._there(vehicles - 1))
-        return self._laid, score(self._laid, known, self._infer_s, point, seed, self._draw(seed))
+        known = self._with(vehicles)
+        return self._laid, score(
+            self._laid, known, self._infer_s, point, seed, self._draw(seed), self._second
+        )
+
+    def _with(self, vehicles: int) -> Intents:
+        return replace(self._known, valid=self._known.valid & self._there(vehicles - 1))
 
     def _there(self, helpers: int) -> Bools:
         reach = np.nan_to_num(self._known.range_m, nan=np.inf)

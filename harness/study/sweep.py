@@ -2,79 +2,109 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.errors import UserError, printable, unknown
+from harness.errors import UserError, printable
 from harness.files import write_whole
+from harness.operating_point import OperatingPoint, named_point
 from harness.run.spec import versions
 from harness.study import figures
-from harness.study.axes import Axis, Value
-from harness.study.play import Setting, play
+from harness.study.axes import AXES, Axis, Value, grid
+from harness.study.play import Setting, Source, described, play, write_table
 from harness.study.stored import Stored
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FORMAT = "swarmdrive-sweep/1"
+CORE = "core"  # the panel that compares operating points
 
 
 def settings(
-    sources: Sequence[Stored], axis: Axis, values: Sequence[Value], condition: str
+    sources: Sequence[Stored], axis: Axis, values: Sequence[Value], conditions: Sequence[str]
 ) -> tuple[Setting, ...]:
-    """The grid points of one axis.
+    """The grid points of one axis, for each condition.
 
     Raises:
-        UserError: no such condition in a run, one without a channel, or more vehicles than there are.
+        UserError: no such condition, one without a channel, or more vehicles than there are.
     """
-    for source in sources:
-        if condition not in source.points:
-            raise unknown(f"condition of {printable(source.run.path)}", condition, source.points)
-    point, vehicles = sources[0].points[condition], min(source.vehicles for source in sources)
-    if point.profile is None:
-        raise UserError(f"--condition {printable(condition)} has no channel; nothing of it can be varied")
+    vehicles = min(source.vehicles for source in sources)
     if axis.field is None and max(map(float, values)) > vehicles:
         raise UserError(
             f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
         )
     return tuple(
-        Setting(condition, axis.at(point, v), vehicles if axis.field else int(v), axis.name, v)
+        Setting(name, axis.at(point, v), vehicles if axis.field else int(v), axis.name, v)
+        for name, point in ((name, point_of(sources, name)) for name in conditions)
         for v in values
     )
 
 
+def point_of(sources: Sequence[Stored], name: str) -> OperatingPoint:
+    """The runs' operating point of that name, or one of the paper's, or a change of one of those."""
+    theirs = {source.points[name] for source in sources if name in source.points}
+    if len(theirs) > 1:
+        raise UserError(f"--condition {printable(name)} is not the same in all runs; sweep them one by one")
+    point = theirs.pop() if theirs else named_point(name)
+    if point.profile is None:
+        raise UserError(f"--condition {printable(name)} has no channel; nothing of it can be varied")
+    return point
+
+
+def usual(sources: Sequence[Stored], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
+    """The paper's panels for runs: their own conditions, swarm size under density-coupled loss, loss, tau."""
+    vehicles = min(source.vehicles for source in sources)
+    own = {name: point for source in sources for name, point in source.points.items()}
+    sizes = settings(sources, AXES["size"], grid(AXES["size"], f"1:{vehicles}"), conditions)
+    return {
+        "core": tuple(Setting(name, point, vehicles) for name, point in own.items()),
+        "size": tuple(replace(s, point=replace(s.point, density_coupled=True, loss=None)) for s in sizes),
+        **{name: settings(sources, AXES[name], grid(AXES[name]), conditions) for name in ("loss", "tau")},
+    }
+
+
 def run_sweep(
-    sources: Sequence[Stored], panels: Mapping[str, Sequence[Setting]], seeds: Sequence[int], out: Path,
+    sources: Sequence[Source], panels: Mapping[str, Sequence[Setting]], seeds: Sequence[int], out: Path,
     progress: Callable[[int], None],
 ) -> "pd.DataFrame":  # fmt: skip
-    """Play every run at every grid point; points and runs are paired by common random numbers.
+    """Play every source at every grid point; points and sources are paired by common random numbers.
 
-    Writes `conditions.csv`, `episodes.csv`, `sweep.json`, and the panels as SVG, PDF and PNG.
+    Writes `conditions` and `episodes` as CSV and JSON Lines, `sweep.json`, and the panels as SVG, PDF and
+    PNG: `sweep` along the axes, and a source's operating points, where they are among the panels.
 
     Returns:
-        The summary: a row a run, grid point and metric.
+        The summary: a row a source, grid point and metric.
     """
     import pandas as pd
 
     played = {
-        name: [play(source, name, points, seeds, progress) for source in sources]
+        name: [
+            play(source, name, able, seeds, progress)
+            for source in sources
+            # Who has no model cannot ask it again.
+            if (able := [s for s in points if isinstance(source, Stored) or not s.point.asks_again])
+        ]
         for name, points in panels.items()
     }
-    by_panel = [pd.concat([p.summary for p in made], ignore_index=True) for made in played.values()]
-    summary = pd.concat(by_panel, ignore_index=True)
-    out.mkdir(parents=True, exist_ok=True)
-    figures.save_all(figures.along(by_panel), out / "sweep")
+    along = [
+        pd.concat([p.summary for p in made], ignore_index=True)
+        for name, made in played.items() if name != CORE
+    ]  # fmt: skip
+    summary = pd.concat([p.summary for made in played.values() for p in made], ignore_index=True)
     episodes = pd.concat([p.episodes for made in played.values() for p in made], ignore_index=True)
-    write_whole(out / "conditions.csv", summary.to_csv(index=False))
-    write_whole(out / "episodes.csv", episodes.to_csv(index=False))
+    out.mkdir(parents=True, exist_ok=True)
+    figures.save_all(figures.along(along), out / "sweep")
+    for n, p in enumerate(played.get(CORE, ()), 1):
+        figures.save_all(figures.composite_a(p.summary), out / f"operating-points-{n}")
+    write_table(summary, out / "conditions")
+    write_table(episodes, out / "episodes")
     manifest = {
         "format": FORMAT,
-        "runs": [
-            {"path": str(s.run.path), "name": s.name, "dataset": s.run.config["dataset"]["sha256"]}
-            for s in sources
-        ],
+        "sources": [source.manifest() for source in sources],
         "seeds": list(seeds),
-        "grid": {name: [s.value for s in points] for name, points in panels.items()},
+        "panels": described(panels),
         "versions": versions(),
     }
     write_whole(out / "sweep.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
