@@ -28,6 +28,7 @@ def play(
     infer_s=(0.145, 0.145, 0.145, 0.145),
     link=((0.9, 0.9), (0.9, 0.9), (0.9, 0.9)),
     jitter=(0.0, 0.5, 1.0),
+    merge=None,
 ) -> Coordination:
     luck = Luck(np.array(link), np.array(jitter))
     return coordinate(
@@ -40,6 +41,7 @@ def play(
         np.full(len(valid), 1000.0),
         np.array(infer_s),
         luck,
+        merge,
     )
 
 
@@ -195,6 +197,84 @@ def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
     assert decision.delivered.tolist() == [True, True, False]
     assert decision.arrival_s == pytest.approx([0.1952, 0.2454, np.inf])
     assert decision.on_time.tolist() == [True, False, False]
+
+
+def test_helpers_on_demand_begin_when_they_are_asked():
+    """145 ms of the ego, 145 of each helper, then slots of 25.1 ms one after another."""
+    wide = replace(V2X, on_demand=True, window_s=0.4)
+    assert play(wide).arrival_s == pytest.approx([0.3151, 0.3402, 0.3653])
+    slow = play(wide, infer_s=(0.145, 0.145, 0.100, 0.300))
+    assert slow.arrival_s == pytest.approx([0.3151, 0.2701, 0.4701])
+    assert slow.on_time.tolist() == [True, True, False]
+    assert play(replace(V2X, on_demand=True)).fused.tolist() == list(DOUBT), "nobody is on time"
+
+
+AGREED = (0.1, 0.2, 0.7)
+
+
+def asked_again(*heard: bool, answer=AGREED, seconds=0.160):
+    """The ego's model is asked with the messages of exactly these helpers."""
+
+    def merge(on_time):
+        assert on_time.tolist() == list(heard)
+        return np.array(answer, dtype=float), np.float64(seconds)
+
+    return merge
+
+
+def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
+    """Over 6g the exchange ends at 151.905 ms; the second inference takes 160 ms more."""
+    decision = play(replace(SIXG, consensus="ego-prompt"), merge=asked_again(True, True, True))
+    assert decision.fused == pytest.approx(AGREED)
+    assert decision.action == 2
+    assert decision.exchange_s == pytest.approx(0.151905)
+    assert decision.latency_s == pytest.approx(0.311905)
+    assert decision.deadline_missed
+    assert np.isnan(decision.weights).all()
+
+
+def test_ego_prompt_reads_only_what_came_in_time():
+    """Over v2x the third reply ends at 220.3 ms: waited for, not read."""
+    decision = play(replace(V2X, consensus="ego-prompt"), merge=asked_again(True, True, False))
+    assert decision.latency_s == pytest.approx(0.3803)
+    assert decision.late == 1
+
+
+def test_ego_prompt_is_not_asked_by_an_ego_that_hears_nobody():
+    merge = asked_again(False, False, False, answer=(np.nan,) * 3, seconds=np.nan)
+    for point, own in ((replace(SIXG, loss=1.0), DOUBT), (SIXG, (0.9, 0.05, 0.05))):
+        decision = play(replace(point, consensus="ego-prompt"), own=own, merge=merge)
+        assert decision.fused.tolist() == list(own)
+        assert decision.latency_s == decision.exchange_s
+        assert decision.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
+        assert not decision.merge_failed
+
+
+def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_time():
+    failed = asked_again(True, True, True, answer=(np.nan,) * 3)
+    decision = play(replace(SIXG, consensus="ego-prompt"), merge=failed)
+    assert decision.merge_failed
+    assert decision.fused.tolist() == list(DOUBT)
+    assert decision.latency_s == pytest.approx(0.311905)
+
+
+@pytest.mark.parametrize(
+    ("rule", "policy"),
+    [
+        ("linear", (0.3125, 0.1, 0.5875)),
+        # Products of p^w, p floored at 0.001: .02414, .01297, .39560, over their sum.
+        ("log-pool", (0.05578, 0.02997, 0.91425)),
+        # Helpers' 0 of weight 1/2 is SLOWER's lower middle, 0.3 its upper: 0.15; IDLE 0.05; FASTER 0.65.
+        ("median", (0.15 / 0.85, 0.05 / 0.85, 0.65 / 0.85)),
+        # The middle half of the weight. SLOWER: 0 for .25, .3 for .125, .6 for .125, so .225; .05 and .625.
+        ("trimmed-mean", (0.225 / 0.9, 0.05 / 0.9, 0.625 / 0.9)),
+    ],
+)
+def test_each_rule_makes_another_policy_of_the_same_messages(rule, policy):
+    """Weights 1/8, 1/4, 1/8, 1/2 of DOUBT, (.8, .1, .1), (.6, .2, .2), (0, 0, 1). None takes time."""
+    decision = play(replace(SIXG, consensus=rule))
+    assert decision.fused == pytest.approx(policy, abs=2e-4)
+    assert decision.latency_s == decision.exchange_s
 
 
 def test_block_fading_is_one_draw_for_all_steps_of_an_episode():

@@ -54,7 +54,8 @@ def test_grid_points_that_are_the_same_point_give_the_same_number(found: pd.Data
 def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> None:
     names = {f"figure-{f}.{kind}" for f in "ab" for kind in ("svg", "pdf", "png")}
     assert {p.name for p in study.iterdir()} == names | {
-        "conditions.csv", "episodes.csv", "ledger.csv", "study.json", "index.html",
+        *(f"{t}.{kind}" for t in ("conditions", "episodes", "ledger") for kind in ("csv", "jsonl")),
+        "study.json", "index.html",
     }  # fmt: skip
     manifest = json.loads((study / "study.json").read_text())
     assert manifest["source"]["proxy_model_version"]

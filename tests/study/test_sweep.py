@@ -28,7 +28,7 @@ def source(done: Evaluated) -> Stored:
 
 def swept(source: Stored, out: Path, name: str, text: str | None = None) -> pd.DataFrame:
     axis = AXES[name]
-    points = settings([source], axis, grid(axis, text), "6g")
+    points = settings([source], axis, grid(axis, text), ["6g"])
     return run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
 
 
@@ -55,19 +55,20 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
 
 
 def test_every_axis_gives_its_panels(source: Stored, tmp_path: Path) -> None:
-    panels = {name: settings([source], axis, grid(axis), "6g") for name, axis in AXES.items()}
+    panels = {name: settings([source], axis, grid(axis), ["6g"]) for name, axis in AXES.items()}
     summary = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
     assert set(summary.panel) == set(AXES)
-    names = {"conditions.csv", "episodes.csv", "sweep.json", "sweep.svg", "sweep.pdf", "sweep.png"}
+    names = {f"{table}.{kind}" for table in ("conditions", "episodes") for kind in ("csv", "jsonl")}
+    names |= {f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png")}
     assert {p.name for p in tmp_path.iterdir()} == names
-    assert json.loads((tmp_path / "sweep.json").read_text())["grid"]["consensus"][0] == "linear"
+    assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
 
 
 def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None:
     """The same answers under another prompt's name see the same luck."""
     other = Stored(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
     axis = AXES["loss"]
-    points = settings([source, other], axis, (0.0, 50.0), "6g")
+    points = settings([source, other], axis, (0.0, 50.0), ["6g"])
     made = run_sweep([source, other], {"loss": points}, (0, 1), tmp_path / "out", lambda n: None)
     assert len(set(made.source)) == 2
     assert not made[made.metric == "success_rate"]["mean"].isna().any()
@@ -76,7 +77,7 @@ def test_runs_are_paired(source: Stored, small: Dataset, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("axis", "values", "condition", "said"),
     [
-        ("tau", (0.7,), "5g", "unknown condition"),
+        ("tau", (0.7,), "5g", "unknown operating point"),
         ("tau", (0.7,), "single-local", "has no channel"),
         ("size", (9,), "6g", "9 vehicles; the run's scenes have"),
     ],
@@ -85,4 +86,4 @@ def test_what_cannot_be_is_one_line(
     source: Stored, axis: str, values: tuple[float, ...], condition: str, said: str
 ) -> None:
     with pytest.raises(UserError, match=said):
-        settings([source], AXES[axis], values, condition)
+        settings([source], AXES[axis], values, [condition])
