@@ -195,7 +195,7 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated) -> 
     asked: list[int] = []
     source.prepare([same], source.seeds, Asking(asked.append, lambda n: None))
     assert asked == [], "the run's own seeds delivered nothing else"
-    made = [source.scored(MERGE, 4, seed)[1].verdict.success.mean() for seed in source.seeds]
+    made = [next(source.scored(MERGE, 4, seed))[1].verdict.success.mean() for seed in source.seeds]
     assert np.mean(made) == pytest.approx(figure(done, MERGE.name, "success_rate").value)
     fewer = Setting("6g", MERGE, 2)
     source.prepare([same, fewer], source.seeds, Asking(asked.append, lambda n: None))

@@ -39,13 +39,15 @@ def paper(
         return
     typer.echo(f"{'row':<4} {'what':<35}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
     for row in map(shown, ledger[ledger.kind != "cited"].itertuples()):
-        mark = " MISS" if row["misses"] else "    *" if row["kind"] == "fitted" else ""
+        fitted = "    *" if row["kind"] == "fitted" else ""
+        mark = {"misses": " MISS", "unclear": "    ?"}.get(row["verdict"], fitted)
         typer.echo(
             f"{row['id']:<4} {row['what'][:34]:<35}{row['paper']:>13}{row['ours']:>21}{row['off']:>6}{mark}"
         )
     found = tally(ledger)
     typer.echo(
-        f"{found['within']} of {found['total']} numbers within the aim; "
+        f"{found['within']} of {found['total']} numbers within the aim, {found['misses']} miss it, "
+        f"{found['unclear']} unclear (?): the interval\nreaches the aim, more --episodes would tell; "
         f"{found['predicted']} are predicted, those with * fitted"
     )
     typer.echo(f"wrote {printable(out / 'index.html')}")

@@ -104,7 +104,9 @@ def _estimates(
         for name, values in metrics.items():  # (seeds, episodes)
             yield point.name, name, over_seeds(name, values), "seed means"
             yield point.name, name, over_episodes(name, values), "episodes"
-        yield from ((point.name, *found) for found in latency_percentiles(mine))
+        yield from (
+            (point.name, *found) for found in latency_percentiles([r.coordination.latency_s for r in mine])
+        )
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
     if BASELINE in by_condition:
@@ -141,14 +143,13 @@ def by_episode(laid: Table, r: Scored, names: Iterable[str] = METRICS) -> dict[s
     return {name: values(name) for name in names}
 
 
-def latency_percentiles(runs: Sequence[Scored]) -> Iterator[tuple[str, Estimate, str]]:
-    """Percentiles over all decisions of a seed, for each of `PERCENTILES`, with an interval over seeds."""
-    latency_ms = np.stack([r.coordination.latency_s for r in runs]) * 1000  # (seeds, decisions)
-    known = ~np.isnan(latency_ms).all(axis=1)
-    for percent in PERCENTILES:
-        each = np.full(len(latency_ms), np.nan)
-        each[known] = np.nanpercentile(latency_ms[known], percent, axis=1)
-        yield f"latency_p{percent}_ms", over_seeds("latency", each[:, None]), "seed means"
+def latency_percentiles(latency_s: Sequence[Floats]) -> Iterator[tuple[str, Estimate, str]]:
+    """`PERCENTILES` over all decisions of a seed, from each seed's (n,), with an interval over seeds."""
+    known = [each[~np.isnan(each)] * 1000 for each in latency_s]
+    unknown = np.full(len(PERCENTILES), np.nan)
+    by_seed = np.array([np.percentile(each, PERCENTILES) if len(each) else unknown for each in known])
+    for percent, values in zip(PERCENTILES, by_seed.T, strict=True):
+        yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:

@@ -10,7 +10,7 @@ the last leave time to mend them; the last one decides.
 The intents go through trigger, channel, consensus and scoring like any model's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -29,6 +29,7 @@ from harness.run.scoring import Scored, outcome
 VERSION = "1"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 ACTIONS = 3
+CHUNK = 2000  # episodes that are played together
 CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
@@ -107,14 +108,16 @@ class Calibrated:
 
     Attributes:
         name: what reports call it.
+        same_episodes: a seed has episodes of its own.
     """
 
     name = "calibrated proxy"
+    same_episodes = False
 
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._draw = lru_cache(maxsize=8)(self._drawn)
+        self._draw = lru_cache(maxsize=6)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -127,12 +130,17 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
+    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
         """Episodes of one seed with so many vehicles, the ego included, at one operating point.
 
-        An ego that has fused the witness's message knows from its next decision on.
+        They come `CHUNK` at a time, which bounds memory and keeps the arrays in the processor's cache.
         """
-        drawn = self._draw(seed, vehicles - 1)
+        for first in range(0, self.episodes, CHUNK):
+            yield self._scored(point, vehicles, seed, first)
+
+    def _scored(self, point: OperatingPoint, vehicles: int, seed: int, first: int) -> tuple[Table, Scored]:
+        """An ego that has fused the witness's message knows from its next decision on."""
+        drawn = self._draw(seed, vehicles - 1, first)
         known, infer_s = drawn.known, np.full(drawn.known.distance_m.shape, self.parameters.inference_s)
         heard = exchange(
             point,
@@ -145,17 +153,18 @@ class Calibrated:
             drawn.links,
         )
         # Who asks and who is heard depends on entropies, which knowing does not change.
-        told = np.any(heard.on_time & drawn.witness, axis=1).reshape(self.episodes, STEPS)
+        told = np.any(heard.on_time & drawn.witness, axis=1).reshape(-1, STEPS)
         knew = np.insert(np.logical_or.accumulate(told, axis=1)[:, :-1], 0, False, axis=1).reshape(-1, 1)
         heard = replace(heard, own=np.where(knew, drawn.told, heard.own))
         return drawn.laid, outcome(
             drawn.laid, point, seed, fuse(point, heard, known.helpers, known.distance_m)
         )
 
-    def _drawn(self, seed: int, helpers: int) -> _Drawn:
+    def _drawn(self, seed: int, helpers: int, first: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""
-        p, e, n = self.parameters, self.episodes, self.episodes * STEPS
-        base = luck.generator("calibrated", seed)
+        p, e = self.parameters, min(CHUNK, self.episodes - first)
+        n = e * STEPS
+        base = luck.generator("calibrated", seed, first)
         approach = np.searchsorted(np.cumsum([p.left_share, p.right_share]), base.random(e), side="right")
         skill = base.random(e)
         right = base.integers(ACTIONS, size=e)
@@ -166,7 +175,7 @@ class Calibrated:
 
         link, jitter, unsure = np.empty((n, helpers, 2)), np.empty((n, helpers)), np.empty((n, helpers))
         for h in range(helpers):
-            own = luck.generator("calibrated", seed, h)
+            own = luck.generator("calibrated", seed, first, h)
             link[:, h] = np.repeat(own.random((e, 2)), STEPS, axis=0)
             jitter[:, h], unsure[:, h] = own.random((2, n))
         witness = np.repeat(approach[:, None] == np.arange(helpers), STEPS, axis=0)
@@ -181,7 +190,7 @@ class Calibrated:
             payload_bits=np.full((n, helpers), PAYLOAD_BITS),
         )  # fmt: skip
         laid = Table(
-            index=np.arange(n).reshape(e, STEPS), episodes=np.arange(e), seeds=np.full(e, seed),
+            index=np.arange(n).reshape(e, STEPS), episodes=first + np.arange(e), seeds=np.full(e, seed),
             safe=_safe(right), delay_s=np.zeros((n, ACTIONS)), allowance_s=0.0,
         )  # fmt: skip
         return _Drawn(laid, known, peaked(ego_nats, knew), witness, Luck(link, jitter))

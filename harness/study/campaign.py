@@ -12,7 +12,7 @@ from harness.study.calibrated import Calibrated
 from harness.study.ledger import ledger
 from harness.study.page import page
 from harness.study.paper import SEEDS, Panel
-from harness.study.play import described, play, write_table
+from harness.study.play import described, joined, play, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,7 +50,7 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
     for stem, figure in drawn.items():
         figures.save_all(figure, out / stem)
     write_table(summary, out / "conditions")
-    write_table(pd.concat([p.episodes for p in played], ignore_index=True), out / "episodes")
+    write_table(joined([p.episodes for p in played]), out / "episodes")
     write_table(found, out / "ledger")
     write_whole(out / "study.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     write_whole(out / "index.html", page(manifest, found, out))

@@ -41,9 +41,10 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     """A row for each number of the paper.
 
     Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`,
-    `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's range), `allowed`, `verdict`
-    (`within`, `misses` or `cited`), `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the paper
-    gives a range over grid points, ours is one row a grid point.
+    `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's range), `allowed`, `verdict`,
+    `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points,
+    ours is one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it is
+    not but the interval reaches what is, `misses` where it does not, or `cited`.
     """
     import pandas as pd
 
@@ -67,10 +68,18 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
             found.append({
                 **place, "value": "" if ours["value"] is None else ours["value"],
                 "ours": mean, "ci_low": ci_low, "ci_high": ci_high, "difference": difference,
-                "allowed": allowed, "verdict": "within" if abs(difference) <= allowed else "misses",
+                "allowed": allowed,
+                "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
                 "kind": "fitted" if row["id"] in fitted else "predicted", "assumed": assumed,
             })  # fmt: skip
     return pd.DataFrame(found)
+
+
+def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
+    """Of a mean with its interval, where `least` to `most` is allowed."""
+    if least <= mean <= most:
+        return "within"
+    return "unclear" if ci_low <= most and ci_high >= least else "misses"
 
 
 def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+OFF = ("misses", "unclear")
+UNITS = {"count": "", "pct": ", %"}
+
+
 def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> str:
     """The page, with the figures that lie in `folder` in it."""
     environment = Environment(
@@ -25,19 +29,22 @@ def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> s
     pictures = {
         key: uri((folder / f"{key.replace('_', '-')}.svg").read_bytes()) for key in ("figure_a", "figure_b")
     }
-    misses = [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["misses"]]
+    off = {v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF}
     return environment.get_template("paper.html.j2").render(
-        manifest=manifest, rows=rows, misses=misses, style=style, **pictures, **totals
+        manifest=manifest, rows=rows, off=off, style=style, **pictures, **totals
     )
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
-    """Numbers of the paper that can be run; of these, those within the aim, and those predicted."""
+    """Numbers of the paper that can be run; how many of them have which verdict, and are predicted."""
     ran = ledger[ledger.kind != "cited"]
-    total = set(ran.id)
+    total, misses = set(ran.id), set(ran[ran.verdict == "misses"].id)
+    unclear = set(ran[ran.verdict == "unclear"].id) - misses
     return {
         "total": len(total),
-        "within": len(total - set(ran[ran.verdict == "misses"].id)),
+        "within": len(total - misses - unclear),
+        "unclear": len(unclear),
+        "misses": len(misses),
         "predicted": len(set(ran[ran.kind == "predicted"].id)),
     }
 
@@ -47,14 +54,15 @@ def shown(row: Any) -> dict[str, Any]:
     value = f" {row.value:g}" if isinstance(row.value, float) else ""
     theirs = f"{row.paper_low:g}" + (f" to {row.paper_high:g}" if row.paper_high != row.paper_low else "")
     cited = row.kind == "cited"
+    unit = UNITS.get(row.unit, f", {row.unit}")
     return {
         "id": row.id,
-        "what": f"{row.condition} {row.variable}{value} {row.metric}, {row.unit}".replace("  ", " "),
+        "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
         "ours": "" if cited else f"{row.ours:.1f} [{row.ci_low:.1f}, {row.ci_high:.1f}]",
         "off": "" if cited else f"{row.difference:+.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,
-        "misses": row.verdict == "misses",
+        "verdict": row.verdict,
         "assumed": row.assumed,
     }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from harness.arrays import Floats
-from harness.files import write_whole
+from harness.files import replacing
 from harness.frozen import Table
 from harness.metrics import Estimate
 from harness.operating_point import OperatingPoint
@@ -23,7 +23,9 @@ METRICS = (
     "success_rate", "unsafe_rate", "late_rate", "latency_proxy_ms", "deadline_miss_rate", "trigger_rate",
     "messages_per_episode", "effective_loss", "observed_reply_loss",
 )  # fmt: skip
-PLACE = ("source", "panel", "condition", "variable", "value")
+ROWS = 100_000  # that are text in memory at a time
+NAMES = ("source", "panel", "condition", "variable")
+PLACE = (*NAMES, "value")
 
 
 class Source(Protocol):
@@ -31,7 +33,10 @@ class Source(Protocol):
 
     Attributes:
         name: what figures call it.
+        same_episodes: whether every seed plays the same episodes.
     """
+
+    same_episodes: bool
 
     @property
     def name(self) -> str:
@@ -42,8 +47,11 @@ class Source(Protocol):
         """What a reader needs to know of where the intents come from."""
         ...
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
-        """Every decision at one operating point with one seed's luck; the same luck at every point."""
+    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
+        """Every decision at one operating point with one seed's luck, whole episodes at a time.
+
+        It is the same luck at every point.
+        """
         ...
 
 
@@ -100,35 +108,58 @@ def play(
         place = dict(zip(PLACE, (
             source.name, panel, setting.condition, setting.variable, setting.value,
         ), strict=True))  # fmt: skip
-        scored = [source.scored(setting.point, setting.vehicles, seed) for seed in seeds]
-        per_seed = [by_episode(laid, made, METRICS) for laid, made in scored]
-        metrics = {name: np.stack([m[name] for m in per_seed]) for name in METRICS}
+        told = [_told(source, setting, seed) for seed in seeds]
+        metrics = {name: np.stack([t[name] for t in told]) for name in METRICS}  # (seeds, episodes)
         rows += [
             {**place, "metric": metric, "mean": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n,
              "interval": interval}
-            for metric, e, interval in _estimates(metrics, scored)
+            for metric, e, interval in _estimates(source, metrics, [t["latency_s"] for t in told])
         ]  # fmt: skip
-        for seed, (laid, _), found in zip(seeds, scored, per_seed, strict=True):
-            frames.append(pd.DataFrame({
-                **place, "seed": seed, "episode": laid.episodes,
-                "success": found["success_rate"].astype(bool),
-                "trigger_rate": found["trigger_rate"], "latency_ms": found["latency_proxy_ms"].round(3),
-                "messages": found["messages_per_episode"].astype(int),
-                "effective_loss": found["effective_loss"].round(6),
-            }))  # fmt: skip
+        frames.append(pd.DataFrame({
+            **place, "seed": np.repeat(seeds, metrics["success_rate"].shape[1]),
+            "episode": np.concatenate([t["episode"] for t in told]).astype(int),
+            "success": metrics["success_rate"].ravel().astype(bool),
+            "trigger_rate": metrics["trigger_rate"].ravel(),
+            "latency_ms": metrics["latency_proxy_ms"].ravel().round(3),
+            "messages": metrics["messages_per_episode"].ravel().astype(int),
+            "effective_loss": metrics["effective_loss"].ravel().round(6),
+        }).astype(dict.fromkeys(NAMES, "category")))  # fmt: skip
         progress(1)
-    return Played(pd.DataFrame(rows), pd.concat(frames, ignore_index=True))
+    return Played(pd.DataFrame(rows), joined(frames))
+
+
+def _told(source: Source, setting: Setting, seed: int) -> dict[str, Floats]:
+    """Each metric by episode, the episodes' numbers, and the latency of every decision."""
+    pieces: dict[str, list[Any]] = {}
+    for laid, made in source.scored(setting.point, setting.vehicles, seed):
+        found = {
+            **by_episode(laid, made, METRICS),
+            "episode": laid.episodes,
+            "latency_s": made.coordination.latency_s,
+        }
+        for name, values in found.items():
+            pieces.setdefault(name, []).append(values)
+    return {name: np.concatenate(values) for name, values in pieces.items()}
 
 
 def _estimates(
-    metrics: dict[str, Floats], scored: Sequence[tuple[Table, Scored]]
+    source: Source, metrics: Mapping[str, Floats], latency_s: Sequence[Floats]
 ) -> Iterator[tuple[str, Estimate, str]]:
-    same = all(laid is scored[0][0] for laid, _ in scored)  # else a seed has episodes of its own
-    for name, values in metrics.items():  # (seeds, episodes)
+    for name, values in metrics.items():
         yield name, over_seeds(name, values), "seed means"
-        if same:
+        if source.same_episodes:
             yield name, over_episodes(name, values), "episodes"
-    yield from latency_percentiles([made for _, made in scored])
+    yield from latency_percentiles(latency_s)
+
+
+def joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
+    """Tables of episodes, one below the other; what says where they belong is kept once."""
+    import pandas as pd
+    from pandas.api.types import union_categoricals
+
+    found = {name: union_categoricals([t[name] for t in tables]) for name in NAMES}
+    rest = pd.concat([t.drop(columns=list(NAMES)) for t in tables], ignore_index=True)
+    return pd.concat([pd.DataFrame(found), rest], axis=1)
 
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
@@ -140,6 +171,9 @@ def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[st
 
 
 def write_table(table: "pd.DataFrame", stem: Path) -> None:
-    """Write a table as CSV and as JSON Lines."""
-    write_whole(stem.with_suffix(".csv"), table.to_csv(index=False))
-    write_whole(stem.with_suffix(".jsonl"), table.to_json(orient="records", lines=True))
+    """Write a table as CSV and as JSON Lines, some rows at a time."""
+    with replacing(stem.with_suffix(".csv")) as part:
+        table.to_csv(part, index=False)
+    with replacing(stem.with_suffix(".jsonl")) as part, part.open("w", encoding="utf-8") as file:
+        for first in range(0, len(table), ROWS):
+            file.write(table[first : first + ROWS].to_json(orient="records", lines=True))

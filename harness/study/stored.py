@@ -1,6 +1,6 @@
 """A finished run as a source: its answers are coordinated again, and no model is asked."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +31,10 @@ class Stored:
         vehicles: the most that any of its scenes has, the ego included.
         seeds: the run's own.
         points: the run's operating points, by name.
+        same_episodes: every seed plays the run's.
     """
+
+    same_episodes = True
 
     def __init__(self, folder: Path, latency: str | None = None) -> None:
         self.run: Run = read(folder)
@@ -79,12 +82,10 @@ class Stored:
                 self.run, self._dataset, self._known, points, every, self._latency, asking
             )
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> tuple[Table, Scored]:
+    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
         """Every decision at one operating point, with the ego and so many of the nearest vehicles."""
         known = self._with(vehicles)
-        return self._laid, score(
-            self._laid, known, self._infer_s, point, seed, self._draw(seed), self._second
-        )
+        yield self._laid, score(self._laid, known, self._infer_s, point, seed, self._draw(seed), self._second)
 
     def _with(self, vehicles: int) -> Intents:
         return replace(self._known, valid=self._known.valid & self._there(vehicles - 1))

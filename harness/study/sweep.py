@@ -12,7 +12,7 @@ from harness.operating_point import OperatingPoint, named_point
 from harness.run.spec import versions
 from harness.study import figures
 from harness.study.axes import AXES, Axis, Value, grid
-from harness.study.play import Setting, Source, described, play, write_table
+from harness.study.play import Setting, Source, described, joined, play, write_table
 from harness.study.stored import Stored
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def run_sweep(
         for name, made in played.items() if name != CORE
     ]  # fmt: skip
     summary = pd.concat([p.summary for made in played.values() for p in made], ignore_index=True)
-    episodes = pd.concat([p.episodes for made in played.values() for p in made], ignore_index=True)
+    episodes = joined([p.episodes for made in played.values() for p in made])
     out.mkdir(parents=True, exist_ok=True)
     figures.save_all(figures.along(along), out / "sweep")
     for n, p in enumerate(played.get(CORE, ()), 1):

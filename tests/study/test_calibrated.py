@@ -15,7 +15,7 @@ SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
 
 
 def success(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> np.ndarray:
-    return source.scored(point, vehicles, seed)[1].verdict.success
+    return next(source.scored(point, vehicles, seed))[1].verdict.success
 
 
 def test_the_shipped_parameters_are_what_the_fit_gives():
@@ -64,7 +64,7 @@ def test_on_a_serial_channel_the_third_reply_is_late():
 def test_an_ego_that_has_heard_keeps_what_it_learnt():
     """It hears the witness while it asks; in the last decision it asks nobody, and is right."""
     source = Calibrated(300, Parameters(guess_right=0.0, know_right=1.0))
-    laid, made = source.scored(replace(SURE, tau_nats=0.85), 4, 0)
+    laid, made = next(source.scored(replace(SURE, tau_nats=0.85), 4, 0))
     asked = laid.by_episode(made.coordination.triggered, fill=False)
     quiet_at_last = asked[:, :-1].any(axis=1) & ~asked[:, -1]
     assert quiet_at_last.any()
@@ -81,7 +81,7 @@ def test_alone_in_the_swarm_is_alone():
 def test_a_threshold_above_the_largest_entropy_is_as_good_as_no_channel():
     source = Calibrated(300)
     deaf = replace(POINTS["6g"], tau_nats=float(np.log(ACTIONS)))
-    _, made = source.scored(deaf, 4, 0)
+    _, made = next(source.scored(deaf, 4, 0))
     assert not made.coordination.triggered.any()
     assert (made.verdict.success == success(source, POINTS["single-local"])).all()
 
@@ -95,7 +95,7 @@ def test_more_loss_saves_nobody_who_was_lost_with_less():
 
 def test_more_helpers_change_nothing_of_the_first_ones_draws():
     source = Calibrated(50)
-    two, four = (source._draw(3, helpers) for helpers in (2, 4))
+    two, four = (source._draw(3, helpers, 0) for helpers in (2, 4))
     assert np.array_equal(two.links.link, four.links.link[:, :2])
     assert np.array_equal(two.known.helpers, four.known.helpers[:, :2])
     assert np.array_equal(two.known.own, four.known.own)
@@ -105,7 +105,7 @@ def test_helpers_that_are_unsure_load_the_channel():
     """Below every entropy four vehicles transmit: 6.6 %; above the helpers' only the ego does."""
     source = Calibrated(50)
     busy = replace(POINTS["6g"], helper_rounds=True)
-    _, low = source.scored(replace(busy, tau_nats=0.2), 4, 0)
-    _, high = source.scored(replace(busy, tau_nats=0.7), 4, 0)
+    _, low = next(source.scored(replace(busy, tau_nats=0.2), 4, 0))
+    _, high = next(source.scored(replace(busy, tau_nats=0.7), 4, 0))
     assert low.coordination.loss == pytest.approx(np.full(50 * STEPS, 0.066))
     assert high.coordination.loss == pytest.approx(np.full(50 * STEPS, 0.012))

@@ -1,4 +1,4 @@
-"""The paper's study at a tenth of its size: the ledger inside its aims, and the folder that a user opens."""
+"""The paper's study: the ledger inside its aims, and the folder that a user opens."""
 
 import json
 from pathlib import Path
@@ -7,15 +7,17 @@ import pandas as pd
 import pytest
 
 from harness.study.campaign import run_paper
-from harness.study.ledger import ledger, paper_numbers
+from harness.study.ledger import ledger, paper_numbers, verdict
 from harness.study.page import tally
 from harness.study.paper import panels
+
+EPISODES = 1500  # a seed: at 69 % a mean of five seeds has a standard error of 0.5 points
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "paper"
-    run_paper(panels(core=600, sweep=600), out, lambda done: None)
+    run_paper(panels(core=EPISODES, sweep=EPISODES), out, lambda done: None)
     return out
 
 
@@ -26,16 +28,25 @@ def found(study: Path) -> pd.DataFrame:
 
 def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None:
     assert set(found.id) == {row["id"] for row in paper_numbers()}
-    assert set(found.verdict) <= {"within", "misses", "cited"}
+    assert set(found.verdict) <= {"within", "unclear", "misses", "cited"}
     assert found[found.kind == "cited"].id.tolist() == ["A1"]
 
 
 def test_the_ledger_is_inside_its_aims(found: pd.DataFrame) -> None:
-    """3 000 episodes a grid point: two standard errors are 1.7 points at 69 %, on top of the aim."""
+    """One row is known to miss (docs/studies.md): at 40 % loss more is heard than in the paper."""
+    assert set(found[found.verdict == "misses"].id) <= {"B12"}
     ran = found[found.kind != "cited"]
-    slack = ran.metric.map({"success": 1.7}).fillna(0.0)
-    off = ran[abs(ran.difference) > ran.allowed + slack]
+    noise = ran.metric.map({"success": 1.0}).fillna(0.0)
+    off = ran[(abs(ran.difference) > ran.allowed + noise) & (ran.id != "B12")]
     assert off.empty, off[["id", "value", "difference"]]
+
+
+def test_a_verdict_looks_at_the_interval() -> None:
+    """Paper 90, aim 1."""
+    assert verdict(90.9, 88.0, 93.0, 89.0, 91.0) == "within"
+    assert verdict(91.5, 90.8, 92.2, 89.0, 91.0) == "unclear"
+    assert verdict(91.5, 91.2, 91.8, 89.0, 91.0) == "misses"
+    assert verdict(88.5, 88.2, 88.8, 89.0, 91.0) == "misses"
 
 
 def test_most_rows_are_predictions(found: pd.DataFrame) -> None:
@@ -74,7 +85,7 @@ def test_episodes_add_up_to_the_conditions(study: Path) -> None:
             & (conditions.metric == "success_rate")
         ]["mean"]  # fmt: skip
         assert rows.success.mean() == pytest.approx(mean)
-        assert len(rows) == 5 * 600
+        assert len(rows) == 5 * EPISODES
 
 
 def test_a_study_without_a_row_of_the_paper_has_none_in_its_ledger() -> None:
