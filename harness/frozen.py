@@ -77,7 +77,9 @@ class Table:
     def by_episode(self, values: Any, fill: Any = np.nan) -> Any:
         """Values (n, ...) as (E, S, ...), `fill` where an episode has no such step."""
         there = self.index >= 0
-        laid = values[np.maximum(self.index, 0)]
+        laid = values[self.index]
+        if there.all():
+            return laid
         return np.where(there.reshape(there.shape + (1,) * (laid.ndim - 2)), laid, fill)
 
 

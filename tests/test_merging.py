@@ -17,7 +17,7 @@ from harness.prompts import load as prompt
 from harness.run import merging
 from harness.run.again import Asking
 from harness.run.evaluate import Evaluated, evaluate
-from harness.study.play import Setting
+from harness.study.setting import Setting
 from harness.study.stored import Stored
 
 MERGE = named_point("6g:consensus=ego-prompt")

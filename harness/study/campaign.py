@@ -12,7 +12,9 @@ from harness.study.calibrated import Calibrated
 from harness.study.ledger import ledger
 from harness.study.page import page
 from harness.study.paper import SEEDS, Panel
-from harness.study.play import described, joined, play, write_table
+from harness.study.play import play
+from harness.study.setting import described
+from harness.study.tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd

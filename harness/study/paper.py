@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from harness.operating_point import POINTS, OperatingPoint
 from harness.study.axes import AXES, Value, grid
-from harness.study.play import Setting
+from harness.study.setting import Setting
 
 SEEDS = (0, 1, 2, 3, 4)
 VEHICLES = 4  # the ego and the cooperative neighbourhood of three

@@ -1,20 +1,19 @@
 """Plays a source of intents at every point of a panel, and tells what came of it with intervals."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from harness.arrays import Floats
-from harness.files import replacing
 from harness.frozen import Table
 from harness.metrics import Estimate
 from harness.operating_point import OperatingPoint
 from harness.run.scoring import Scored
 from harness.run.summary import by_episode, latency_percentiles, over_episodes, over_seeds
-from harness.study.axes import Value
+from harness.study.setting import Setting
+from harness.study.tables import EPISODE_METRICS, PLACE, of_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,9 +22,6 @@ METRICS = (
     "success_rate", "unsafe_rate", "late_rate", "latency_proxy_ms", "deadline_miss_rate", "trigger_rate",
     "messages_per_episode", "effective_loss", "observed_reply_loss",
 )  # fmt: skip
-ROWS = 100_000  # that are text in memory at a time
-NAMES = ("source", "panel", "condition", "variable")
-PLACE = (*NAMES, "value")
 
 
 class Source(Protocol):
@@ -53,25 +49,6 @@ class Source(Protocol):
         It is the same luck at every point.
         """
         ...
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One grid point of a panel.
-
-    Attributes:
-        condition: name of the operating point that it is a change of.
-        point: the operating point.
-        vehicles: how many, the ego included.
-        variable: what varies in the panel; empty where conditions are compared.
-        value: its value there.
-    """
-
-    condition: str
-    point: OperatingPoint
-    vehicles: int
-    variable: str = ""
-    value: Value | None = None
 
 
 @dataclass(frozen=True)
@@ -103,29 +80,23 @@ def play(
     """
     import pandas as pd
 
-    rows, frames = [], []
+    rows: list[dict[str, Any]] = []
+    episodes: list[dict[str, Floats]] = []
     for setting in settings:
-        place = dict(zip(PLACE, (
-            source.name, panel, setting.condition, setting.variable, setting.value,
-        ), strict=True))  # fmt: skip
+        place = (source.name, panel, setting.condition, setting.variable, setting.value)
         told = [_told(source, setting, seed) for seed in seeds]
         metrics = {name: np.stack([t[name] for t in told]) for name in METRICS}  # (seeds, episodes)
         rows += [
-            {**place, "metric": metric, "mean": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n,
-             "interval": interval}
+            {**dict(zip(PLACE, place, strict=True)), "metric": metric, "mean": e.value, "ci_low": e.low,
+             "ci_high": e.high, "n": e.n, "interval": interval}
             for metric, e, interval in _estimates(source, metrics, [t["latency_s"] for t in told])
         ]  # fmt: skip
-        frames.append(pd.DataFrame({
-            **place, "seed": np.repeat(seeds, metrics["success_rate"].shape[1]),
-            "episode": np.concatenate([t["episode"] for t in told]).astype(int),
-            "success": metrics["success_rate"].ravel().astype(bool),
-            "trigger_rate": metrics["trigger_rate"].ravel(),
-            "latency_ms": metrics["latency_proxy_ms"].ravel().round(3),
-            "messages": metrics["messages_per_episode"].ravel().astype(int),
-            "effective_loss": metrics["effective_loss"].ravel().round(6),
-        }).astype(dict.fromkeys(NAMES, "category")))  # fmt: skip
+        episodes.append({name: metrics[name].ravel() for name in EPISODE_METRICS} | {
+            "seed": np.repeat(seeds, metrics["success_rate"].shape[1]),
+            "episode": np.concatenate([t["episode"] for t in told]),
+        })  # fmt: skip
         progress(1)
-    return Played(pd.DataFrame(rows), joined(frames))
+    return Played(pd.DataFrame(rows), of_episodes(source.name, panel, settings, episodes))
 
 
 def _told(source: Source, setting: Setting, seed: int) -> dict[str, Floats]:
@@ -150,30 +121,3 @@ def _estimates(
         if source.same_episodes:
             yield name, over_episodes(name, values), "episodes"
     yield from latency_percentiles(latency_s)
-
-
-def joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
-    """Tables of episodes, one below the other; what says where they belong is kept once."""
-    import pandas as pd
-    from pandas.api.types import union_categoricals
-
-    found = {name: union_categoricals([t[name] for t in tables]) for name in NAMES}
-    rest = pd.concat([t.drop(columns=list(NAMES)) for t in tables], ignore_index=True)
-    return pd.concat([pd.DataFrame(found), rest], axis=1)
-
-
-def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
-    """The grid points, complete, for a manifest."""
-    return {
-        name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
-        for name, settings in panels.items()
-    }
-
-
-def write_table(table: "pd.DataFrame", stem: Path) -> None:
-    """Write a table as CSV and as JSON Lines, some rows at a time."""
-    with replacing(stem.with_suffix(".csv")) as part:
-        table.to_csv(part, index=False)
-    with replacing(stem.with_suffix(".jsonl")) as part, part.open("w", encoding="utf-8") as file:
-        for first in range(0, len(table), ROWS):
-            file.write(table[first : first + ROWS].to_json(orient="records", lines=True))

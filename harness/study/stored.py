@@ -19,7 +19,7 @@ from harness.run.intents import Intents, intents
 from harness.run.merging import Merged, delivered
 from harness.run.scoring import Scored, draw, score
 from harness.run.timing import PAPER, inference_s
-from harness.study.play import Setting
+from harness.study.setting import Setting
 
 
 class Stored:

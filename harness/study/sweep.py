@@ -12,8 +12,10 @@ from harness.operating_point import OperatingPoint, named_point
 from harness.run.spec import versions
 from harness.study import figures
 from harness.study.axes import AXES, Axis, Value, grid
-from harness.study.play import Setting, Source, described, joined, play, write_table
+from harness.study.play import Source, play
+from harness.study.setting import Setting, described
 from harness.study.stored import Stored
+from harness.study.tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,0 +1,100 @@
+"""What a study costs: the paper's campaign, a sweep over a stored run, and ten million decisions.
+
+The limit is drawing the random numbers that each grid point's decisions need, with NumPy.
+
+    python benchmarks/study.py [--decisions 10000000]
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter, process_time
+
+import numpy as np
+
+from harness.operating_point import POINTS
+from harness.study.calibrated import STEPS, Calibrated
+from harness.study.paper import SEEDS, panels
+from harness.study.play import play
+from harness.study.setting import Setting
+
+HARNESS = [sys.executable, "-m", "harness"]
+
+
+def main() -> None:
+    """Print each figure beside its aim, and all as one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--decisions", type=int, default=10_000_000)
+    most = arguments.parse_args().decisions
+    found = {**campaign(), **sweep(), **linear(most)}
+    aims = {"campaign_wall_s": 3, "play_over_draw": 5, "sweep_wall_s": 5, "peak_mb": 1000}
+    for name, value in found.items():
+        aim = f"   aim {aims[name]}" if name in aims else ""
+        print(f"{name:<28}{value:>10.2f}{aim}")
+    print(json.dumps(found))
+
+
+def campaign() -> dict[str, float]:
+    """The whole command, and its grid points against drawing what they need."""
+    with tempfile.TemporaryDirectory() as folder:
+        wall_s = timed([*HARNESS, "campaign", "paper", "--out", f"{folder}/paper"])
+    start, decisions = process_time(), 0
+    for panel in panels():
+        play(Calibrated(panel.episodes), panel.name, panel.settings, SEEDS, lambda done: None)
+    play_s = process_time() - start
+    start = process_time()
+    for panel in panels():
+        for setting in panel.settings:
+            for seed in SEEDS:
+                draw(np.random.default_rng(seed), panel.episodes, setting.vehicles - 1)
+                decisions += panel.episodes * STEPS
+    draw_s = process_time() - start
+    return {
+        "campaign_wall_s": wall_s, "campaign_decisions": decisions,
+        "play_cpu_s": play_s, "draw_cpu_s": draw_s,
+        "play_over_draw": play_s / draw_s,
+    }  # fmt: skip
+
+
+def draw(generator: np.random.Generator, episodes: int, helpers: int) -> None:
+    """As many numbers as `Calibrated` draws: four an episode and two a link, one and two a decision."""
+    generator.random((episodes, 4 + 2 * helpers))
+    generator.random((episodes * STEPS, 1 + 2 * helpers))
+
+
+def sweep() -> dict[str, float]:
+    """100 grid points over a stored run of 200 episodes, 1 200 scenes, five seeds each."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = f"{folder}/run"
+        timed([*HARNESS, "eval", "--model", "proxy", "--limit", "200", "--out", run])
+        wall_s = timed([*HARNESS, "sweep", run, "--over", "tau", "--grid", "0.1:1.09:0.01"])
+        scenes = len((Path(run) / "rows.jsonl").read_text().splitlines())
+    return {"sweep_wall_s": wall_s, "sweep_points": 100, "sweep_scenes": scenes}
+
+
+def linear(most: int) -> dict[str, float]:
+    """Seconds per million decisions of one grid point with five seeds, small and large; peak memory."""
+    found = {}
+    for name, decisions in (("small", most // 10), ("large", most)):
+        source = Calibrated(decisions // (STEPS * len(SEEDS)))
+        start = process_time()
+        play(source, "one", [Setting("6g", POINTS["6g"], 4)], SEEDS, lambda done: None)
+        found[f"{name}_s_per_million"] = (process_time() - start) / decisions * 1e6
+    found["large_decisions"] = most
+    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return found
+
+
+def timed(command: list[str]) -> float:
+    """Wall seconds of a command in a process of its own."""
+    start = perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    return perf_counter() - start
+
+
+if __name__ == "__main__":
+    main()
