@@ -25,12 +25,11 @@ from harness.frozen import Table
 from harness.operating_point import OperatingPoint
 from harness.run.intents import Intents
 from harness.run.scoring import Scored, outcome
+from harness.study.entropies import ACTIONS, peaked, spread
 
 VERSION = "1"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
-ACTIONS = 3
 CHUNK = 2000  # episodes that are played together
-CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
 EGO_M, WITNESS_M, OTHERS_M = 25.0, 6.0, 20.0
@@ -143,15 +142,9 @@ class Calibrated:
         drawn = self._draw(seed, vehicles - 1, first)
         known, infer_s = drawn.known, np.full(drawn.known.distance_m.shape, self.parameters.inference_s)
         heard = exchange(
-            point,
-            known.own,
-            known.helpers,
-            known.valid,
-            known.range_m,
-            known.payload_bits,
-            infer_s,
+            point, known.own, known.helpers, known.valid, known.range_m, known.payload_bits, infer_s,
             drawn.links,
-        )
+        )  # fmt: skip
         # Who asks and who is heard depends on entropies, which knowing does not change.
         told = np.any(heard.on_time & drawn.witness, axis=1).reshape(-1, STEPS)
         knew = np.insert(np.logical_or.accumulate(told, axis=1)[:, :-1], 0, False, axis=1).reshape(-1, 1)
@@ -201,25 +194,3 @@ def _safe(right: Ints) -> Bools:
     table = np.ones((len(right), STEPS, ACTIONS), dtype=bool)
     table[:, -1] = right[:, None] == np.arange(ACTIONS)
     return table.reshape(-1, ACTIONS)
-
-
-def peaked(nats: Floats, top: Ints) -> Floats:
-    """Intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
-    entropies, shares = _by_entropy()
-    most = np.interp(nats, entropies, shares)[..., None]
-    return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
-
-
-@lru_cache(maxsize=1)
-def _by_entropy() -> tuple[Floats, Floats]:
-    share = np.linspace(1.0, 1 / ACTIONS, 4001)[1:-1]
-    rest = (1 - share) / (ACTIONS - 1)
-    return -share * np.log(share) - (1 - share) * np.log(rest), share
-
-
-def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
-    """Draws of a normal distribution, cut at `CUT` standard deviations either side, by its quantiles."""
-    from scipy.special import ndtr, ndtri
-
-    below = ndtr(-CUT)
-    return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))

@@ -10,7 +10,8 @@ part of the dangers that helpers watch.
 import numpy as np
 
 from harness.channel import density_coupled_loss
-from harness.study.calibrated import CUT, FITTED_ON, Parameters
+from harness.study.calibrated import FITTED_ON, Parameters
+from harness.study.entropies import CUT
 from harness.study.ledger import paper_numbers
 
 

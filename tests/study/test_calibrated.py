@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from harness.operating_point import POINTS, OperatingPoint
-from harness.study.calibrated import ACTIONS, STEPS, Calibrated, Parameters, peaked, spread
+from harness.study.calibrated import STEPS, Calibrated, Parameters
+from harness.study.entropies import ACTIONS, peaked, spread
 from harness.study.fit import fit
 from harness.trigger import entropy_nats
 
