@@ -7,7 +7,9 @@ from typing import get_args
 import pytest
 
 from harness.backends.base import AnswerMode
+from harness.consensus import NAMES
 from harness.failures import Failures
+from harness.operating_point import POINTS, SETTINGS
 from harness.parse import Repair, Status
 
 ROOT = Path(__file__).parent.parent
@@ -37,3 +39,18 @@ def test_the_readme_names_every_command() -> None:
     readme = (ROOT / "README.md").read_text()
     for name in get_command(app).commands:  # type: ignore[attr-defined]
         assert f"`harness {name}" in readme
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_every_setting_of_an_operating_point_is_documented_with_its_default(setting: str) -> None:
+    text = (ROOT / "docs/operating-points.md").read_text()
+    [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
+    default = getattr(POINTS["v2x"], setting)
+    shown = {None: "the profile's", False: "false"}.get(default, default)
+    cell = line.split("|")[3].strip().strip("`")
+    assert cell == (f"{shown:g}" if isinstance(shown, float) else str(shown))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_consensus_is_documented(name: str) -> None:
+    assert f"| `{name}` |" in (ROOT / "docs/operating-points.md").read_text()
