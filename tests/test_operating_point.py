@@ -78,3 +78,39 @@ def test_an_unknown_point_is_told_the_nearest():
     assert named_point("6g") is POINTS["6g"]
     with pytest.raises(UserError, match="did you mean 'v2x'"):
         named_point("v2xx")
+
+
+def test_a_change_of_a_point_is_called_by_its_text():
+    point = named_point("6g:consensus=median,window_s=0.4,max_helpers=2,on_demand=true,loss=0.1")
+    assert point == OperatingPoint(
+        "6g:consensus=median,window_s=0.4,max_helpers=2,on_demand=true,loss=0.1", "6g",
+        consensus="median", window_s=0.4, max_helpers=2, on_demand=True, loss=0.1,
+    )  # fmt: skip
+    assert named_point("single-local:fallback=brake").fallback == "brake"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("6g:", "unknown setting of operating point 6g ''"),
+        ("6g:windows_s=0.3", "did you mean 'window_s'?"),
+        ("6g:profile=v2x", "unknown setting of operating point 6g 'profile'"),
+        ("6g:tau_nats", "tau_nats is ''; it must be a finite number"),
+        ("6g:max_helpers=1.5", "max_helpers is '1.5'; it must be a whole number"),
+        ("6g:on_demand=yes", "on_demand is 'yes'; it must be true or false"),
+        ("6g:loss=nan", "loss is nan; it must be a probability"),
+        ("6g:loss=0.1,loss=0.2", "loss is given twice"),
+        ("6g:consensus=vote", "unknown consensus 'vote'"),
+    ],
+)
+def test_a_change_that_is_not_allowed_is_one_line(text, says):
+    with pytest.raises(UserError) as error:
+        named_point(text)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_only_a_point_with_a_channel_asks_again():
+    assert named_point("v2x:consensus=ego-prompt").asks_again
+    assert not named_point("v2x").asks_again
+    assert not named_point("single-local:consensus=ego-prompt").asks_again

@@ -37,12 +37,12 @@ def paper(
     if as_json:
         typer.echo(ledger.to_json(orient="records"))
         return
-    typer.echo(f"{'row':<4} {'what':<35}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
+    typer.echo(f"{'row':<4}{'what':<31}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
     for row in map(shown, ledger[ledger.kind != "cited"].itertuples()):
         fitted = "    *" if row["kind"] == "fitted" else ""
         mark = {"misses": " MISS", "unclear": "    ?"}.get(row["verdict"], fitted)
         typer.echo(
-            f"{row['id']:<4} {row['what'][:34]:<35}{row['paper']:>13}{row['ours']:>21}{row['off']:>6}{mark}"
+            f"{row['id']:<4}{row['what'][:30]:<31}{row['paper']:>13}{row['ours']:>21}{row['off']:>6}{mark}"
         )
     found = tally(ledger)
     typer.echo(

@@ -1,0 +1,101 @@
+"""`harness sweep` and `harness campaign paper` as typed."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+
+from harness import cli
+from harness.dataset.load import Dataset
+
+Said = tuple[int, str, str]
+
+
+@pytest.fixture
+def harness(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Said]:
+    monkeypatch.chdir(tmp_path)
+
+    def typed(*args: str | Path) -> Said:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0), *capsys.readouterr()
+
+    return typed
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return evaluate(spec_of(small), tmp_path_factory.mktemp("sweep") / "run").out
+
+
+def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
+    harness: Callable[..., Said], done: Path
+) -> None:
+    code, out, err = harness("sweep", done, "--proxy", "--out", "swept")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.splitlines()[-1] == "wrote swept/sweep.svg"
+    table = pd.read_csv("swept/conditions.csv")
+    assert set(table.panel) == {"core", "size", "loss", "tau"}
+    assert set(table[table.panel == "core"].condition) == {"single-local", "v2x", "6g"}
+    assert table.source.nunique() == 2
+    pictures = {f"{stem}.{kind}" for kind in ("svg", "pdf", "png")
+                for stem in ("sweep", "operating-points-1", "operating-points-2")}  # fmt: skip
+    assert pictures <= {p.name for p in Path("swept").iterdir()}
+    lines = Path("swept/conditions.jsonl").read_text().splitlines()
+    assert len(lines) == len(table)
+    sizes = json.loads(Path("swept/sweep.json").read_text())["panels"]["size"]
+    assert [s["vehicles"] for s in sizes] == [1, 2, 3, 4]
+    assert all(s["density_coupled"] for s in sizes)
+
+
+def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
+    harness: Callable[..., Said], done: Path
+) -> None:
+    """On demand the helpers' 145 ms come after the ego's; serial replies of 25 ms each follow."""
+    options = ("--over", "window", "--grid", "400", "--condition", "v2x", "--condition", "v2x:on_demand=true")
+    code, out, err = harness("sweep", done, *options, "--latency", "paper", "--json")
+    assert (code, err) == (0, "")
+    table = pd.DataFrame(json.loads(out))
+    p99 = table[table.metric == "latency_p99_ms"].set_index("condition")["mean"]
+    assert p99["v2x"] == pytest.approx(220, abs=3)
+    assert p99["v2x:on_demand=true"] == pytest.approx(365, abs=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--over", "speed"), "unknown --over 'speed'"),
+        (("--over", "tau", "--grid", "a"), "--grid a: give numbers"),
+        (("--over", "tau", "--grid", "1", "--grid", "2"), "--grid: 2 given for 1 of --over"),
+        (("--over", "tau", "--condition", "6g:tau=1"), "unknown setting of operating point 6g 'tau'"),
+        (("--over", "tau", "--condition", "single-local"), "has no channel; nothing of it can be varied"),
+        (("--over", "consensus", "--grid", "ego-prompt"), "proxy is no language model"),
+        (("--latency", "mine"), "unknown --latency 'mine'"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_nothing_is_written(
+    options: tuple[str, ...], said: str, harness: Callable[..., Said], done: Path
+) -> None:
+    code, out, err = harness("sweep", done, *options, "--out", "swept")
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+    assert not Path("swept").exists()
+
+
+def test_the_papers_study_ends_with_how_many_numbers_it_met(harness: Callable[..., Said]) -> None:
+    code, out, err = harness("campaign", "paper", "--episodes", "20", "--sweep-episodes", "20", "--out", "p")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert "of 30 numbers within the aim" in out
+    assert out.splitlines()[-1] == "wrote p/index.html"
