@@ -2,11 +2,14 @@
 
 import fcntl
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from harness import cli
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 
@@ -43,3 +46,20 @@ def small_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.Fixture
 @pytest.fixture(scope="session")
 def small(small_path: Path) -> Dataset:
     return load(small_path)
+
+
+@pytest.fixture
+def harness(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., tuple[int, str, str]]:
+    """The command as typed, in a folder of its own: its exit code, and what it said on stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def typed(*args: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0), *capsys.readouterr()
+
+    return typed

@@ -47,7 +47,7 @@ def paper(
     found = tally(ledger)
     typer.echo(
         f"{found['within']} of {found['total']} numbers within the aim, {found['misses']} miss it, "
-        f"{found['unclear']} unclear (?:\nthe interval reaches the aim, more --episodes would tell); "
+        f"{found['unclear']} unclear (?:\nthe interval reaches it, more --episodes would tell); "
         f"{found['predicted']} predicted, * fitted"
     )
     typer.echo(f"wrote {printable(out / 'index.html')}")

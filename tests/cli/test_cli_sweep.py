@@ -1,7 +1,6 @@
 """`harness sweep` and `harness campaign paper` as typed."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,26 +9,9 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 
-from harness import cli
 from harness.dataset.load import Dataset
 
 Said = tuple[int, str, str]
-
-
-@pytest.fixture
-def harness(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., Said]:
-    monkeypatch.chdir(tmp_path)
-
-    def typed(*args: str | Path) -> Said:
-        monkeypatch.setattr(sys, "argv", ["harness", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return int(ended.value.code or 0), *capsys.readouterr()
-
-    return typed
 
 
 @pytest.fixture(scope="module")
