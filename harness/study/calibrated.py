@@ -27,7 +27,7 @@ from harness.run.intents import Intents
 from harness.run.scoring import Scored, outcome
 from harness.study.entropies import ACTIONS, peaked, spread
 
-VERSION = "1"
+VERSION = "2"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 CHUNK = 2000  # episodes that are played together
 
