@@ -43,14 +43,12 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
     """Weighted geometric mean of intents, `(..., A)` (the logarithmic opinion pool of Genest 1984).
 
-    A probability below `floor` counts as that much, so that one rounded 0 is no veto; an ego that hears
-    nobody keeps its intent as it is.
+    A probability below `floor` counts as that much, so that one rounded 0 is no veto.
     """
     row_weights = weights[..., None]
     logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
     pooled = np.exp(np.sum(row_weights * logs, axis=-2))
-    alone = weights[..., :1] == 1
-    return np.where(alone, p[..., 0, :], pooled / np.sum(pooled, axis=-1, keepdims=True))
+    return np.asarray(pooled / np.sum(pooled, axis=-1, keepdims=True))
 
 
 def median(p: Floats, weights: Floats) -> Floats:

@@ -77,18 +77,18 @@ def fuse(
 ) -> Coordination:
     """The policy of each decision, once it is known who was heard; arguments as in `coordinate`."""
     weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
+    anybody = np.any(heard.on_time, axis=-1)
     latency_s, merge_failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus in RULES:
         fused = RULES[point.consensus](np.concatenate([heard.own[..., None, :], helpers], axis=-2), weights)
     else:
         if merge is None:
             raise ValueError(f"consensus {point.consensus} needs the ego's second answers")
-        anybody = np.any(heard.on_time, axis=-1)
-        merged, seconds = merge(heard.on_time)
-        merge_failed = anybody & np.any(np.isnan(merged), axis=-1)
-        fused = np.where((anybody & ~merge_failed)[..., None], merged, heard.own)
+        fused, seconds = merge(heard.on_time)
+        merge_failed = anybody & np.any(np.isnan(fused), axis=-1)
         weights = np.where(anybody[..., None], np.nan, weights)
         latency_s = latency_s + np.where(anybody, seconds, 0.0)
+    fused = np.where((anybody & ~merge_failed)[..., None], fused, heard.own)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,

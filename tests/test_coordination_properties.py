@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.consensus import RULES
 from harness.coordination import Coordination, coordinate
 from harness.exchange import Luck
 from harness.operating_point import POINTS, OperatingPoint
@@ -44,6 +45,8 @@ points = st.builds(
     tau_nats=st.floats(0, 1.2),
     max_helpers=st.integers(0, 5),
     roadside_edge=st.booleans(),
+    on_demand=st.booleans(),
+    consensus=st.sampled_from(sorted(RULES)),
 )
 
 
