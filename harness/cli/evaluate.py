@@ -183,6 +183,11 @@ def _table(done: "Evaluated") -> None:
     )
     console.print("gain is over single-local, paired by episode")
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
+    if (m["latency"].get("load_a_core") or 0) > 1:
+        console.print(
+            f"timed on a busy machine ({m['latency']['load_a_core']} processes a core): "
+            "let it run alone, or use --latency card or paper"
+        )
     if m.get("cached_answers"):
         console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
     if m.get("engine_errors"):

@@ -1,6 +1,7 @@
 """Where a decision's inference time comes from: measured at batch 1, the model card, or the paper."""
 
 import json
+import os
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,7 +31,8 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
 
     Returns:
         `source` (`card`, `measured` or `paper`), `inference_s` by role (None where each answer's own time
-        counts), `basis`, and for a sample its `n` by role. `merge_latency` adds `merge_s` where it is needed.
+        counts), `basis`, and for a sample its `n` by role and the machine's load. `merge_latency` adds
+        `merge_s` where it is needed.
     """
     if spec.latency == "paper":
         return PAPER
@@ -128,7 +130,16 @@ def _timed(backend: Backend, asked: Sequence[Request]) -> dict[str, Any]:
         "inference_s": {role: known.get(role, fill) for role in times},
         "basis": "median of single requests (batch 1) on this machine, before the run",
         "n": {role: len(t) for role, t in times.items()},
+        "load_a_core": _load(),
     }
+
+
+def _load() -> float | None:
+    """Processes that wanted a core in the last minute, a core; None where the system does not say."""
+    try:
+        return round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)
+    except (OSError, AttributeError):
+        return None
 
 
 def inference_s(latency: Mapping[str, Any], answers: list[list[Answer | None]]) -> Floats:
