@@ -7,10 +7,12 @@ the request, not from its sensors.
 """
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from harness.arrays import Floats
 from harness.perception.rays import blocked_by, sweep
 from harness.perception.sensors import Detection, detect
 from harness.road import SECTORS, Path, conflict_zone, crossings, paths
@@ -159,15 +161,22 @@ def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
 
 def _sectors(state: WorldState, viewer: VehicleState) -> list[Graph]:
     """How much of each sector's approach lane is in sight, and which known thing hides the rest."""
-    found = []
-    for sector in SECTORS:
-        path = paths()[sector, "straight"]
-        end = path.junction_m[0] + 11.0
-        points = np.array([path.at(end - back)[:2] for back in np.linspace(*SECTOR_REACH_M, 15)])
-        blockers = blocked_by(state, viewer, points)
+    points = _looked_at()
+    found = blocked_by(state, viewer, points.reshape(-1, 2))
+    sectors = []
+    for n, sector in enumerate(SECTORS):
+        blockers = found[n * points.shape[1] : (n + 1) * points.shape[1]]
         seen = sum(b is None for b in blockers) / len(blockers)
         hiding = sorted({b for b in blockers if b is not None})
-        found.append(
+        sectors.append(
             {"sector": sector, "seen_share": round(seen, 2), "occluded": seen < OCCLUDED_BELOW, "by": hiding}
         )
-    return found
+    return sectors
+
+
+@lru_cache(maxsize=1)
+def _looked_at() -> Floats:
+    """(sectors, 15, 2) m, points of each sector's approach lane. Shared: not to be written to."""
+    approaches = [paths()[sector, "straight"] for sector in SECTORS]
+    back_m = np.linspace(*SECTOR_REACH_M, 15)
+    return np.array([[p.at(p.junction_m[0] + 11.0 - back)[:2] for back in back_m] for p in approaches])

@@ -1,6 +1,7 @@
 """Ray casting: what a vehicle has a line of sight to, past buildings and other vehicles."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,13 +59,19 @@ def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats
 
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     """Cast rays all round a vehicle."""
-    bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
+    bearing, rays = _all_round()
     ids, corners = surfaces(state, viewer)
-    rays = np.column_stack([np.cos(bearing), np.sin(bearing)])
     distance, met = first_hits(np.array([viewer.x_m, viewer.y_m]), rays, corners)
     reached = np.isfinite(distance)
     hits = {name: np.flatnonzero(reached & (met == n)) for n, name in enumerate(ids)}
     return Sweep(bearing, distance, {name: rays for name, rays in hits.items() if len(rays)})
+
+
+@lru_cache(maxsize=1)
+def _all_round() -> tuple[Floats, Floats]:
+    """Bearings (RAYS,) and their directions (RAYS, 2). Shared: not to be written to."""
+    bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
+    return bearing, np.column_stack([np.cos(bearing), np.sin(bearing)])
 
 
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
