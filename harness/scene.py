@@ -7,6 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.arrays import Floats
+
 Kind = Literal["car", "truck"]
 Part = Literal["ego", "helper", "other"]
 
@@ -57,13 +59,18 @@ class VehicleState:
 
 
 def rectangle(
-    x_m: float, y_m: float, heading_rad: float, length_m: float, width_m: float
-) -> NDArray[np.float64]:
-    """(4, 2) m corners of a rectangle: front left first, then clockwise as seen from above."""
-    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
-    along = np.array([length_m, length_m, -length_m, -length_m]) / 2
-    right = np.array([-width_m, width_m, width_m, -width_m]) / 2
-    return np.column_stack([x_m + along * cos - right * sin, y_m + along * sin + right * cos])
+    x_m: float | Floats,
+    y_m: float | Floats,
+    heading_rad: float | Floats,
+    length_m: float | Floats,
+    width_m: float | Floats,
+) -> Floats:
+    """(..., 4, 2) m corners of rectangles (...): front left first, then clockwise as seen from above."""
+    cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
+    along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
+    right = np.multiply.outer(width_m, [-1.0, 1.0, 1.0, -1.0]) / 2
+    x, y = np.asarray(x_m)[..., None], np.asarray(y_m)[..., None]
+    return np.stack([x + along * cos - right * sin, y + along * sin + right * cos], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -5,19 +5,22 @@ decided.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import shapely
 
+from harness.arrays import Floats
 from harness.outcome import Outcome, fault, outline, striker
 from harness.road import JUNCTION_M
 from harness.scenarios.occluded_intersection import NAME as NAME
-from harness.scene import WorldState
+from harness.scene import WorldState, rectangle
 from harness.simulator import OccludedIntersectionEnv, spawn_of, state_of, vehicle_on
 
 Snapshot = Mapping[str, Any]
+HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 
 @dataclass
@@ -30,6 +33,8 @@ class World:
         step: decisions taken so far.
         frame: frames simulated so far.
         outcome: what has happened so far; its `ended` says whether the episode is decided.
+        hard_brakings: how often the ego has begun to brake harder than HARD_BRAKING_MPS2.
+        braking_hard: whether it did so in the last frame.
     """
 
     env: OccludedIntersectionEnv
@@ -37,6 +42,8 @@ class World:
     step: int = 0
     frame: int = 0
     outcome: Outcome = field(default_factory=Outcome)
+    hard_brakings: int = 0
+    braking_hard: bool = False
 
     @classmethod
     def start(cls, seed: int) -> "World":
@@ -56,7 +63,8 @@ class World:
 
     def branch(self) -> "World":
         """A copy that goes its own way."""
-        return copy.deepcopy(self)
+        shared = (self.env.road.network, self.env.layout)  # nobody writes to them
+        return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> Snapshot:
         """What `thaw` needs besides `state()` to go on exactly as this world would."""
@@ -104,14 +112,32 @@ class World:
         After the scenario's last decision the action is held until the episode is decided.
         """
         p = self.env.parameters
-        self.env.action_type.act(self.env.action_type.actions_indexes[action])
+        self.take(action)
         self.step += 1
         last = self.step >= p.decisions
-        until = p.time_limit_s if last else self.step * p.decision_period_s
-        while self.frame < round(until * p.simulation_hz) and not self.outcome.ended:
-            self._advance()
+        until_s = p.time_limit_s if last else self.step * p.decision_period_s
+        self.advance(round(until_s * p.simulation_hz))
 
-    def _advance(self) -> None:
+    def take(self, action: str) -> None:
+        """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
+        self.env.action_type.act(self.env.action_type.actions_indexes[action])
+
+    def advance(self, until_frame: int) -> None:
+        """Live on until so many frames are simulated or the episode is decided."""
+        vehicles = self.env.road.vehicles
+        poses, speeds = [], [float(vehicles[0].speed)]
+        while self.frame < until_frame and not self.outcome.ended:
+            self._step()
+            poses.append([(*v.position.tolist(), float(v.heading)) for v in vehicles])
+            speeds.append(float(vehicles[0].speed))
+        if poses:
+            least_m = least_gap_m(np.array(poses), vehicles, self.outcome.least_gap_m)
+            self.outcome = replace(self.outcome, least_gap_m=least_m)
+            hard = -np.diff(speeds) * self.env.parameters.simulation_hz > HARD_BRAKING_MPS2
+            self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
+            self.braking_hard = bool(hard[-1])
+
+    def _step(self) -> None:
         p, road = self.env.parameters, self.env.road
         standing = {v.spawn.id for v in road.vehicles if v.crashed}
         road.act()
@@ -131,19 +157,28 @@ class World:
             self.outcome = self.outcome.ending("cleared", self.time_s)
         elif self.frame >= round(p.time_limit_s * p.simulation_hz):
             self.outcome = self.outcome.ending("time_out", self.time_s)
-        self.outcome = replace(
-            self.outcome,
-            least_gap_m=_least_gap_m(ego, others, self.outcome.least_gap_m),
-            other_crashes=self.outcome.other_crashes + len(crashed),
-        )
+        if crashed:
+            self.outcome = replace(self.outcome, other_crashes=self.outcome.other_crashes + len(crashed))
 
 
-def _least_gap_m(ego: Any, others: list[Any], least_m: float) -> float:
-    """The smaller of `least_m` and the gap now; outlines are only built for vehicles that could matter."""
-    mine = None
-    for v in others:
-        reach = (ego.diagonal + v.diagonal) / 2
-        if float(np.hypot(*(v.position - ego.position))) - reach < least_m:
-            mine = mine or outline(state_of(ego))
-            least_m = min(least_m, float(mine.distance(outline(state_of(v)))))
-    return least_m
+def least_gap_m(poses: Floats, vehicles: Sequence[Any], least_m: float) -> float:
+    """The smaller of `least_m` and the least gap between the ego's outline and another's.
+
+    Args:
+        poses: (frames, vehicles, 3), x, y and heading; the ego first.
+        vehicles: whose poses they are.
+        least_m: the least gap before these frames.
+    """
+    sizes = np.array([(v.LENGTH, v.WIDTH) for v in vehicles])
+    centres_m = np.hypot(*np.moveaxis(poses[:, 1:, :2] - poses[:, :1, :2], -1, 0))
+    # Two centres are at least both half widths apart from touching, and at most both half diagonals.
+    farthest_m = np.hypot(*sizes.T)
+    most_m = centres_m - (sizes[0, 1] + sizes[1:, 1]) / 2
+    close = centres_m - (farthest_m[0] + farthest_m[1:]) / 2 <= min(
+        least_m, float(most_m.min(initial=np.inf))
+    )
+    frames, others = np.nonzero(close)
+    mine = rectangle(*poses[frames, 0].T, *sizes[:1].T)
+    its = rectangle(*poses[frames, 1 + others].T, *sizes[1 + others].T)
+    gaps_m = shapely.distance(shapely.polygons(mine), shapely.polygons(its))
+    return min(least_m, float(gaps_m.min(initial=np.inf)))

@@ -9,8 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 from highway_env.envs.intersection_env import IntersectionEnv
+from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 
+from harness import simulator
 from harness.files import digest
 from harness.live import drive
 from harness.outcome import Outcome, outline
@@ -40,7 +42,7 @@ def through_json(world):
 
 def advance(world, frames):
     for _ in range(frames):
-        world._advance()
+        world.advance(world.frame + 1)
 
 
 def test_actions_are_highway_envs_by_name_and_order():
@@ -108,6 +110,36 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
     before = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
     World.start(FROM_LEFT).act("IDLE")
     assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
+
+
+@pytest.mark.parametrize("seed", [NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING, 3, 12])
+@pytest.mark.parametrize(
+    "actions", [("IDLE",) * 6, ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE")]
+)
+def test_cheap_frames_are_highway_envs_to_the_last_bit(seed, actions, monkeypatch):
+    cheap = trajectory(seed, actions)
+    monkeypatch.setattr(simulator._Road, "step", Road.step)
+    monkeypatch.delattr(simulator._OnRoute, "act")
+    monkeypatch.delattr(simulator._OnRoute, "step")
+    assert trajectory(seed, actions) == cheap
+
+
+@pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
+def test_a_second_at_once_and_frame_by_frame_are_the_same_second(seed):
+    whole, frames = World.start(seed), World.start(seed)
+    for action in ("SLOWER", "IDLE", "FASTER"):
+        whole.act(action)
+        frames.take(action)
+        advance(frames, P.simulation_hz)
+        assert frames.state().vehicles == whole.state().vehicles
+        assert (frames.outcome, frames.hard_brakings) == (whole.outcome, whole.hard_brakings)
+
+
+def test_braking_hard_is_counted_once_each_time_it_begins():
+    world = World.start(NO_DANGER)
+    for action, so_far in (("IDLE", 0), ("SLOWER", 1), ("IDLE", 1), ("SLOWER", 2), ("FASTER", 2)):
+        world.act(action)
+        assert world.hard_brakings == so_far
 
 
 def test_two_seeds_are_two_episodes():
@@ -179,7 +211,7 @@ def asleep_at_the_wheel(world):
     """The two helpers neither steer nor brake."""
     for vehicle in world.env.road.vehicles[1:3]:
         vehicle.speed_control = lambda target_speed: 0.0
-        vehicle.steering_control = lambda lane_index: 0.0
+        vehicle._steering = lambda lane, along, lateral: 0.0
 
 
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
