@@ -6,6 +6,7 @@ would end badly, the best safe action is taken instead and `full-view` drives on
 close to failure as that behaviour gets, and still has all its decision points.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from harness.live import decide, finish
 from harness.outcome import Outcome
 from harness.perception.graph import scene_graph
 from harness.road import JUNCTION_M, LANE_WIDTH_M, conflict_zone
+from harness.scene import VehicleState, WorldState
 from harness.world import World
 
 Record = dict[str, Any]
@@ -75,21 +77,27 @@ def rollout(world: World, action: str) -> Outcome:
 
 def _record(world: World, episode: int, outcomes: dict[str, Outcome], behaviour: dict[str, str]) -> Record:
     state = world.state()
+    return {
+        **moment(world, state, episode, (state.ego, *state.helpers)),
+        "road": ROAD,
+        "behaviour": behaviour,
+        "outcomes": {action: _row(outcome) for action, outcome in outcomes.items()},
+        "snapshot": world.snapshot(),
+    }
+
+
+def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
+    """What is there at a decision point, and what the viewers see of it; the ego is the first of them."""
     zone = conflict_zone()
-    viewers = (state.ego, *state.helpers)
     return {
         "scene": f"{episode:05d}-{state.step}",
         "episode": episode,
         "episode_seed": world.seed,
         "step": state.step,
-        "road": ROAD,
         "danger": {"sector": world.env.layout.danger, "vehicle": world.env.layout.danger_id},
-        "behaviour": behaviour,
         "state": state.to_dict(),
         "graphs": {v.id: scene_graph(state, v.id) for v in viewers},
         "distance_m": {v.id: round(float(np.hypot(v.x_m - zone[0], v.y_m - zone[1])), 3) for v in viewers},
-        "outcomes": {action: _row(outcome) for action, outcome in outcomes.items()},
-        "snapshot": world.snapshot(),
     }
 
 

@@ -87,13 +87,14 @@ def ask_all(
 
 def _ask(backend: Backend, chunk: list[Request], file: TextIO, answers: dict[str, Answer]) -> None:
     for request, completion in zip(chunk, backend.complete(chunk), strict=True):
-        answers[request.id] = answer = _answer(request, completion)
+        answers[request.id] = answer = answer_of(request, completion)
         file.write(canonical_json([request.id, answer]) + "\n")
     file.flush()
     os.fsync(file.fileno())
 
 
-def _answer(request: Request, completion: Completion) -> Answer:
+def answer_of(request: Request, completion: Completion) -> Answer:
+    """What is kept of an answer."""
     # A lone surrogate cannot be written to a file; nothing else of the text is touched.
     text = completion.text.encode("utf-8", "replace").decode("utf-8")
     return {

@@ -75,11 +75,11 @@ def evaluate(
         UserError: the folder holds something else, or the model cannot be had. Nothing is written then.
     """
     if resume and (out / "run.json").is_file():
-        return _finished(spec, out)
-    _refuse(spec, out, resume)
+        return finished(spec, out)
+    refuse(spec, out, resume)
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     identity = backend.identity()
-    with _begun(spec, out, identity) as work:
+    with working(spec, out, identity) as work:
         # Times are had from the backend itself: the cache answers in no time, which is nobody's.
         latency = measure(spec, backend, work / "latency.json")
         asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
@@ -101,7 +101,7 @@ def evaluate(
             "cached_answers": sum(answer["cached"] for answer in by_id.values()),
             "engine_errors": sum(answer["error"] is not None for answer in by_id.values()),
         })  # fmt: skip
-    _tidy(out)
+    tidy(out)
     return done
 
 
@@ -138,7 +138,8 @@ def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[st
     return Evaluated(out, manifest, result)
 
 
-def _finished(spec: Spec, out: Path) -> Evaluated:
+def finished(spec: Spec, out: Path) -> Evaluated:
+    """The run that is there already. Raises UserError if it is another one, or damaged."""
     import pandas as pd
 
     try:
@@ -157,18 +158,18 @@ def _finished(spec: Spec, out: Path) -> Evaluated:
         raise UserError(
             f"--out {printable(out)} holds a damaged run ({printable(error)}); delete it and run again"
         ) from None
-    _tidy(out)
+    tidy(out)
     return Evaluated(out, manifest, result)
 
 
-def _tidy(out: Path) -> None:
+def tidy(out: Path) -> None:
     """Remove what the work left, and what kills left of files half written."""
     shutil.rmtree(out / WORK, ignore_errors=True)
     for part in out.glob(".*.part"):
         part.unlink(missing_ok=True)
 
 
-def _refuse(spec: Spec, out: Path, resume: bool) -> None:
+def refuse(spec: Spec, out: Path, resume: bool) -> None:
     """Raise before anything is loaded or written, if the folder cannot be used."""
     shown = printable(out)
     if (out / "run.json").exists():
@@ -199,7 +200,7 @@ def _stored(stored: dict[str, Any], key: str) -> Any:
 
 
 @contextmanager
-def _begun(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
+def working(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
     """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
     work, existed = out / WORK, out.exists()
     new = not (work / CONFIG).is_file()

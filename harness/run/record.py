@@ -38,7 +38,7 @@ def rows(
             "step": scene.record["step"],
             "danger": scene.record["danger"]["sector"],
             "answers": {
-                viewer: _answer(answer, parsed, "ego" if j == 0 else "helper")
+                viewer: answered(answer, parsed, "ego" if j == 0 else "helper")
                 for j, (viewer, answer, parsed)
                 in enumerate(zip(scene.viewers, known.answers[i], known.parsed[i], strict=False))
                 if answer and parsed
@@ -57,11 +57,12 @@ def _second(spec: Spec, known: Intents, second: Merged) -> dict[int, dict[str, A
     for code, answer, parsed in zip(second.codes.tolist(), second.answers, second.parsed, strict=True):
         i = code >> helpers
         heard = request_id(spec.dataset.scenes[i], places_of(code, helpers)).partition("/")[2]
-        found.setdefault(i, {})[heard] = _answer(answer, parsed, "merge")
+        found.setdefault(i, {})[heard] = answered(answer, parsed, "merge")
     return found
 
 
-def _answer(answer: Answer, parsed: Parsed, role: str) -> dict[str, Any]:
+def answered(answer: Answer, parsed: Parsed, role: str) -> dict[str, Any]:
+    """An answer with its raw text, and what was read in it."""
     return {
         **answer,
         "role": role,

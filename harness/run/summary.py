@@ -7,7 +7,7 @@ Wilson for yes/no outcomes that no seed changes, else Student's t. Both are cond
 answers the model gave.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from harness.metrics import (
     safe_target,
     seed_interval,
 )  # fmt: skip
+from harness.run.asking import Answer
 from harness.run.intents import Intents
 from harness.run.merging import Merged
 from harness.run.scoring import Scored, statuses
@@ -39,7 +40,11 @@ COLUMNS = (
 )  # fmt: skip
 ALL = "all"  # stands for the condition where a figure does not depend on it
 BASELINE = "single-local"
-YES_OR_NO = ("success_rate", "unsafe_rate", "late_rate")  # what an episode has or has not
+# What an episode has or has not.
+YES_OR_NO = (
+    "success_rate", "unsafe_rate", "late_rate", "collision_rate", "time_out_rate", "off_road_rate",
+    "at_fault_rate",
+)  # fmt: skip
 PERCENTILES = (50, 95, 99)
 
 
@@ -79,6 +84,11 @@ def summary(
     spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
 ) -> "pd.DataFrame":
     """The long table of `summary.csv`."""
+    return long_table(spec, _estimates(spec, laid, known, runs, second))
+
+
+def long_table(spec: Spec, estimates: Iterable[tuple[str, str, Estimate, str]]) -> "pd.DataFrame":
+    """Estimates, each a condition, a metric, its value and what its interval is over, in `COLUMNS`."""
     import pandas as pd
 
     rows = [
@@ -87,7 +97,7 @@ def summary(
             "condition": condition, "metric": metric, "value": e.value, "ci_low": e.low, "ci_high": e.high,
             "n": e.n, "n_excluded": e.n_excluded, "interval": interval,
         }
-        for condition, metric, e, interval in _estimates(spec, laid, known, runs, second)
+        for condition, metric, e, interval in estimates
     ]  # fmt: skip
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
@@ -109,24 +119,38 @@ def _estimates(
         )
         total = np.array([float(r.coordination.messages.sum()) for r in mine])
         yield point.name, "message_count", seed_interval(total), "seed means"
+    yield from gains(by_condition)
+    given = {
+        "ego": [row[0] for row in known.answers], "helper": [a for row in known.answers for a in row[1:]],
+        "merge": second.answers if second else [],
+    }  # fmt: skip
+    yield from of_answers(
+        statuses(known, second), {role: [a for a in all_ if a] for role, all_ in given.items()}
+    )
+
+
+def gains(by_condition: Mapping[str, Mapping[str, Floats]]) -> Iterator[tuple[str, str, Estimate, str]]:
+    """What each condition gains over `BASELINE`; its `success_rate` is (seeds, episodes)."""
     if BASELINE in by_condition:
         for name, metrics in by_condition.items():
             if name != BASELINE:
                 gain = metrics["success_rate"] - by_condition[BASELINE]["success_rate"]
                 yield name, f"success_gain_over_{BASELINE}", seed_interval(gain.mean(axis=1)), "seed means"
                 yield name, f"success_gain_over_{BASELINE}", episode_interval(gain.mean(axis=0)), "episodes"
-    for role, verdicts in statuses(known, second).items():
+
+
+def of_answers(
+    verdicts: Mapping[str, Sequence[str]], answers: Mapping[str, Sequence[Answer]]
+) -> Iterator[tuple[str, str, Estimate, str]]:
+    """How answers were parsed, and how long they and their prompts are, by role."""
+    for role, each in verdicts.items():
         for verdict in ("strict", "recovered", "failed"):
-            if verdicts:
-                hits = np.array([float(v == verdict) for v in verdicts])
+            if each:
+                hits = np.array([float(v == verdict) for v in each])
                 yield ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers"
-    given = {
-        "ego": [row[0] for row in known.answers], "helper": [a for row in known.answers for a in row[1:]],
-        "merge": second.answers if second else [],
-    }  # fmt: skip
-    for role, answers in given.items():
+    for role, given in answers.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
-            counts = [a[what] for a in answers if a and a[what] is not None]
+            counts = [a[what] for a in given if a[what] is not None]
             if counts:
                 estimate = episode_interval(np.array(counts, dtype=float))
                 yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"
