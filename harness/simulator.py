@@ -42,8 +42,22 @@ class _Road(Road):  # type: ignore[misc]
         placed = [(v, *v.position.tolist(), v.diagonal / 2) for v in self.vehicles]
         for (v, x, y, reach), (other, other_x, other_y, other_reach) in combinations(placed, 2):
             within = reach + other_reach + v.speed * dt + NEAR_M
-            if (x - other_x) ** 2 + (y - other_y) ** 2 < within * within:
+            dx, dy = other_x - x, other_y - y
+            if dx * dx + dy * dy < within * within and not _apart(v, other, dx, dy, dt):
                 v.handle_collisions(other, dt)
+
+
+def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> bool:
+    """Whether an axis of either vehicle keeps their outlines farther apart than both can move in `dt`."""
+    (cos, sin), (other_cos, other_sin) = v.direction.tolist(), other.direction.tolist()
+    dot, cross = abs(cos * other_cos + sin * other_sin), abs(cos * other_sin - sin * other_cos)
+    moves = (abs(v.speed) + abs(other.speed)) * dt + NEAR_M
+    for a, b, c, s in ((v, other, cos, sin), (other, v, other_cos, other_sin)):
+        along = abs(dx_m * c + dy_m * s) - (a.LENGTH + b.LENGTH * dot + b.WIDTH * cross) / 2
+        across = abs(dy_m * c - dx_m * s) - (a.WIDTH + b.LENGTH * cross + b.WIDTH * dot) / 2
+        if along > moves or across > moves:
+            return True
+    return False
 
 
 class _OnRoute:

@@ -122,6 +122,20 @@ class World:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
         self.env.action_type.act(self.env.action_type.actions_indexes[action])
 
+    @property
+    def speed_index(self) -> int:
+        """Which of the scenario's target speeds the ego aims at."""
+        return int(self.env.road.vehicles[0].speed_index)
+
+    def speed_index_after(self, action: str) -> int:
+        """Which target speed the ego would aim at if it took an action now."""
+        ego = self.env.road.vehicles[0]
+        kept = dict(vars(ego))
+        self.take(action)
+        found = self.speed_index
+        vars(ego).update(kept)
+        return found
+
     def advance(self, until_frame: int) -> None:
         """Live on until so many frames are simulated or the episode is decided."""
         vehicles = self.env.road.vehicles

@@ -12,6 +12,7 @@ from harness.cli import (
     campaign,
     dataset,
     distill,
+    drive,
     evaluate,
     model,
     parity,
@@ -32,6 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("eval")(evaluate.evaluate)
+app.command("drive")(drive.drive)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(scenario.app, name="scenario")

@@ -45,7 +45,7 @@ def rows(
             },
             **({"merged": again[i]} if i in again else {}),
             "safe": laid.safe[i].tolist(),
-            "delay_s": [_number(d) for d in laid.delay_s[i].tolist()],
+            "delay_s": [number(d) for d in laid.delay_s[i].tolist()],
             "decisions": made,
         }) + "\n"  # fmt: skip
 
@@ -95,8 +95,8 @@ def _decisions(
         entropy, triggered, failed, fused, action, latency_ms, missed, safe, delay_s = decision
         messages = [
             {
-                "arrival_ms": _number(arrival_ms), "delivered": delivered, "from": viewer,
-                "on_time": on_time, "weight": _number(weight),
+                "arrival_ms": number(arrival_ms), "delivered": delivered, "from": viewer,
+                "on_time": on_time, "weight": number(weight),
             }
             for viewer, was_asked, delivered, on_time, arrival_ms, weight
             in zip(viewers, asked, *reply, weights[1:], strict=False) if was_asked
@@ -104,9 +104,9 @@ def _decisions(
         # Members stand in the order in which they are written, which spares sorting them.
         yield {
             "action": actions[action], "condition": run.point.name,
-            "deadline_missed": None if math.isnan(latency_ms) else missed, "delay_s": _number(delay_s),
-            "entropy_nats": entropy, "fused": fused, "latency_ms": _number(latency_ms),
-            "messages": messages, "own_failed": failed, "own_weight": _number(weights[0]), "safe": safe,
+            "deadline_missed": None if math.isnan(latency_ms) else missed, "delay_s": number(delay_s),
+            "entropy_nats": entropy, "fused": fused, "latency_ms": number(latency_ms),
+            "messages": messages, "own_failed": failed, "own_weight": number(weights[0]), "safe": safe,
             "seed": run.seed, "triggered": triggered,
         }  # fmt: skip
 
@@ -151,6 +151,6 @@ def _failures(spec: Spec, laid: Table, run: Scored) -> list[str]:
     return found
 
 
-def _number(value: float) -> float | None:
+def number(value: float) -> float | None:
     """JSON has no NaN and no infinity: unknown and never are null."""
     return value if math.isfinite(value) else None

@@ -1,0 +1,154 @@
+"""`harness drive`: a model with a prompt drives live."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import typer
+
+from harness.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
+    from harness.drive.spec import Drive
+    from harness.run.evaluate import Evaluated
+
+ALL = "all"
+
+
+def drive(
+    model: str = typer.Option("proxy", help="Card, checkpoint directory, .gguf file, hub id, or a driver."),
+    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
+    prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
+    condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
+    episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
+    first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
+    seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
+    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
+    answer: str = typer.Option("json", help="json: free text; constrained: to the schema; readout: letters."),
+    batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
+    workers: int = typer.Option(2, help="Processes, each with the model loaded."),
+    device: str | None = typer.Option(None, help="cpu or cuda."),
+    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
+    out: Path | None = typer.Option(None, help="The run's folder. Default: reports/<model>-<prompt>-drive."),
+    resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
+    no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
+    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
+) -> None:
+    """Drive live episodes in highway-env: every decision is asked at its moment and acts when it is ready."""
+    from harness import cards, prompts
+    from harness.cli.estimates import in_range
+    from harness.cli.evaluate import parse_seeds
+    from harness.cli.scenario import MOST_WORKERS
+    from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.drive.spec import spec_of
+    from harness.operating_point import POINTS, named_point
+
+    if ALL in condition and len(condition) > 1:
+        raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
+    shipped = _shipped()
+    episodes = shipped["episodes"] if episodes is None else episodes
+    first_seed = shipped["seed"] if first_seed is None else first_seed
+    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    in_range("--first-seed", first_seed, 0, LAST_SEED)
+    in_range("--workers", workers, 1, MOST_WORKERS)
+    names = POINTS if condition in ([], [ALL]) else condition
+    spec = spec_of(
+        cards.resolve(model, engine),
+        prompts.load(prompt),
+        tuple(named_point(name) for name in dict.fromkeys(names)),
+        parse_seeds(seeds),
+        thinking=thinking,
+        answer=cast("AnswerMode", answer),
+        batch_size=batch_size,
+        device=device,
+        dtype=dtype,
+        first_seed=first_seed,
+        episodes=episodes,
+    )
+    _run(spec, out or _default_out(spec, resume), resume, workers, no_cache, as_json)
+
+
+def _shipped() -> dict[str, Any]:
+    from harness.resources import DATASET, folder
+
+    manifest: dict[str, Any] = json.loads((folder("datasets") / DATASET / "manifest.json").read_text())
+    return manifest
+
+
+def _default_out(spec: "Drive", resume: bool) -> Path:
+    from dataclasses import replace
+
+    from harness.cli.evaluate import default_out
+
+    named = replace(spec.dataset, manifest={**spec.dataset.manifest, "name": "drive"})
+    return default_out(replace(spec, dataset=named), resume)
+
+
+def _run(spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, as_json: bool) -> None:
+    from harness.backends.cache import default_file
+    from harness.cli.evaluate import as_mapping
+    from harness.cli.progress import bar
+    from harness.drive.run import run
+
+    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json) as progress:
+        done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
+    if as_json:
+        typer.echo(json.dumps(as_mapping(done), indent=1))
+        return
+    _table(done)
+    typer.echo(f"wrote {out / 'episodes.csv'}, summary.csv, rows.jsonl and run.json")
+
+
+def _table(done: "Evaluated") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from harness.cli.estimates import interval
+
+    console = Console(width=80, markup=False, highlight=False)
+    rows = done.summary[done.summary.interval != "seed means"]
+    figures: dict[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
+    table = Table(box=None, width=80, pad_edge=False)
+    table.add_column("condition", no_wrap=True)
+    for heading in ("success % [95 % CI]", "crash", "late", "latency", "missed", "gap", "clear"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for point in done.manifest["conditions"]:
+        name = point["name"]
+
+        def cell(metric: str, scale: float = 1.0, unit: str = "", name: str = name) -> str:
+            value = figures[name, metric].value
+            return "-" if value != value else f"{value * scale:.1f}{unit}"
+
+        success = figures[name, "success_rate"]
+        table.add_row(
+            name,
+            interval(success.value, success.ci_low, success.ci_high, 100),
+            cell("collision_rate", 100, " %"),
+            cell("late_rate", 100, " %"),
+            cell("latency_proxy_ms", 1, " ms"),
+            cell("deadline_miss_rate", 100, " %"),
+            cell("least_gap_m", 1, " m"),
+            cell("time_to_clear_s", 1, " s"),
+        )
+    m = done.manifest
+    console.print(
+        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · driven live"
+    )
+    console.print(table)
+    last = m["first_seed"] + m["episodes"] - 1
+    console.print(
+        f"n = {m['episodes']} episodes (layout seeds {m['first_seed']} to {last}) × "
+        f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the window; "
+        "means: least gap,\nand seconds to clear where the ego did"
+    )
+    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
+    if m.get("cached_answers"):
+        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
+    if m.get("engine_errors"):
+        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
+    for role in ("ego", "helper"):
+        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
+        if shares[0] is not None:
+            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
+            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")

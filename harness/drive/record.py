@@ -1,0 +1,114 @@
+"""The record of a live run: a row a moment with every raw text, and a row an episode."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.coordination import Coordination
+from harness.dataset.load import Scene
+from harness.drive.episode import Episode, Trajectory
+from harness.metrics import known_mean
+from harness.outcome import Outcome
+from harness.run.intents import Intents
+from harness.run.record import answered, number
+from harness.scenarios.occluded_intersection import Parameters
+
+Row = dict[str, Any]
+
+# What is counted in a decision, of which an episode has the mean.
+MEANS = (
+    "latency_ms", "deadline_missed", "triggered", "effective_loss", "observed_loss", "entropy_nats",
+    "normalised_entropy", "own_failed",
+)  # fmt: skip
+
+
+def moments(scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]]) -> list[Row]:
+    """A row a moment: its answers, and what each condition and seed that was there made of them."""
+    return [
+        {
+            "scene": scene.id,
+            "episode": scene.record["episode"],
+            "step": scene.record["step"],
+            "danger": scene.record["danger"]["sector"],
+            "answers": {
+                viewer: answered(answer, parsed, "ego" if j == 0 else "helper")
+                for j, (viewer, answer, parsed) in enumerate(
+                    zip(scene.viewers, known.answers[i], known.parsed[i], strict=False)
+                )
+                if answer and parsed
+            },
+            "decisions": made[i],
+        }
+        for i, scene in enumerate(scenes)
+    ]
+
+
+def decisions(
+    c: Coordination,
+    condition: str,
+    seeds: Sequence[int],
+    viewers: Sequence[Sequence[str]],
+    actions: Sequence[str],
+) -> Iterator[Row]:
+    """One condition's decisions (n,), each of an episode with its seed; `acted` is not known yet."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        observed = np.where(c.messages > 0, c.lost / c.messages, np.nan)
+    table = {
+        "action": c.action, "deadline_missed": c.deadline_missed, "entropy_nats": c.entropy_nats.round(6),
+        "fused": c.fused.round(6), "latency_ms": (c.latency_s * 1000).round(3),
+        "normalised_entropy": c.normalised_entropy.round(6), "own_failed": c.own_failed,
+        "triggered": c.triggered, "effective_loss": np.where(c.triggered, c.loss, np.nan),
+        "observed_loss": observed, "own_weight": c.weights[:, 0].round(6),
+    }  # fmt: skip
+    columns: dict[str, list[Any]] = {name: values.tolist() for name, values in table.items()}
+    arrival_ms = (c.arrival_s * 1000).round(3).tolist()
+    for i, seed in enumerate(seeds):
+        messages = [
+            {
+                "from": viewer, "arrival_ms": number(arrival_ms[i][j]),
+                "delivered": bool(c.delivered[i, j]), "on_time": bool(c.on_time[i, j]),
+                "weight": round(float(c.weights[i, 1 + j]), 6),
+            }
+            for j, viewer in enumerate(viewers[i]) if c.asked[i, j]
+        ]  # fmt: skip
+        row: Row = {k: number(v[i]) if isinstance(v[i], float) else v[i] for k, v in columns.items()}
+        named = {"condition": condition, "seed": seed, "action": actions[row["action"]]}
+        yield {**row, **named, "acted": False, "messages": messages}
+
+
+def ended(one: Trajectory, episode: Episode, reference: Outcome | None) -> Row:
+    """What became of an episode; it is `late` if it cleared too long after the `reference`."""
+    found = one.world.outcome
+    outcome = found.judged(reference, Parameters()) if reference else found
+    delay_s = None
+    if reference and reference.time_s is not None and reference.success and found.success:
+        delay_s = round((found.time_s or 0.0) - reference.time_s, 3)
+    known = {name: [_float(d[name]) for d in episode.decisions] for name in MEANS}
+    return {
+        "episode": one.number,
+        "layout_seed": one.world.seed,
+        "danger": one.world.env.layout.danger or "none",
+        "condition": episode.point.name,
+        "seed": episode.seed,
+        "result": outcome.result,
+        "time_s": outcome.time_s,
+        "clear_s": found.time_s if found.success else None,
+        "delay_s": delay_s,
+        "partner": outcome.partner,
+        "striker": outcome.striker,
+        "fault": outcome.fault,
+        "least_gap_m": round(outcome.least_gap_m, 3),
+        "hard_brakings": one.world.hard_brakings,
+        "other_crashes": outcome.other_crashes,
+        "decisions": len(episode.decisions),
+        "skipped": episode.skipped,
+        "never_acted": sum(not d["acted"] for d in episode.decisions),
+        "messages": sum(len(d["messages"]) for d in episode.decisions),
+        "deadline_misses": sum(d["deadline_missed"] for d in episode.decisions),
+        "means": {name: number(float(known_mean(np.array(values), 0))) for name, values in known.items()},
+    }
+
+
+def _float(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
