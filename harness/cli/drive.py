@@ -109,7 +109,7 @@ def _table(done: "Evaluated") -> None:
     console = Console(width=80, markup=False, highlight=False)
     rows = done.summary[done.summary.interval != "seed means"]
     figures: dict[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
-    table = Table(box=None, width=80, pad_edge=False)
+    table = Table(box=None, width=80, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("condition", no_wrap=True)
     for heading in ("success % [95 % CI]", "crash", "late", "latency", "missed", "gap", "clear"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -139,8 +139,8 @@ def _table(done: "Evaluated") -> None:
     last = m["first_seed"] + m["episodes"] - 1
     console.print(
         f"n = {m['episodes']} episodes (layout seeds {m['first_seed']} to {last}) × "
-        f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the window; "
-        "means: least gap,\nand seconds to clear where the ego did"
+        f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
+        "window; gap: the least,\nand clear: seconds to clear where the ego did, both means"
     )
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
     if m.get("cached_answers"):

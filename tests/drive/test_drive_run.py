@@ -1,0 +1,106 @@
+"""A live run's folder: its files, the same for any workers and batch, and after a kill."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from driving import spec
+
+from harness.drive.run import run
+from harness.errors import UserError
+
+FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
+HERE = Path(__file__).parent
+
+
+def folder_of(of, out, workers=1, resume=False, done=None):
+    run(of, out, resume, workers, [].append if done is None else done.append)
+    return {name: (out / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "run"
+    done = []
+    folder_of(spec(episodes=10), out, done=done)
+    assert sum(done) == 10
+    return out
+
+
+def test_a_run_holds_what_was_driven_and_enough_to_drive_it_again(whole):
+    assert {p.name for p in whole.iterdir()} == {*FILES, "run.json"}
+    manifest = json.loads((whole / "run.json").read_text())
+    assert manifest["format"] == "swarmdrive-drive/1"
+    assert manifest["latency"]["inference_s"] == {"ego": 0.145, "helper": 0.145}
+    assert "--episodes 10 --first-seed 0 --seeds 0,1" in manifest["command"]
+    assert manifest["scenario"]["parameters"]["simulation_hz"] == 50
+    with (whole / "episodes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 10 * 3 * 2
+    places = [(int(r["episode"]), r["condition"], int(r["seed"])) for r in rows]
+    assert places == [(e, c, s) for e in range(10) for c in ("single-local", "v2x", "6g") for s in (0, 1)]
+    assert {r["partner"] != "" for r in rows if r["failure"] == "collision"} == {True}
+
+
+def test_a_summary_agrees_with_its_episodes(whole):
+    episodes, summary = pd.read_csv(whole / "episodes.csv"), pd.read_csv(whole / "summary.csv")
+    for condition, mine in episodes.groupby("condition"):
+        figures = summary[(summary.condition == condition) & (summary.interval == "episodes")]
+        value = figures.set_index("metric").value
+        assert value["success_rate"] == pytest.approx(mine.success.mean())
+        assert value["collision_rate"] == pytest.approx((mine.failure == "collision").mean())
+        ends = ("success_rate", "collision_rate", "late_rate", "time_out_rate", "off_road_rate")
+        assert sum(value[end] for end in ends) == pytest.approx(1.0)
+        assert value["unsafe_rate"] == pytest.approx(1.0 - value["success_rate"] - value["late_rate"])
+        assert value["messages_per_episode"] == pytest.approx(mine.messages.mean())
+        assert value["hard_brakings_per_episode"] == pytest.approx(mine.hard_brakings.mean())
+    assert summary[summary.condition == "all"].metric.tolist()[:2] == [
+        "strict_rate_ego",
+        "recovered_rate_ego",
+    ]
+
+
+@pytest.mark.parametrize(("workers", "batch_size"), [(2, 8), (1, 1), (1, 100), (2, 3)])
+def test_workers_and_batches_change_no_byte(whole, tmp_path, workers, batch_size):
+    found = folder_of(spec(episodes=10, batch_size=batch_size), tmp_path / "run", workers)
+    assert found == {name: (whole / name).read_bytes() for name in FILES}
+
+
+@pytest.mark.slow
+def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path):
+    cruise = spec("cruise", seeds=(0,), episodes=17)  # three chunks
+    expected = folder_of(cruise, tmp_path / "whole")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
+    resumed = 0
+    for n in (3, 8, 12, 19):
+        out = tmp_path / f"at-{n}"
+        command = [sys.executable, str(HERE / "killed_drive.py"), str(out), str(n)]
+        killed = subprocess.run(command, env=environment, capture_output=True, check=False)
+        assert killed.returncode == -9, killed.stderr
+        if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
+            with pytest.raises(UserError, match="add --resume to go on"):
+                run(cruise, out, False, 1, lambda done: None)
+            with pytest.raises(UserError, match="begun with another seeds"):
+                run(spec("cruise", seeds=(1,), episodes=17), out, True, 1, lambda done: None)
+            resumed += 1
+        assert folder_of(cruise, out, resume=True) == expected
+        assert {p.name for p in out.iterdir()} == {*FILES, "run.json"}
+    assert resumed >= 3
+
+
+def test_a_finished_run_is_not_driven_over(whole):
+    with pytest.raises(UserError, match="already holds a finished run"):
+        run(spec(episodes=10), whole, False, 1, lambda done: None)
+    again = run(spec(episodes=10), whole, True, 1, lambda done: pytest.fail("driven again"))
+    assert again.manifest["episodes"] == 10
+
+
+def test_a_model_that_is_not_there_leaves_nothing_behind(tmp_path):
+    with pytest.raises(UserError, match="no such"):
+        run(spec("replay:/nowhere"), tmp_path / "run", False, 1, lambda done: None)
+    assert list(tmp_path.iterdir()) == []
