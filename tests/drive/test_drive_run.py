@@ -77,7 +77,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     resumed = 0
-    for n in (3, 8, 12, 19):
+    for n in (8, 22, 26, 40):
         out = tmp_path / f"at-{n}"
         command = [sys.executable, str(HERE / "killed_drive.py"), str(out), str(n)]
         killed = subprocess.run(command, env=environment, capture_output=True, check=False)
@@ -90,7 +90,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
             resumed += 1
         assert folder_of(cruise, out, resume=True) == expected
         assert {p.name for p in out.iterdir()} == {*FILES, "run.json"}
-    assert resumed >= 3
+    assert resumed == 3
 
 
 def test_a_finished_run_is_not_driven_over(whole):
