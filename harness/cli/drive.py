@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
     from harness.drive.spec import Drive
     from harness.run.evaluate import Evaluated
+    from harness.run.spec import Latency
 
 ALL = "all"
 
@@ -20,7 +21,10 @@ def drive(
     model: str = typer.Option("proxy", help="Card, checkpoint directory, .gguf file, hub id, or a driver."),
     engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
     prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
-    condition: list[str] = typer.Option([], help="Operating point; repeat for several. Default: all."),
+    condition: list[str] = typer.Option(
+        [],
+        help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all.",
+    ),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
@@ -30,6 +34,10 @@ def drive(
     workers: int = typer.Option(2, help="Processes, each with the model loaded."),
     device: str | None = typer.Option(None, help="cpu or cuda."),
     dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
+    latency: str | None = typer.Option(
+        None,
+        help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's.",
+    ),
     out: Path | None = typer.Option(None, help="The run's folder. Default: reports/<model>-<prompt>-drive."),
     resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
@@ -63,6 +71,7 @@ def drive(
         batch_size=batch_size,
         device=device,
         dtype=dtype,
+        latency=cast("Latency | None", latency),
         first_seed=first_seed,
         episodes=episodes,
     )
@@ -110,7 +119,7 @@ def _table(done: "Evaluated") -> None:
     rows = done.summary[done.summary.interval != "seed means"]
     figures: dict[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
     table = Table(box=None, width=80, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("condition", no_wrap=True)
+    table.add_column("condition", overflow="fold")
     for heading in ("success % [95 % CI]", "crash", "late", "latency", "missed", "gap", "clear"):
         table.add_column(heading, justify="right", no_wrap=True)
     for point in done.manifest["conditions"]:
@@ -147,7 +156,7 @@ def _table(done: "Evaluated") -> None:
         console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
     if m.get("engine_errors"):
         console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
-    for role in ("ego", "helper"):
+    for role in ("ego", "helper", "merge"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)

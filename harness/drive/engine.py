@@ -7,13 +7,14 @@ action. A decision that is still open when the next is due goes on, and the next
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from harness import live, luck
+from harness.arrays import Floats, Ints
 from harness.backends.base import Backend
 from harness.coordination import coordinate
 from harness.dataset.freeze import moment
@@ -22,11 +23,14 @@ from harness.drive import record
 from harness.drive.episode import Decision, Episode, Trajectory
 from harness.drive.spec import Drive
 from harness.drivers import PRIVILEGED
-from harness.exchange import Luck
+from harness.exchange import Luck, exchange
 from harness.files import digest
+from harness.operating_point import OperatingPoint
+from harness.run import merging
 from harness.run.asking import answer_of, requests
 from harness.run.intents import Intents, intents
-from harness.run.timing import inference_s
+from harness.run.merging import Merged
+from harness.run.timing import inference_s, merge_s
 from harness.scenarios.occluded_intersection import Parameters
 from harness.world import World
 
@@ -98,39 +102,80 @@ def _decide(
     scenes = tuple(look(spec, one, step) for one, _ in deciding)
     asked = list(requests(spec, scenes))
     by_id = {r.id: answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)}
-    known = intents(replace(spec.dataset, scenes=scenes), by_id, spec.answer, spec.thinking)
+    live_scenes = replace(spec.dataset, scenes=scenes)
+    known = intents(live_scenes, by_id, spec.answer, spec.thinking)
     seconds = inference_s(latency, known.answers)
-    for point in spec.points:
-        places = [(n, e) for n, (_, free) in enumerate(deciding) for e in free if e.point is point]
-        if places:
-            _coordinate(spec, known, seconds, scenes, step, places)
+    rounds = [
+        _Round(point, step, scenes, known, seconds, places)
+        for point in spec.points
+        if (places := [(n, e) for n, (_, free) in enumerate(deciding) for e in free if e.point is point])
+    ]
+    second = _asked_again(replace(spec, dataset=live_scenes), backend, latency, known, rounds)
+    for one_round in rounds:
+        one_round.decide(spec.dataset.actions, second)
     made = [[e.decisions[-1] for e in free] for _, free in deciding]
-    return record.moments(scenes, known, made)
+    return record.moments(scenes, known, made, second)
 
 
-def _coordinate(
-    spec: Drive, known: Intents, seconds: Any, scenes: Sequence[Scene], step: int,
-    places: Sequence[tuple[int, Episode]],
-) -> None:  # fmt: skip
-    """Make the decisions of one condition's episodes, each in the scene of its place."""
-    at = np.array([n for n, _ in places])
-    helpers = known.valid.shape[1]
-    drawn = [_luck(e.seed, scenes[n].state.episode_seed, helpers) for n, e in places]
-    point = places[0][1].point
-    result = coordinate(
-        point, known.own[at], known.helpers[at], known.valid[at], known.distance_m[at], known.range_m[at],
-        known.payload_bits[at], np.nan_to_num(seconds[at]),
-        Luck(np.array([d[:2].T for d in drawn]), np.array([d[2 + step] for d in drawn])),
-    )  # fmt: skip
-    begun = round(step * P.decision_period_s * P.simulation_hz)
-    viewers = [scenes[n].viewers[1:] for n in at]
-    seeds = [e.seed for _, e in places]
-    made = record.decisions(result, point.name, seeds, viewers, spec.dataset.actions)
-    for (_, episode), decision, latency_s in zip(places, made, result.latency_s.tolist(), strict=True):
-        frame = begun + frames(latency_s)
-        decision["acts_at_s"] = frame / P.simulation_hz
-        episode.decisions.append(decision)
-        episode.open = Decision(decision["action"], frame, decision)
+@dataclass(frozen=True)
+class _Round:
+    """One condition's decisions at one time, each a place among the scenes and an episode."""
+
+    point: OperatingPoint
+    step: int
+    scenes: Sequence[Scene]
+    known: Intents
+    seconds: Floats
+    places: Sequence[tuple[int, Episode]]
+
+    @cached_property
+    def at(self) -> Ints:
+        """(n,) the scene of each decision."""
+        return np.array([n for n, _ in self.places])
+
+    @cached_property
+    def inputs(self) -> dict[str, Any]:
+        """What `exchange` wants."""
+        at, known = self.at, self.known
+        helpers = known.valid.shape[1]
+        drawn = [_luck(e.seed, self.scenes[n].state.episode_seed, helpers) for n, e in self.places]
+        luck = Luck(np.array([d[:2].T for d in drawn]), np.array([d[2 + self.step] for d in drawn]))
+        return {
+            "point": self.point, "own": known.own[at], "helpers": known.helpers[at], "valid": known.valid[at],
+            "range_m": known.range_m[at], "payload_bits": known.payload_bits[at],
+            "infer_s": np.nan_to_num(self.seconds[at]), "luck": luck,
+        }  # fmt: skip
+
+    def codes(self) -> Ints:
+        """Sets of messages that the ego's model is to merge."""
+        on_time = exchange(**self.inputs).on_time
+        return merging.codes_of(on_time, self.at)[on_time.any(axis=1)]
+
+    def decide(self, actions: Sequence[str], second: Merged | None) -> None:
+        """Open every decision."""
+        merge = partial(second, at=self.at) if second else None
+        result = coordinate(**self.inputs, distance_m=self.known.distance_m[self.at], merge=merge)
+        begun = round(self.step * P.decision_period_s * P.simulation_hz)
+        viewers = [self.scenes[n].viewers[1:] for n, _ in self.places]
+        made = record.decisions(result, self.point, [e.seed for _, e in self.places], viewers, actions)
+        ready = [begun + frames(latency_s) for latency_s in result.latency_s.tolist()]
+        for (_, episode), decision, frame in zip(self.places, made, ready, strict=True):
+            decision["acts_at_s"] = frame / P.simulation_hz
+            episode.decisions.append(decision)
+            episode.open = Decision(decision["action"], frame, decision)
+
+
+def _asked_again(
+    spec: Drive, backend: Backend, latency: Mapping[str, Any], known: Intents, rounds: Sequence[_Round]
+) -> Merged | None:
+    """The ego's second answers, where a condition merges messages by its model and some have arrived."""
+    found = [one.codes() for one in rounds if one.point.asks_again]
+    if not any(map(len, found)):
+        return None
+    codes = np.unique(np.concatenate(found))
+    asked = list(merging.requests(spec, known, codes))
+    answers = [answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)]
+    return merging.merged(spec, codes, answers, merge_s(latency, answers))
 
 
 @lru_cache(maxsize=4096)

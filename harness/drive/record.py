@@ -9,9 +9,11 @@ from harness.coordination import Coordination
 from harness.dataset.load import Scene
 from harness.drive.episode import Episode, Trajectory
 from harness.metrics import known_mean
+from harness.operating_point import OperatingPoint
 from harness.outcome import Outcome
 from harness.run.intents import Intents
-from harness.run.record import answered, number
+from harness.run.merging import Merged
+from harness.run.record import answered, by_scene, number
 from harness.scenarios.occluded_intersection import Parameters
 
 Row = dict[str, Any]
@@ -19,12 +21,18 @@ Row = dict[str, Any]
 # What is counted in a decision, of which an episode has the mean.
 MEANS = (
     "latency_ms", "deadline_missed", "triggered", "effective_loss", "observed_loss", "entropy_nats",
-    "normalised_entropy", "own_failed",
+    "normalised_entropy", "own_failed", "fusion_ms", "merge_failed",
 )  # fmt: skip
 
 
-def moments(scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]]) -> list[Row]:
-    """A row a moment: its answers, and what each condition and seed that was there made of them."""
+def moments(
+    scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]], second: Merged | None
+) -> list[Row]:
+    """A row a moment: its answers, and what each condition and seed that was there made of them.
+
+    `merged` has the ego's second answers by whose messages it had, where there are any.
+    """
+    again = by_scene(scenes, known, second) if second else {}
     return [
         {
             "scene": scene.id,
@@ -38,6 +46,7 @@ def moments(scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]]) 
                 )
                 if answer and parsed
             },
+            **({"merged": again[i]} if i in again else {}),
             "decisions": made[i],
         }
         for i, scene in enumerate(scenes)
@@ -46,7 +55,7 @@ def moments(scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]]) 
 
 def decisions(
     c: Coordination,
-    condition: str,
+    point: OperatingPoint,
     seeds: Sequence[int],
     viewers: Sequence[Sequence[str]],
     actions: Sequence[str],
@@ -60,6 +69,8 @@ def decisions(
         "normalised_entropy": c.normalised_entropy.round(6), "own_failed": c.own_failed,
         "triggered": c.triggered, "effective_loss": np.where(c.triggered, c.loss, np.nan),
         "observed_loss": observed, "own_weight": c.weights[:, 0].round(6),
+        "fusion_ms": ((c.latency_s - c.exchange_s) * 1000).round(3),
+        "merge_failed": np.where(c.on_time.any(axis=1) & point.asks_again, c.merge_failed, np.nan),
     }  # fmt: skip
     columns: dict[str, list[Any]] = {name: values.tolist() for name, values in table.items()}
     arrival_ms = (c.arrival_s * 1000).round(3).tolist()
@@ -68,12 +79,12 @@ def decisions(
             {
                 "from": viewer, "arrival_ms": number(arrival_ms[i][j]),
                 "delivered": bool(c.delivered[i, j]), "on_time": bool(c.on_time[i, j]),
-                "weight": round(float(c.weights[i, 1 + j]), 6),
+                "weight": number(round(float(c.weights[i, 1 + j]), 6)),
             }
             for j, viewer in enumerate(viewers[i]) if c.asked[i, j]
         ]  # fmt: skip
         row: Row = {k: number(v[i]) if isinstance(v[i], float) else v[i] for k, v in columns.items()}
-        named = {"condition": condition, "seed": seed, "action": actions[row["action"]]}
+        named = {"condition": point.name, "seed": seed, "action": actions[row["action"]]}
         yield {**row, **named, "acted": False, "messages": messages}
 
 

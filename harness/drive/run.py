@@ -20,9 +20,12 @@ from harness.drive.summary import summary
 from harness.errors import UserError, printable
 from harness.files import canonical_json, write_whole
 from harness.memory import uncollected
+from harness.run import merging
+from harness.run.asking import answer_of, requests
 from harness.run.evaluate import CONFIG, Evaluated, finished, refuse, tidy, working
+from harness.run.intents import intents
 from harness.run.spec import versions
-from harness.run.timing import SAMPLE, measure
+from harness.run.timing import SAMPLE, measure, merge_latency
 from harness.workers import spread
 
 if TYPE_CHECKING:
@@ -91,6 +94,16 @@ def _begin(spec: Drive) -> tuple[dict[str, Any], dict[str, Any]]:
     sample = replace(spec, dataset=replace(spec.dataset, scenes=tuple(scenes)), batch_size=2)
     with TemporaryDirectory() as folder:
         latency = measure(sample, backend, Path(folder) / "latency.json")
+    if any(point.asks_again for point in spec.points):
+        asked = list(requests(sample, scenes))
+        by_id = {r.id: answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)}
+        known = intents(sample.dataset, by_id, spec.answer, spec.thinking)
+        heard = merging.codes_of(known.valid)[known.valid.any(axis=1)]
+        second = list(merging.requests(sample, known, heard))
+        latency = {
+            "merge_s": latency["inference_s"]["ego"],
+            **merge_latency(sample, backend, latency, second, {}),
+        }
     if latency["inference_s"] is None or None in latency["inference_s"].values():
         raise UserError(
             f"--model {printable(spec.card.name)}: none of {len(scenes)} trial answers could be timed, and "
@@ -135,7 +148,7 @@ def _written(spec: Drive, out: Path, work: Path, begun: Mapping[str, Any]) -> Ev
     moments: list[Row] = [row for part in parts for row in part["moments"]]
     episodes: list[Row] = [row for part in parts for row in part["episodes"]]
     result = summary(spec, moments, episodes)
-    answers = [answer for row in moments for answer in row["answers"].values()]
+    answers = [a for row in moments for a in (*row["answers"].values(), *row.get("merged", {}).values())]
     manifest = {
         "format": FORMAT,
         "name": out.name,

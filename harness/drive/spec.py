@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from harness.cards import Card
-from harness.consensus import RULES
 from harness.dataset.load import Dataset
 from harness.errors import UserError, printable
 from harness.operating_point import OperatingPoint
@@ -36,12 +35,6 @@ class Drive(Spec):
                 f"--model {printable(self.card.name)}: a replay has answers to frozen scenes alone; "
                 "give the model that it replays"
             )
-        for point in self.points:
-            if point.consensus not in RULES:
-                raise UserError(
-                    f"--condition {printable(point.name)}: consensus {point.consensus} asks the ego again, "
-                    f"which is not driven live; use one of {', '.join(RULES)}"
-                )
 
     def settings(self) -> dict[str, Any]:
         """What a resumed run must have in common with the one it continues."""
@@ -61,7 +54,7 @@ class Drive(Spec):
             ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
-            ("--out", out),
+            ("--latency", self.latency), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         return shlex.join(["harness", "drive", *parts, *(["--thinking"] if self.thinking else [])])

@@ -39,6 +39,7 @@ PER_EPISODE: dict[str, Callable[[Row], Any]] = {
 NAMES = {  # what a frozen run's summary calls the mean of a decision's count
     "latency_ms": "latency_proxy_ms", "deadline_missed": "deadline_miss_rate", "triggered": "trigger_rate",
     "observed_loss": "observed_reply_loss", "own_failed": "fallback_rate",
+    "merge_failed": "merge_failed_rate",
 }  # fmt: skip
 
 
@@ -69,8 +70,8 @@ def _estimates(
             yield point.name, f"latency_p{percent}_ms", over_seeds("latency", each), "seed means"
         yield point.name, "message_count", seed_interval(metrics["messages_per_episode"].sum(1)), "seed means"
     yield from gains(by_condition)
-    answers = [answer for row in moments for answer in row["answers"].values()]
-    by_role = {role: [a for a in answers if a["role"] == role] for role in ("ego", "helper")}
+    answers = [a for row in moments for a in (*row["answers"].values(), *row.get("merged", {}).values())]
+    by_role = {role: [a for a in answers if a["role"] == role] for role in ("ego", "helper", "merge")}
     yield from of_answers({role: [a["verdict"] for a in given] for role, given in by_role.items()}, by_role)
 
 

@@ -39,10 +39,13 @@ class Merged:
     intents: Floats
     seconds: Floats
 
-    def __call__(self, on_time: Bools) -> tuple[Floats, Floats]:
-        """Intents (n, A) and seconds (n,) for who was heard, (n, H); NaN where nobody was."""
+    def __call__(self, on_time: Bools, at: Ints | None = None) -> tuple[Floats, Floats]:
+        """Intents (n, A) and seconds (n,) for who was heard, (n, H); NaN where nobody was.
+
+        `at` (n,) says which decision each is of; None where they are the decisions in order.
+        """
         anybody = on_time.any(axis=1)
-        wanted = codes_of(on_time)[anybody]
+        wanted = codes_of(on_time, at)[anybody]
         place = np.searchsorted(self.codes, wanted)
         if not np.array_equal(self.codes[np.minimum(place, len(self.codes) - 1)], wanted):
             raise LookupError("a set of messages was delivered that the ego's model was never asked about")
@@ -52,10 +55,11 @@ class Merged:
         return intents, seconds
 
 
-def codes_of(on_time: Bools) -> Ints:
-    """One number for a decision and who was heard in it, (n,), from (n, H)."""
+def codes_of(on_time: Bools, at: Ints | None = None) -> Ints:
+    """One number for a decision and who was heard in it, (n,), from (n, H); `at` as in `Merged`."""
     n, helpers = on_time.shape
-    return np.asarray(np.arange(n) << helpers | on_time @ (1 << np.arange(helpers)))
+    at = np.arange(n) if at is None else at
+    return np.asarray(at << helpers | on_time @ (1 << np.arange(helpers)))
 
 
 def places_of(code: int, helpers: int) -> list[int]:

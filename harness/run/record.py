@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.dataset.load import Scene
 from harness.files import canonical_json
 from harness.frozen import Table
 from harness.metrics import known_mean
@@ -27,7 +28,7 @@ def rows(
 
     `merged` has the ego's second answers by whose messages it had, where there are any.
     """
-    again = _second(spec, known, second) if second else {}
+    again = by_scene(spec.dataset.scenes, known, second) if second else {}
     scenes = spec.dataset.scenes
     helpers = [scene.viewers[1:] for scene in scenes]
     tables = [_decisions(run, helpers, spec.dataset.actions) for run in runs]
@@ -50,13 +51,13 @@ def rows(
         }) + "\n"  # fmt: skip
 
 
-def _second(spec: Spec, known: Intents, second: Merged) -> dict[int, dict[str, Any]]:
-    """By scene."""
+def by_scene(scenes: Sequence[Scene], known: Intents, second: Merged) -> dict[int, dict[str, Any]]:
+    """The ego's second answers by place of the scene and by whose messages it had."""
     found: dict[int, dict[str, Any]] = {}
     helpers = known.valid.shape[1]
     for code, answer, parsed in zip(second.codes.tolist(), second.answers, second.parsed, strict=True):
         i = code >> helpers
-        heard = request_id(spec.dataset.scenes[i], places_of(code, helpers)).partition("/")[2]
+        heard = request_id(scenes[i], places_of(code, helpers)).partition("/")[2]
         found.setdefault(i, {})[heard] = answered(answer, parsed, "merge")
     return found
 
