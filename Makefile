@@ -27,6 +27,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/coordinate.py
 	$(BIN)/python benchmarks/study.py
 	$(BIN)/python benchmarks/answer_modes.py
+	$(BIN)/python benchmarks/drive.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

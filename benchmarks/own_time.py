@@ -39,7 +39,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "prompt": [(Prompt, "render")],
     "parse": [(intents, "parse")],
     "coordinate": [(evaluate, "score")],
-    "record": [(asking, "_answer"), (asking, "canonical_json"), (record, "rows"), (record, "episodes"),
+    "record": [(asking, "answer_of"), (asking, "canonical_json"), (record, "rows"), (record, "episodes"),
                (evaluate, "summary"), (evaluate, "write_whole")],
 }  # fmt: skip
 LIMIT = "limit"

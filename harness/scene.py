@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -54,8 +55,13 @@ class VehicleState:
         return SIZES_M[self.kind][1]
 
     def corners(self) -> NDArray[np.float64]:
-        """(4, 2) m, front left first, then clockwise as seen from above."""
-        return rectangle(self.x_m, self.y_m, self.heading_rad, self.length_m, self.width_m)
+        """(4, 2) m, front left first, then clockwise as seen from above. Shared: not to be written to."""
+        return _corners(self)
+
+
+@lru_cache(maxsize=256)  # every viewer of a scene looks at the same vehicles
+def _corners(v: VehicleState) -> Floats:
+    return rectangle(v.x_m, v.y_m, v.heading_rad, v.length_m, v.width_m)
 
 
 def rectangle(

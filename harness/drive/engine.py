@@ -168,13 +168,14 @@ class _Round:
 def _asked_again(
     spec: Drive, backend: Backend, latency: Mapping[str, Any], known: Intents, rounds: Sequence[_Round]
 ) -> Merged | None:
-    """The ego's second answers, where a condition merges messages by its model and some have arrived."""
+    """The ego's second answers, where a condition has its model merge messages; empty if nobody was heard."""
     found = [one.codes() for one in rounds if one.point.asks_again]
-    if not any(map(len, found)):
+    if not found:
         return None
     codes = np.unique(np.concatenate(found))
     asked = list(merging.requests(spec, known, codes))
-    answers = [answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)]
+    completions = backend.complete(asked) if asked else []
+    answers = [answer_of(r, c) for r, c in zip(asked, completions, strict=True)]
     return merging.merged(spec, codes, answers, merge_s(latency, answers))
 
 

@@ -1,13 +1,14 @@
 """The record of a live run: a row a moment with every raw text, and a row an episode."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.coordination import Coordination
 from harness.dataset.load import Scene
 from harness.drive.episode import Episode, Trajectory
+from harness.drive.spec import Drive
 from harness.metrics import known_mean
 from harness.operating_point import OperatingPoint
 from harness.outcome import Outcome
@@ -15,6 +16,9 @@ from harness.run.intents import Intents
 from harness.run.merging import Merged
 from harness.run.record import answered, by_scene, number
 from harness.scenarios.occluded_intersection import Parameters
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Row = dict[str, Any]
 
@@ -123,3 +127,23 @@ def ended(one: Trajectory, episode: Episode, reference: Outcome | None) -> Row:
 
 def _float(value: float | None) -> float:
     return float("nan") if value is None else float(value)
+
+
+def episodes(spec: Drive, rows: Sequence[Row]) -> "pd.DataFrame":
+    """The table of `episodes.csv`: a frozen run's columns, then what only driving shows."""
+    import pandas as pd
+
+    return pd.DataFrame(
+        {
+            "model": spec.card.name, "prompt": spec.prompt.version, "answer": spec.answer,
+            "condition": e["condition"], "seed": e["seed"], "episode": e["episode"], "danger": e["danger"],
+            "success": e["result"] == "cleared", "failure": "" if e["result"] == "cleared" else e["result"],
+            "delay_s": e["delay_s"], "messages": e["messages"], "trigger_rate": e["means"]["triggered"],
+            "latency_ms": e["means"]["latency_ms"], "deadline_misses": e["deadline_misses"],
+            **{k: e[k] for k in (
+                "layout_seed", "time_s", "partner", "striker", "fault", "least_gap_m", "hard_brakings",
+                "other_crashes", "decisions", "skipped", "never_acted",
+            )},
+        }
+        for e in rows
+    )  # fmt: skip

@@ -2,34 +2,26 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from harness.backends.base import Backend, Rendering
-from harness.backends.cache import Cached
-from harness.backends.registry import open_backend
-from harness.cards import Card
-from harness.drive.engine import P, drive, look, start
+from harness.drive import record
+from harness.drive.engine import drive
+from harness.drive.model import begin, opened
 from harness.drive.record import Row
 from harness.drive.spec import FORMAT, Drive
 from harness.drive.summary import summary
-from harness.errors import UserError, printable
 from harness.files import canonical_json, write_whole
 from harness.memory import uncollected
-from harness.run import merging
-from harness.run.asking import answer_of, requests
 from harness.run.evaluate import CONFIG, Evaluated, finished, refuse, tidy, working
-from harness.run.intents import intents
 from harness.run.spec import versions
-from harness.run.timing import SAMPLE, measure, merge_latency
 from harness.workers import spread
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 EPISODES_AT_ONCE = 8  # driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
@@ -62,7 +54,7 @@ def run(
     # Compiled templates do not travel between processes.
     spec = replace(spec, prompt=replace(spec.prompt))
     # Engines are opened where they are asked: a process that is forked has none of their threads.
-    [(identity, latency)] = spread(_begin, [spec], workers, lambda done: None)
+    [(identity, latency)] = spread(begin, [spec], workers, lambda done: None)
     with working(spec, out, identity) as work:
         kept = work / "latency.json"
         if kept.is_file():
@@ -79,50 +71,6 @@ def run(
     return done
 
 
-def _begin(spec: Drive) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Identity of the model and latency of its decisions.
-
-    An answer's own seconds depend on what else the machine does, so a measured latency is always the median
-    of a sample: the same in every episode, with any number of workers.
-    """
-    backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, None)
-    scenes = []
-    for number in range(min(SAMPLE, spec.episodes)):
-        trajectory = start(spec, number)
-        trajectory.world.advance(round(number * P.decision_period_s * P.simulation_hz / 2))
-        scenes.append(look(spec, trajectory, 0))
-    sample = replace(spec, dataset=replace(spec.dataset, scenes=tuple(scenes)), batch_size=2)
-    with TemporaryDirectory() as folder:
-        latency = measure(sample, backend, Path(folder) / "latency.json")
-    if any(point.asks_again for point in spec.points):
-        asked = list(requests(sample, scenes))
-        by_id = {r.id: answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)}
-        known = intents(sample.dataset, by_id, spec.answer, spec.thinking)
-        heard = merging.codes_of(known.valid)[known.valid.any(axis=1)]
-        second = list(merging.requests(sample, known, heard))
-        latency = {
-            "merge_s": latency["inference_s"]["ego"],
-            **merge_latency(sample, backend, latency, second, {}),
-        }
-    if latency["inference_s"] is None or None in latency["inference_s"].values():
-        raise UserError(
-            f"--model {printable(spec.card.name)}: none of {len(scenes)} trial answers could be timed, and "
-            "no episode goes on without a latency; see what `harness model check` says"
-        )
-    return backend.identity(), latency
-
-
-@lru_cache(maxsize=2)
-def _opened(
-    card: Card, device: str | None, dtype: str | None, batch_size: int, cache: Path | None
-) -> Backend:
-    """This process's backend."""
-    if cache is not None:
-        backend = _opened(card, device, dtype, batch_size, None)
-        return Cached(backend, cache) if isinstance(backend, Rendering) else backend
-    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
-
-
 def _chunks(spec: Drive) -> list[range]:
     """Numbers of episodes that are driven together: enough to fill a batch."""
     size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
@@ -136,7 +84,7 @@ def _file(work: Path, chunk: range) -> Path:
 def _driven(spec: Drive, latency: Mapping[str, Any], work: Path, cache: Path | None, chunk: range) -> None:
     """Drive a chunk, unless that was done before."""
     if not _file(work, chunk).is_file():
-        backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, cache)
+        backend = opened(spec.card, spec.device, spec.dtype, spec.batch_size, cache)
         moments, episodes = drive(spec, backend, latency, chunk)
         write_whole(_file(work, chunk), canonical_json({"moments": moments, "episodes": episodes}))
 
@@ -163,27 +111,7 @@ def _written(spec: Drive, out: Path, work: Path, begun: Mapping[str, Any]) -> Ev
         "versions": versions(),
     }
     write_whole(out / "rows.jsonl", "".join(canonical_json(row) + "\n" for row in moments))
-    write_whole(out / "episodes.csv", _table(spec, episodes).to_csv(index=False))
+    write_whole(out / "episodes.csv", record.episodes(spec, episodes).to_csv(index=False))
     write_whole(out / "summary.csv", result.to_csv(index=False))
     write_whole(out / "run.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     return Evaluated(out, manifest, result)
-
-
-def _table(spec: Drive, episodes: Sequence[Row]) -> "pd.DataFrame":
-    """The table of `episodes.csv`: a frozen run's columns, then what only driving shows."""
-    import pandas as pd
-
-    return pd.DataFrame(
-        {
-            "model": spec.card.name, "prompt": spec.prompt.version, "answer": spec.answer,
-            "condition": e["condition"], "seed": e["seed"], "episode": e["episode"], "danger": e["danger"],
-            "success": e["result"] == "cleared", "failure": "" if e["result"] == "cleared" else e["result"],
-            "delay_s": e["delay_s"], "messages": e["messages"], "trigger_rate": e["means"]["triggered"],
-            "latency_ms": e["means"]["latency_ms"], "deadline_misses": e["deadline_misses"],
-            **{k: e[k] for k in (
-                "layout_seed", "time_s", "partner", "striker", "fault", "least_gap_m", "hard_brakings",
-                "other_crashes", "decisions", "skipped", "never_acted",
-            )},
-        }
-        for e in episodes
-    )  # fmt: skip

@@ -18,10 +18,12 @@ ALONE = POINTS["single-local"]
 
 
 class Script:
-    """A backend whose answers are a function of who is asked at which decision."""
+    """A backend whose answers are a function of who is asked when; `merged` is any second answer."""
 
-    def __init__(self, line: Callable[[str, int], Sequence[float]]) -> None:
-        self.line = line
+    def __init__(
+        self, line: Callable[[str, int], Sequence[float]], merged: Sequence[float] = (0.0, 1.0, 0.0)
+    ) -> None:
+        self.line, self.merged = line, merged
         self.asked: list[str] = []
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
@@ -29,8 +31,7 @@ class Script:
 
     def _say(self, request: Request) -> Completion:
         self.asked.append(request.id)
-        assert request.view is not None
-        p = self.line(request.view["viewer"], request.view["step"])
+        p = self.line(request.view["viewer"], request.view["step"]) if request.view else self.merged
         return Completion(request.id, says(p, request.role), None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
@@ -54,9 +55,10 @@ def driven(
     latency = {
         "source": "card",
         "inference_s": dict.fromkeys(("ego", "helper"), inference_s),
+        "merge_s": inference_s,
         "basis": "test",
     }
-    return drive(of, backend or open_backend(of.card), latency, episodes)
+    return drive(of, backend or open_backend(of.card, batch_size=of.batch_size), latency, episodes)
 
 
 def decisions(moments: Sequence[Row], condition: str, seed: int = 0) -> dict[int, Row]:

@@ -72,6 +72,7 @@ def test_workers_and_batches_change_no_byte(whole, tmp_path, workers, batch_size
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path):
     cruise = spec("cruise", seeds=(0,), episodes=17)  # three chunks
     expected = folder_of(cruise, tmp_path / "whole")

@@ -12,7 +12,7 @@ from harness.drive.episode import Decision, Episode, Trajectory
 from harness.drivers import DRIVERS
 from harness.frozen import table
 from harness.luck import uniforms
-from harness.operating_point import POINTS
+from harness.operating_point import POINTS, named_point
 from harness.run.scoring import draw
 from harness.world import World
 
@@ -176,3 +176,35 @@ def test_helpers_that_cannot_be_heard_make_no_difference_but_time():
     _, episodes = driven(spec(points=(ALONE, deaf), seeds=(0,), first_seed=FROM_LEFT))
     assert episodes[0]["messages"] == 0 < episodes[1]["messages"]
     assert episodes[1]["means"]["latency_ms"] > episodes[0]["means"]["latency_ms"]
+
+
+def test_messages_that_the_egos_model_merges_take_a_second_inference():
+    """Unsure at 1 s, the ego hears three helpers, is asked again with their messages, and is for braking."""
+    merging = named_point("6g:consensus=ego-prompt")
+    run = spec("swarm-tiny", points=(POINTS["6g"], merging), seeds=(0,), first_seed=NO_DANGER)
+    script = Script(
+        lambda viewer, step: (UNSURE if viewer == "v1" else FASTER) if step == 1 else IDLE, SLOWER
+    )
+    moments, _ = driven(run, backend=script, infer_s=0.1)
+    plain, merged = decisions(moments, "6g"), decisions(moments, merging.name)
+    assert (plain[1]["action"], plain[1]["acts_at_s"]) == ("FASTER", 1.12)
+    assert (merged[1]["action"], merged[1]["acts_at_s"], merged[1]["fusion_ms"]) == ("SLOWER", 1.22, 100.0)
+    assert (merged[0]["fusion_ms"], merged[0]["acts_at_s"]) == (0.0, 0.1)
+    [again] = [row["merged"] for row in moments if "merged" in row]
+    assert list(again) == ["v1+v2+v3+v4"]
+    assert sum("+" in asked for asked in script.asked) == 1
+
+
+@pytest.mark.slow
+def test_a_language_model_in_float32_drives_alike_in_any_company():
+    points = [ALONE, named_point("6g:consensus=ego-prompt")]
+    tiny = spec("swarm-tiny:transformers", points, (0,), first_seed=FROM_LEFT, latency="paper")
+    together = driven(tiny, (0, 1), infer_s=0.145)
+    alone = [driven(replace(tiny, batch_size=1), (e,), infer_s=0.145) for e in (0, 1)]
+    assert together[1] == [episode for _, episodes in alone for episode in episodes]
+    moments = [row for some, _ in alone for row in some]
+    assert any("merged" in row for row in moments)
+    for row in (*moments, *together[0]):
+        for answer in (*row["answers"].values(), *row.get("merged", {}).values()):
+            del answer["batch_size"], answer["seconds"]
+    assert moments == together[0]
