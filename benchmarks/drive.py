@@ -21,7 +21,7 @@ from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from harness import cards, prompts, simulator
+from harness import cards, live, prompts, simulator
 from harness.backends.proxy import Proxy
 from harness.dataset import freeze
 from harness.drive.engine import drive
@@ -31,11 +31,12 @@ from harness.operating_point import POINTS
 from harness.world import World
 
 LATENCY = {"source": "card", "inference_s": {"ego": 0.145, "helper": 0.145}, "basis": "the proxy's card"}
-# Functions whose time makes up a part. A decision's frames and what its vehicles see are the simulator.
+# Functions whose time makes up a part: frames, what is seen, and who drives. The rest is the harness's own.
 PARTS: dict[str, tuple[Any, str]] = {
     "highway-env": (World, "_step"),
     "sensors": (freeze, "scene_graph"),
     "proxy": (Proxy, "complete"),
+    "reference": (live, "decide"),
 }
 
 
