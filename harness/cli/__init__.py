@@ -21,6 +21,7 @@ from harness.cli import (
     report,
     scenario,
     sweep,
+    video,
 )
 from harness.errors import UserError, printable
 
@@ -34,6 +35,7 @@ app = typer.Typer(
 )
 app.command("eval")(evaluate.evaluate)
 app.command("drive")(drive.drive)
+app.command("video")(video.command)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(scenario.app, name="scenario")
