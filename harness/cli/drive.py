@@ -149,7 +149,7 @@ def _table(done: "Evaluated") -> None:
     console.print(
         f"n = {m['episodes']} episodes (layout seeds {m['first_seed']} to {last}) × "
         f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
-        "window; gap: the least,\nand clear: seconds to clear where the ego did, both means"
+        "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means"
     )
     console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
     if m.get("cached_answers"):
