@@ -1,15 +1,17 @@
 """`harness campaign`: whole studies."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import typer
 
-app = typer.Typer(help="Whole studies: the paper's, from one causal simulator.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
+    from harness.run.spec import Latency
 
-
-@app.callback()
-def _group() -> None:
-    """A group of commands, also while it has one."""
+app = typer.Typer(
+    help="Whole studies: the paper's, from one causal simulator, and driven live.", no_args_is_help=True
+)
 
 
 @app.command("paper")
@@ -51,3 +53,50 @@ def paper(
         f"{found['predicted']} predicted, * fitted"
     )
     typer.echo(f"wrote {printable(out / 'index.html')}")
+
+
+@app.command("closed-loop")
+def closed_loop(
+    model: str = typer.Option("proxy", help="Card, checkpoint directory, .gguf file or hub id."),
+    prompt: str = typer.Option("v2", help="Prompt version."),
+    answer: str = typer.Option("json", help="json, constrained or readout."),
+    episodes: int = typer.Option(300, help="Layouts, each driven under every grid point and seed."),
+    first_seed: int = typer.Option(0, help="Layout seed of the first."),
+    seeds: str = typer.Option("0:5", help="Seeds of the channel's luck."),
+    workers: int = typer.Option(2, help="Processes, each with the model loaded."),
+    batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
+    latency: str | None = typer.Option(None, help="Inference times: card, measured or paper."),
+    out: Path | None = typer.Option(None, help="Folder; one that was begun is gone on with."),
+    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON."),
+) -> None:
+    """The paper's panels driven live in highway-env, and its Figures A and B from that."""
+    from harness import cards, prompts
+    from harness.backends.cache import default_file
+    from harness.cli.estimates import in_range
+    from harness.cli.evaluate import parse_seeds
+    from harness.cli.progress import bar
+    from harness.cli.scenario import MOST_WORKERS
+    from harness.cli.sweep import tables
+    from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.drive.spec import spec_of
+    from harness.errors import printable
+    from harness.study.closed_loop import panels, run_closed_loop
+
+    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    in_range("--first-seed", first_seed, 0, LAST_SEED)
+    in_range("--workers", workers, 1, MOST_WORKERS)
+    points = {s.point.name: s.point for panel in panels().values() for s in panel}
+    spec = spec_of(
+        cards.resolve(model), prompts.load(prompt), tuple(points.values()), parse_seeds(seeds),
+        answer=cast("AnswerMode", answer), batch_size=batch_size, latency=cast("Latency | None", latency),
+        first_seed=first_seed, episodes=episodes,
+    )  # fmt: skip
+    named = "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{spec.card.name}-{prompt}")
+    where = out or Path("reports") / f"closed-loop-{named}"
+    with bar("layouts", episodes, quiet=as_json) as progress:
+        summary = run_closed_loop(spec, where, workers, progress, default_file())
+    if as_json:
+        typer.echo(summary.to_json(orient="records"))
+        return
+    tables(summary)
+    typer.echo(f"wrote {printable(where / 'figure-a.svg')} and {printable(where / 'figure-b.svg')}")

@@ -75,14 +75,15 @@ def sweep(
     if as_json:
         typer.echo(summary.to_json(orient="records"))
         return
-    _tables(summary)
+    tables(summary)
     typer.echo(f"wrote {printable(where / 'sweep.svg')}")
 
 
-def _tables(summary: "pd.DataFrame") -> None:
+def tables(summary: "pd.DataFrame") -> None:
+    """A study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
     from harness.cli.estimates import interval
     from harness.errors import printable
-    from harness.study.sweep import CORE
+    from harness.study.setting import CORE
 
     heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
     shown = ""

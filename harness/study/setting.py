@@ -7,6 +7,8 @@ from typing import Any
 from harness.operating_point import OperatingPoint
 from harness.study.axes import Value
 
+CORE = "core"  # the panel that compares operating points
+
 
 @dataclass(frozen=True)
 class Setting:

@@ -13,7 +13,7 @@ from harness.run.spec import versions
 from harness.study import figures
 from harness.study.axes import AXES, Axis, Value, grid
 from harness.study.play import Source, play
-from harness.study.setting import Setting, described
+from harness.study.setting import CORE, Setting, described
 from harness.study.stored import Stored
 from harness.study.tables import joined, write_table
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FORMAT = "swarmdrive-sweep/1"
-CORE = "core"  # the panel that compares operating points
 
 
 def settings(
