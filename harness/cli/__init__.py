@@ -14,6 +14,7 @@ from harness.cli import (
     distill,
     drive,
     evaluate,
+    fidelity,
     model,
     parity,
     parse,
@@ -44,6 +45,7 @@ app.command("report")(report.command)
 app.command("parse")(parse.command)
 app.command("distill")(distill.distill)
 app.command("sweep")(sweep.sweep)
+app.command("fidelity")(fidelity.fidelity)
 app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
 

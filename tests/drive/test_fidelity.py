@@ -1,0 +1,96 @@
+"""Frozen against closed, on four layouts that were frozen and driven."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+
+from harness.dataset.load import Dataset
+from harness.errors import UserError
+from harness.study.fidelity import disagreements, fidelity
+
+Said = tuple[int, str, str]
+LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0:2", "--workers", "1")  # those of `small`
+
+
+@pytest.fixture
+def runs(harness: Callable[..., Said], small: Dataset) -> list[Path]:
+    """Three models, each frozen and driven."""
+    made = []
+    for model in ("proxy", "cruise", "brake"):
+        made.append(evaluate(spec_of(small, model), Path(f"eval-{model}")).out)
+        assert harness("drive", "--model", model, *LAYOUTS, "--out", f"drive-{model}")[0] == 0
+        made.append(Path(f"drive-{model}"))
+    return made
+
+
+def success(run: Path, condition: str) -> pd.Series:
+    table = pd.read_csv(run / "episodes.csv")
+    return table[table.condition == condition].groupby("episode").success.mean()
+
+
+def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> None:
+    found = fidelity(runs)
+    assert len(found.table) == 3 * 3
+    assert len(found.episodes) == 3 * 3 * 2 * 4
+    for row in found.table.itertuples():
+        frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))
+        assert row.frozen == pytest.approx(frozen.mean())
+        assert row.closed == pytest.approx(closed.mean())
+        assert row.difference == pytest.approx((frozen - closed).mean())
+        assert row.n == 4
+    assert found.ranked == 3, "no condition makes a difference to a driver, nor to the proxy in these four"
+    assert -1 <= found.rank <= 1
+    other = found.episodes.success_frozen != found.episodes.success_closed
+    assert disagreements(found.episodes)["count"].sum() == other.sum()
+
+
+def test_whoever_drives_as_its_frozen_scenes_say_differs_by_nothing(runs: list[Path]) -> None:
+    """The driven episodes' results written into the frozen run's table."""
+    driven = pd.read_csv("drive-cruise/episodes.csv").set_index(["condition", "seed", "episode"])
+    table = pd.read_csv("eval-cruise/episodes.csv").set_index(["condition", "seed", "episode"])
+    table[["success", "failure"]] = driven[["success", "failure"]]
+    table.reset_index().to_csv("eval-cruise/episodes.csv", index=False)
+    found = fidelity([Path("eval-cruise"), Path("drive-cruise")])
+    assert (found.table.difference == 0).all()
+    assert (found.table.agreement == 1).all()
+    assert disagreements(found.episodes).empty
+
+
+def test_the_command_writes_a_page_and_says_the_largest_difference(
+    runs: list[Path], harness: Callable[..., Said]
+) -> None:
+    code, out, err = harness("fidelity", *runs, "--out", "told")
+    assert (code, err) == (0, "")
+    assert "rank correlation of 3 models and conditions" in out
+    assert "Largest difference, frozen minus closed" in out
+    names = {f"fidelity.{kind}" for kind in ("csv", "jsonl", "svg", "pdf", "png")}
+    assert {p.name for p in Path("told").iterdir()} == names | {
+        "episodes.csv",
+        "episodes.jsonl",
+        "index.html",
+    }
+    assert len(json.loads(harness("fidelity", *runs, "--json")[1])) == 9
+
+
+def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable[..., Said]) -> None:
+    for folders, said in (
+        (runs[:1], "no run on live episodes"),
+        (runs[1:2], "no run on frozen scenes"),
+        ([runs[0], runs[3]], "have no episode in common"),
+        ([runs[0], runs[0], runs[1]], "two of the runs have the same episodes"),
+        ([runs[0], Path("nowhere")], "nowhere is no finished run"),
+    ):
+        with pytest.raises(UserError, match=said):
+            fidelity(folders)
+    shutil.copytree(runs[1], "torn")
+    Path("torn/episodes.csv").write_text("model,prompt\n")
+    code, out, err = harness("fidelity", runs[0], "torn")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "torn is no finished run" in err
+    assert not Path("reports").exists()
