@@ -44,7 +44,7 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
         assert row.closed == pytest.approx(closed.mean())
         assert row.difference == pytest.approx((frozen - closed).mean())
         assert row.n == 4
-    assert found.ranked == 3, "no condition makes a difference to a driver, nor to the proxy in these four"
+    assert found.ranked == 5, "no condition makes a difference to a driver"
     assert -1 <= found.rank <= 1
     other = found.episodes.success_frozen != found.episodes.success_closed
     assert disagreements(found.episodes)["count"].sum() == other.sum()
@@ -67,7 +67,7 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
 ) -> None:
     code, out, err = harness("fidelity", *runs, "--out", "told")
     assert (code, err) == (0, "")
-    assert "rank correlation of 3 models and conditions" in out
+    assert "rank correlation of 5 models and conditions" in out
     assert "Largest difference, frozen minus closed" in out
     names = {f"fidelity.{kind}" for kind in ("csv", "jsonl", "svg", "pdf", "png")}
     assert {p.name for p in Path("told").iterdir()} == names | {
