@@ -123,6 +123,15 @@ def test_latency_by_hand(told: pd.DataFrame, played: Dataset, tmp_path: Path) ->
     assert value(told, "clear", "deadline_miss_rate")[0] == 0
 
 
+def test_percentiles_are_over_all_decisions(told: pd.DataFrame) -> None:
+    """Seven decisions of 100 ms, one of which consults: the median is 100 ms, the 99th almost the longest."""
+    longest = 4 * 2 * value(told, "clear", "latency_proxy_ms")[0] - 700
+    assert value(told, "clear", "latency_p50_ms", "seed means") == (pytest.approx(100), 1, 0)
+    near = value(told, "clear", "latency_p99_ms", "seed means")[0]
+    assert near == pytest.approx(100 + 0.94 * (longest - 100))  # linear between the sixth and the seventh
+    assert value(told, "clear", "fusion_ms")[0] == 0
+
+
 def test_brier_and_likelihood_by_hand(told: pd.DataFrame) -> None:
     """Decisions in which no action is safe have no score, and an episode of such is excluded."""
     # Two safe actions, sure of one: 1/4 + 1/4. Three safe, sure of one: 4/9 + 1/9 + 1/9.
