@@ -58,12 +58,12 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
         ((out, 3, None, None), "give 0 to 2"),
         ((out, 0, "5g", None), "unknown condition '5g'"),
         ((out, 0, None, 9), "unknown seed '9'"),
-        ((tmp_path, 0, None, None), "is no live run"),
+        ((tmp_path, 0, None, None), "is no run.* made by `harness drive`"),
     ):
         with pytest.raises(UserError, match=says):
             find(*arguments)
     frozen = tmp_path / "frozen"
     frozen.mkdir()
     (frozen / "run.json").write_text(json.dumps({"format": "swarmdrive-run/1"}))
-    with pytest.raises(UserError, match="was not driven"):
+    with pytest.raises(UserError, match="has format 'swarmdrive-run/1'.* made by `harness drive`"):
         find(frozen, 0, None, None)
