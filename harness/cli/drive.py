@@ -43,7 +43,7 @@ def drive(
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
 ) -> None:
-    """Drive live episodes in highway-env: every decision is asked at its moment and acts when it is ready."""
+    """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
     from harness import cards, prompts
     from harness.cli.estimates import in_range
     from harness.cli.evaluate import parse_seeds
@@ -102,11 +102,14 @@ def _run(spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, a
 
     with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json) as progress:
         done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
+    from harness.cli.report import write  # draws with matplotlib, which no episode waits for
+
+    page = write(out, None, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
         return
     _table(done)
-    typer.echo(f"wrote {out / 'episodes.csv'}, summary.csv, rows.jsonl and run.json")
+    typer.echo(f"wrote {page}")
 
 
 def _table(done: "Evaluated") -> None:

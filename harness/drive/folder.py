@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from harness.drive.spec import FORMAT
+from harness.errors import UserError, printable
 from harness.run import folder
 from harness.run.folder import NEEDED, NEEDED_IN_ROW, Form, Row, Run, number
 
@@ -29,7 +31,7 @@ class Driven(Run):
     @property
     def source(self) -> str:
         """What its episodes are of."""
-        return f"{self.config['scenario'].get('name')}, driven live"
+        return f"{self.config['scenario'].get('name')} (driven live)"
 
 
 def read(path: Path) -> Driven:
@@ -43,7 +45,15 @@ def read(path: Path) -> Driven:
 
 def driven(run: Run) -> Driven:
     """A live run with its episodes. Raises UserError if episodes.csv is missing or broken."""
-    return Driven(**vars(run), ends=dict(folder.table(run.path / "episodes.csv", _end)))
+    file = run.path / "episodes.csv"
+    ends = dict(folder.table(file, _end))
+    for condition, seed, n in product(run.conditions, run.config["seeds"], range(run.config["episodes"])):
+        if (condition, seed, n) not in ends:
+            raise UserError(
+                f"{printable(file)} lacks episode {n} of {printable(condition)} with seed {seed}; "
+                "make the run again"
+            )
+    return Driven(**vars(run), ends=ends)
 
 
 def _end(line: Mapping[str, str]) -> tuple[tuple[str, int, int], dict[str, Any]]:

@@ -65,5 +65,5 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
     frozen = tmp_path / "frozen"
     frozen.mkdir()
     (frozen / "run.json").write_text(json.dumps({"format": "swarmdrive-run/1"}))
-    with pytest.raises(UserError, match="has format 'swarmdrive-run/1'.* made by `harness drive`"):
+    with pytest.raises(UserError, match=r"has format 'swarmdrive-run/1'.* made by `harness drive`"):
         find(frozen, 0, None, None)
