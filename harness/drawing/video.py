@@ -133,10 +133,9 @@ class _Canvas:
         self.bars.set(xlim=(0, 1), ylim=(len(ACTIONS) - 0.5, -0.5), xticks=[0, 0.5, 1])
         self.bars.set_yticks(range(len(ACTIONS)), labels=ACTIONS, size=7)
         self.bars.tick_params(labelsize=6, length=2)
-        self.lines = [
-            self.figure.text(0.02, (BARS_IN - 0.3 - 0.25 * n) / height, "", size=8) for n in range(3)
-        ]
-        self.lines[0].set_text(f"episode {played.episode}, {played.condition}, seed {played.seed}")
+        self.lines = [self.figure.text(0.02, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
+        self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
+        self.lines[1].set_text(printable(played.condition, 34))
         self.canvas = FigureCanvasAgg(self.figure)
         self.canvas.draw()  # type: ignore[no-untyped-call]
         self.fixed = self.canvas.copy_from_bbox(self.figure.bbox)  # type: ignore[no-untyped-call]
@@ -154,11 +153,11 @@ class _Canvas:
             self.bars.add_artist(bar)
             self.bars.draw_artist(bar)
             bar.remove()
-        slow = ", thinking (slow motion)" if still.open else ""
-        self.lines[1].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
+        slow = ", thinking (slowed)" if still.open else ""
+        self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
         decision = f"decision {still.decision['action']} at {still.decision['acts_at_s']:.2f} s"
-        self.lines[2].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
-        for line in self.lines[1:]:
+        self.lines[3].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
+        for line in self.lines[2:]:
             self.figure.draw_artist(line)
         pixels = np.asarray(self.canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         return np.ascontiguousarray(pixels[..., :3])

@@ -12,6 +12,7 @@ from harness.drive.folder import read
 from harness.drive.replay import scene_of
 from harness.drive.run import run
 from harness.errors import UserError
+from harness.operating_point import named_point
 from harness.report.choose import FAILURE, failures, pick
 from harness.report.page import write_report
 from harness.run import folder
@@ -95,6 +96,17 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, page):
     assert sent[-1]["content"] in "".join(page.pieces)
 
 
+@pytest.mark.slow
+def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path):
+    point = named_point("6g:consensus=ego-prompt")
+    of = spec("swarm-tiny", points=[point], seeds=(0,), first_seed=FROM_LEFT, latency="paper")
+    run(of, tmp_path / "run", False, 1, lambda done: None)
+    heard = [key for row in read(tmp_path / "run").rows for key in row.get("merged", {})]
+    found = Page(write_report(tmp_path / "run").read_text())
+    assert "prompt: not rendered" not in found.text
+    assert found.text.count(", merge") == len(heard) > 0
+
+
 def changed(driven, tmp_path, name, edit):
     copy = tmp_path / "copy"
     shutil.copytree(driven, copy)
@@ -104,7 +116,7 @@ def changed(driven, tmp_path, name, edit):
 
 def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_path):
     def edit(text):
-        rows = [json.loads(line) for line in text.splitlines()]
+        rows = [json.loads(line) for line in text.splitlines()[:5]]
         for row in rows:
             row["answers"]["v2"]["prompt_sha256"] = "0" * 64
         return "".join(json.dumps(row) + "\n" for row in rows)
