@@ -40,10 +40,13 @@ def drive(
     ),
     out: Path | None = typer.Option(None, help="The run's folder. Default: reports/<model>-<prompt>-drive."),
     resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
+    save_video: int = typer.Option(
+        0, help="Draw the first so many failed episodes of the last condition into the run's videos/."
+    ),
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
 ) -> None:
-    """Drive live episodes in highway-env: every decision is asked at its moment and acts when it is ready."""
+    """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
     from harness import cards, prompts
     from harness.cli.estimates import in_range
     from harness.cli.evaluate import parse_seeds
@@ -60,6 +63,7 @@ def drive(
     in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     in_range("--first-seed", first_seed, 0, LAST_SEED)
     in_range("--workers", workers, 1, MOST_WORKERS)
+    in_range("--save-video", save_video, 0, episodes)
     names = POINTS if condition in ([], [ALL]) else condition
     spec = spec_of(
         cards.resolve(model, engine),
@@ -75,7 +79,7 @@ def drive(
         first_seed=first_seed,
         episodes=episodes,
     )
-    _run(spec, out or _default_out(spec, resume), resume, workers, no_cache, as_json)
+    _run(spec, out or _default_out(spec, resume), resume, workers, save_video, no_cache, as_json)
 
 
 def _shipped() -> dict[str, Any]:
@@ -94,7 +98,9 @@ def _default_out(spec: "Drive", resume: bool) -> Path:
     return default_out(replace(spec, dataset=named), resume)
 
 
-def _run(spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, as_json: bool) -> None:
+def _run(
+    spec: "Drive", out: Path, resume: bool, workers: int, save_video: int, no_cache: bool, as_json: bool
+) -> None:
     from harness.backends.cache import default_file
     from harness.cli.evaluate import as_mapping
     from harness.cli.progress import bar
@@ -102,11 +108,21 @@ def _run(spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, a
 
     with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json) as progress:
         done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
+    # They draw with matplotlib, which no episode waits for.
+    from harness.cli.report import write
+    from harness.cli.video import write_failures
+
+    page = write(out, None, quiet=as_json)
+    videos = write_failures(out, save_video, quiet=as_json) if save_video else []
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
         return
     _table(done)
-    typer.echo(f"wrote {out / 'episodes.csv'}, summary.csv, rows.jsonl and run.json")
+    if videos:
+        typer.echo(f"wrote {out / 'videos'}: {', '.join(video.name for video in videos)}")
+    elif save_video:
+        typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
+    typer.echo(f"wrote {page}")
 
 
 def _table(done: "Evaluated") -> None:

@@ -77,12 +77,12 @@ def frames(latency_s: float) -> int:
     return math.ceil(latency_s * P.simulation_hz - ROUNDING_FRAMES)
 
 
-def look(spec: Drive, trajectory: Trajectory, step: int) -> Scene:
+def look(engine: str, trajectory: Trajectory, step: int) -> Scene:
     """What there is to be seen and asked in a trajectory now. The same moment has the same id anywhere."""
     world = trajectory.world
     state = replace(world.state(), step=step)
     # A rule is asked for the ego alone.
-    viewers = [state.ego] if spec.card.engine == "driver" else [state.ego, *state.helpers]
+    viewers = [state.ego] if engine == "driver" else [state.ego, *state.helpers]
     seen = moment(world, state, trajectory.number, viewers)
     return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
 
@@ -99,7 +99,7 @@ def _decide(
             deciding.append((one, free))
     if not deciding:
         return []
-    scenes = tuple(look(spec, one, step) for one, _ in deciding)
+    scenes = tuple(look(spec.card.engine, one, step) for one, _ in deciding)
     asked = list(requests(spec, scenes))
     by_id = {r.id: answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)}
     live_scenes = replace(spec.dataset, scenes=scenes)

@@ -33,7 +33,7 @@ def begin(spec: Drive) -> tuple[dict[str, Any], dict[str, Any]]:
     for number in range(min(SAMPLE, spec.episodes)):
         trajectory = start(spec, number)
         trajectory.world.advance(round(number * P.decision_period_s * P.simulation_hz / 2))
-        scenes.append(look(spec, trajectory, 0))
+        scenes.append(look(spec.card.engine, trajectory, 0))
     sample = replace(spec, dataset=replace(spec.dataset, scenes=tuple(scenes)), batch_size=2)
     with TemporaryDirectory() as folder:
         latency = measure(sample, backend, Path(folder) / "latency.json")

@@ -1,15 +1,16 @@
 """A driven episode, played again from its record: the same actions in the same frames give the same world."""
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.drive.engine import P
-from harness.drive.record import Row
-from harness.drive.spec import FORMAT
+from harness.dataset.load import Scene
+from harness.drive.engine import P, look
+from harness.drive.episode import Trajectory
+from harness.drive.folder import read
 from harness.errors import UserError, printable, unknown
+from harness.run.folder import Row, Run
 from harness.scene import WorldState
 from harness.world import World
 
@@ -29,7 +30,7 @@ class Played:
         decisions: what it made of them, in the same order.
     """
 
-    config: dict[str, Any]
+    config: Mapping[str, Any]
     condition: str
     seed: int
     episode: int
@@ -58,38 +59,60 @@ class Still:
     outcome: str
 
 
-def find(run: Path, episode: int, condition: str | None, seed: int | None) -> Played:
+def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:
     """An episode of a run folder; the last condition and the first seed unless others are given.
 
     Raises:
         UserError: the folder is no live run, or has no such episode, condition or seed.
     """
-    try:
-        config = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        if config["format"] != FORMAT:
-            raise UserError(f"{printable(run)} is a run of {printable(config['format'])}, and was not driven")
-        names, seeds = [c["name"] for c in config["conditions"]], config["seeds"]
-        condition, seed = condition or names[-1], seeds[0] if seed is None else seed
-        if condition not in names:
-            raise unknown("condition", condition, names)
-        if seed not in seeds:
-            raise unknown("seed", str(seed), list(map(str, seeds)))
-        if not 0 <= episode < config["episodes"]:
-            raise UserError(
-                f"episode {episode} is not in {printable(run)}; give 0 to {config['episodes'] - 1}"
-            )
-        moments, decisions = [], []
-        for line in (run / "rows.jsonl").read_text(encoding="utf-8").split("\n")[:-1]:
-            row = json.loads(line)
-            for made in row["decisions"] if row["episode"] == episode else ():
-                if (made["condition"], made["seed"]) == (condition, seed):
-                    moments.append(row)
-                    decisions.append(made)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    run = read(path)
+    names, seeds = run.conditions, run.config["seeds"]
+    condition, seed = condition or names[-1], seeds[0] if seed is None else seed
+    if condition not in names:
+        raise unknown("condition", condition, names)
+    if seed not in seeds:
+        raise unknown("seed", str(seed), list(map(str, seeds)))
+    if not 0 <= episode < run.config["episodes"]:
         raise UserError(
-            f"{printable(run)} is no live run ({printable(error)}); give a folder made by `harness drive`"
-        ) from None
-    return Played(config, condition, seed, episode, moments, decisions)
+            f"episode {episode} is not in {printable(path)}; give 0 to {run.config['episodes'] - 1}"
+        )
+    return played(run, episode, condition, seed)
+
+
+def played(run: Run, episode: int, condition: str, seed: int) -> Played:
+    """An episode that the run has."""
+    found = [
+        (row, made)
+        for row in run.rows
+        if row["episode"] == episode
+        for made in row["decisions"]
+        if (made["condition"], made["seed"]) == (condition, seed)
+    ]
+    return Played(
+        run.config, condition, seed, episode, [row for row, _ in found], [made for _, made in found]
+    )
+
+
+def scene_of(run: Run, row: Row) -> Scene:
+    """What there was to be seen in a moment, had by playing one of the episodes in it again.
+
+    Its id is the row's only where this simulator does what the run's did.
+    """
+    mine, hz = row["decisions"][0], P.simulation_hz
+    episode = played(run, row["episode"], mine["condition"], mine["seed"])
+    begins = round(row["step"] * P.decision_period_s * hz)
+    world = World.start(run.config["first_seed"] + row["episode"])
+    for frame, action in _acts(episode).items():
+        if frame <= begins:
+            world.advance(frame)
+            world.take(action)
+    world.advance(begins)
+    return look(run.config["model"]["engine"], Trajectory(row["episode"], world, []), row["step"])
+
+
+def _acts(played: Played) -> dict[int, str]:
+    """Actions by the frame in which they were taken."""
+    return {round(d["acts_at_s"] * P.simulation_hz): d["action"] for d in played.decisions if d["acted"]}
 
 
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
@@ -97,7 +120,7 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
     hz = P.simulation_hz
     world = World.start(played.config["first_seed"] + played.episode)
     begins = [round(row["step"] * P.decision_period_s * hz) for row in played.moments]
-    acts = {round(d["acts_at_s"] * hz): d["action"] for d in played.decisions if d["acted"]}
+    acts = _acts(played)
     place, seen = 0, world.state()
     while True:
         if place + 1 < len(begins) and begins[place + 1] <= world.frame:

@@ -1,9 +1,10 @@
 """Which decisions a report shows: the telling ones first, and then an even sample of the rest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from harness.run.folder import Row
+from harness.drive.folder import Driven
+from harness.run.folder import Row, Run
 
 FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
     "first failure",
@@ -14,42 +15,85 @@ FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
 
 
 class Pick(NamedTuple):
-    """A decision to show, and why."""
+    """A decision to show, the seed of the channel under which it is shown, and why."""
 
     row: Row
+    seed: int
     why: str
 
 
-def decisions_of(row: Row) -> list[dict[str, Any]]:
-    """The row's decisions of its first seed, one a condition."""
-    return [d for d in row["decisions"] if d["seed"] == row["decisions"][0]["seed"]]
+def decisions_of(row: Row, seed: int) -> list[dict[str, Any]]:
+    """The row's decisions of one seed, one a condition."""
+    return [d for d in row["decisions"] if d["seed"] == seed]
 
 
-def pick(rows: Sequence[Row], n: int) -> list[Pick]:
+def failures(run: Run) -> dict[int, int]:
+    """Rows in which an episode begins to fail, and the seed with which it does."""
+    return _wrecks(run) if isinstance(run, Driven) else _unsafe(run.rows)
+
+
+def _unsafe(rows: Sequence[Row]) -> dict[int, int]:
+    """Each episode's first action of the run's first seed that is unsafe where another was safe."""
+    found: dict[int, int] = {}
+    episodes: set[int] = set()
+    for i, row in enumerate(rows):
+        seed = _first_seed(row)
+        bad = any(row["safe"]) and not all(d["safe"] for d in decisions_of(row, seed))
+        if bad and row["episode"] not in episodes:
+            episodes.add(row["episode"])
+            found[i] = seed
+    return found
+
+
+def _wrecks(run: Driven) -> dict[int, int]:
+    """The last moment that a layout's failed episodes have in common with one that did not fail.
+
+    Where all episodes of a layout fail, it is the last moment of the first of them.
+    """
+    telling: dict[int, tuple[bool, int, int]] = {}
+    for i, row in enumerate(run.rows):
+        number = row["episode"]
+        ends = {
+            (d["condition"], d["seed"]): run.ends[d["condition"], d["seed"], number]["result"]
+            for d in row["decisions"]
+        }
+        failed = [seed for (_, seed), result in ends.items() if result != "cleared"]
+        if failed:
+            parts = len(failed) < len(ends)
+            if number not in telling or parts >= telling[number][0]:
+                telling[number] = parts, i, failed[0]
+    return {i: seed for _, i, seed in telling.values()}
+
+
+def _first_seed(row: Row) -> int:
+    return int(row["decisions"][0]["seed"])
+
+
+def pick(rows: Sequence[Row], failed: Mapping[int, int], n: int) -> list[Pick]:
     """Choose up to n rows, kept in their order; the same rows always give the same choice.
 
-    Up to a quarter each are: an episode's first action that is unsafe where another was safe; conditions
-    that act differently; answers that were recovered or failed. The rest is spread evenly. Where one kind is
-    scarce, the sample is larger.
+    Up to a quarter each are: failures, each with the seed that shows it; conditions that act differently;
+    answers that were recovered or failed. The rest is spread evenly. Where one kind is scarce, the sample is
+    larger.
     """
-    episodes: set[int] = set()
-    kinds: dict[str, list[int]] = {FAILURE: [], DISAGREEMENT: [], ANSWER: [], SAMPLE: list(range(len(rows)))}
+    seeds = [failed.get(i, _first_seed(row)) for i, row in enumerate(rows)]
+    kinds: dict[str, list[int]] = {
+        FAILURE: list(failed),
+        DISAGREEMENT: [],
+        ANSWER: [],
+        SAMPLE: list(range(len(rows))),
+    }
     for i, row in enumerate(rows):
-        decisions = decisions_of(row)
-        avoidable = any(row["safe"])
-        if avoidable and row["episode"] not in episodes and not all(d["safe"] for d in decisions):
-            episodes.add(row["episode"])
-            kinds[FAILURE].append(i)
-        if len({d["action"] for d in decisions}) > 1:
+        if len({d["action"] for d in decisions_of(row, seeds[i])}) > 1:
             kinds[DISAGREEMENT].append(i)
-        if any(answer["verdict"] != "strict" for answer in row["answers"].values()):
+        if any(a["verdict"] != "strict" for a in (*row["answers"].values(), *row.get("merged", {}).values())):
             kinds[ANSWER].append(i)
     why: dict[int, str] = {}
     for kind, candidates in kinds.items():
         left = [i for i in candidates if i not in why]
         room = n - len(why) if kind == SAMPLE else n // 4
         why |= dict.fromkeys(_spread(left, room), kind)
-    return [Pick(rows[i], why[i]) for i in sorted(why)]
+    return [Pick(rows[i], seeds[i], why[i]) for i in sorted(why)]
 
 
 def _spread(items: Sequence[int], n: int) -> list[int]:

@@ -4,7 +4,6 @@ Whatever a model, a prompt or a file name says is text: templates escape everyth
 nothing or turn the line around are spelt out, and the page's own policy forbids scripts and requests.
 """
 
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,22 +12,17 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
-from harness import prompts as versions
-from harness import readout
-from harness.dataset.load import Scene
 from harness.drawing.pictures import uri
-from harness.drawing.scene import draw
+from harness.drive.folder import LIVE, Driven, driven
 from harness.errors import UserError, printable
 from harness.files import write_whole
 from harness.report import figures, words
-from harness.report.choose import Pick, decisions_of, pick
-from harness.run.folder import Row, Run, dataset_of, read
+from harness.report.choose import failures, pick
+from harness.report.decisions import Prompts, cards, prompts_of
+from harness.run.folder import FROZEN, Row, Run, read
 
 DECISIONS = 60
 TEMPLATES = Path(__file__).parent / "templates"
-
-Messages = Sequence[Mapping[str, Any]]
-Prompts = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
 
 
 def write_report(
@@ -55,46 +49,26 @@ def write_report(
     out = run / "report.html" if out is None else out
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    found = read(run)
+    found = read(run, FROZEN, LIVE)
+    if found.config["format"] == LIVE.format:
+        found = driven(found)
     write_whole(out, render(found, prompts or prompts_of(found), progress))
     return out
 
 
-def prompts_of(run: Run) -> Prompts | None:
-    """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
-    version, actions = str(run.config["prompt"]["version"]), tuple(run.config["actions"])
-    if version not in versions.names():
-        return None
-    prompt = versions.load(version)
-    if prompt.sha256 != run.config["prompt"]["sha256"]:
-        return None
-
-    def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
-        return readout.asked(messages, actions) if run.answer == "readout" else messages
-
-    return sent
-
-
 def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -> str:
     """The page."""
-    scenes = {scene.id: scene for scene in dataset_of(run).scenes}
-    picks = pick(run.rows, DECISIONS)
-    for chosen in picks:
-        if chosen.row["scene"] not in scenes:
-            raise UserError(
-                f"{printable(run.path / 'rows.jsonl')} has scene {printable(chosen.row['scene'])!r}, "
-                "which its dataset has not; run `harness eval` again"
-            )
+    picks = pick(run.rows, failures(run), DECISIONS)
     decisions = []
-    for chosen in picks:
-        decisions.append(_decision(chosen, scenes[chosen.row["scene"]], run, prompts))
+    for card in cards(run, picks, prompts):
+        decisions.append(card)
         progress(1)
     chart = figures.success_latency(run)
     by_verdict = _count(run.rows, "verdict")
     return _environment().get_template("page.html.j2").render(
         run=run,
         config=run.config,
+        live=isinstance(run, Driven),
         title=run.config.get("name") or run.path.name,
         headline=words.headline(run),
         latency=words.latency_source(run.config["latency"]),
@@ -139,11 +113,12 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]
 
 def _metrics(run: Run, conditions: Sequence[str]) -> list[dict[str, Any]]:
     """The summary: a metric a line, with its value in each condition."""
+    meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
     known = {s.metric: None for s in run.scores if s.condition in conditions}
     return [
         {
             "name": words.metric_name(metric),
-            "meaning": words.MEANINGS.get(metric, ""),
+            "meaning": meanings.get(metric, ""),
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in conditions],
         }
         for metric in known
@@ -157,40 +132,3 @@ def _count(rows: Iterable[Row], key: str) -> dict[str, Counter[str]]:
         for answer in (*row["answers"].values(), *row.get("merged", {}).values()):
             counts.setdefault(answer["role"], Counter())[answer[key]] += 1
     return counts
-
-
-def _decision(chosen: Pick, scene: Scene, run: Run, prompts: Prompts | None) -> dict[str, Any]:
-    actions, row = run.config["actions"], chosen.row
-    picture = io.BytesIO()
-    draw(scene, picture, "svg")
-    outcomes = [
-        {**scene.record["outcomes"][action], "action": action, "safe": safe, "delay_s": delay_s}
-        for action, safe, delay_s in zip(actions, row["safe"], row["delay_s"], strict=True)
-    ]
-    return {
-        "scene": scene,
-        "why": chosen.why,
-        "picture": uri(picture.getvalue()),
-        "outcomes": outcomes,
-        "avoidable": any(row["safe"]),
-        "choices": [{**d, "bars": _bars(actions, d["fused"])} for d in decisions_of(row)],
-        "answers": [
-            {
-                **answer,
-                "viewer": viewer,
-                "bars": _bars(actions, answer.get("intent")),
-                "prompt": prompts(scene, viewer.partition("+")[0], _heard(row, viewer)) if prompts else None,
-            }
-            for viewer, answer in (*row["answers"].items(), *row.get("merged", {}).items())
-        ],
-    }
-
-
-def _heard(row: Row, viewer: str) -> Messages:
-    """What an ego that answered a second time had heard, from its key in `merged`: itself and the senders."""
-    said = {sender: row["answers"][sender] for sender in viewer.split("+")[1:] if sender in row["answers"]}
-    return [{"sender": s, "intent": a["intent"], **(a["message"] or {})} for s, a in said.items()]
-
-
-def _bars(actions: Sequence[str], p: Sequence[float] | None) -> list[tuple[str, float]]:
-    return list(zip(actions, map(float, p), strict=True)) if p else []

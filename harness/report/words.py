@@ -32,6 +32,22 @@ MEANINGS = {
     "fallback_rate": "decisions in which the ego's own answer could not be read",
 }
 
+LIVE_MEANINGS = MEANINGS | {
+    SUCCESS: "episodes in which the ego clears the intersection, and no later than the allowance",
+    "unsafe_rate": "episodes that end in a collision, by time-out or off the road",
+    "late_rate": "episodes cleared, but too long after the full-view driver, whose decisions act at once",
+    "at_fault_rate": "episodes that end in a collision in which the ego should have given way",
+    "time_out_rate": "episodes in which the ego does not clear the intersection in time",
+    "off_road_rate": "episodes in which the ego leaves the road",
+    "time_to_clear_s": "until the ego has cleared the intersection, where it does, late or not",
+    "least_gap_m": "smallest distance to another vehicle's outline in an episode; 0 in a collision",
+    "hard_brakings_per_episode": "times the ego begins to brake harder than 4 m/s²",
+    "other_crashes_per_episode": "vehicles that crash without the ego",
+    "decisions_per_episode": "decisions begun",
+    "skipped_per_episode": "decisions not begun, since the one before was still open",
+    "never_acted_per_episode": "decisions that were not ready before the episode ended",
+}
+
 
 def number(value: float | None, digits: int = 2) -> str:
     """A number with so many decimals; a dash for None."""
@@ -48,6 +64,12 @@ def unit(metric: str) -> tuple[float, str, int]:
         return 1.0, " ms", 1
     if metric.endswith("_nats"):
         return 1.0, " nats", 3
+    if metric.endswith("_s"):
+        return 1.0, " s", 2
+    if metric.endswith("_m"):
+        return 1.0, " m", 1
+    if metric.endswith("_per_episode"):
+        return 1.0, "", 2
     return 1.0, "", 1 if "message" in metric or "tokens" in metric else 3
 
 
@@ -71,17 +93,19 @@ def interval(score: Score) -> str:
 
 def metric_name(metric: str) -> str:
     """A metric's name in words; its unit is shown with the value."""
-    return metric.removesuffix("_ms").removesuffix("_nats").replace("_", " ")
+    for suffix in ("_ms", "_nats", "_s", "_m"):
+        metric = metric.removesuffix(suffix)
+    return metric.replace("_", " ")
 
 
 def headline(run: Run) -> str:
     """What came out, in one sentence: the best condition, and the one without V2V beside it."""
     found = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
-    model, dataset = run.config["model"].get("name"), run.config["dataset"].get("name")
+    model = run.config["model"].get("name")
     if not found:
-        return f"{model} on {dataset}: the run has no success rate."
+        return f"{model} on {run.source}: the run has no success rate."
     best = max(found, key=lambda c: found[c].value or 0.0)
-    text = f"With {model}, {best} {_clears(found[best])} of {dataset}"
+    text = f"With {model}, {best} {_clears(found[best])} of {run.source}"
     latency = run.score(best, LATENCY)
     if latency is not None:
         text += f" at {shown(latency)['value']} a decision"

@@ -1,20 +1,40 @@
-"""A run folder, read again: for its report, and to be coordinated otherwise."""
+"""A run folder, read again: for its report, to be coordinated otherwise, and to be played again."""
 
 import csv
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from harness.dataset.load import Dataset, find, load
 from harness.errors import UserError, printable
 from harness.run.spec import FORMAT
 
-NEEDED = ("model", "prompt", "dataset", "actions", "conditions", "seeds", "latency")
-NEEDED_IN_ROW = ("scene", "episode", "answers", "safe", "delay_s", "decisions")
-
+T = TypeVar("T")
 Row = dict[str, Any]  # one decision point of rows.jsonl
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a run of one kind has.
+
+    Attributes:
+        format: what its run.json says it is.
+        command: what makes it.
+        needed: keys of its run.json.
+        needed_in_row: keys of each row of its rows.jsonl.
+    """
+
+    format: str
+    command: str
+    needed: tuple[str, ...]
+    needed_in_row: tuple[str, ...]
+
+
+NEEDED = ("model", "prompt", "actions", "conditions", "seeds", "latency")
+NEEDED_IN_ROW = ("scene", "episode", "danger", "answers", "decisions")
+FROZEN = Form(FORMAT, "harness eval", (*NEEDED, "dataset"), (*NEEDED_IN_ROW, "safe", "delay_s"))
 
 
 @dataclass(frozen=True)
@@ -64,6 +84,11 @@ class Run:
         return str(self.config.get("answer", "json"))
 
     @property
+    def source(self) -> str:
+        """What its episodes are of."""
+        return str(self.config["dataset"].get("name"))
+
+    @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the operating points, in the run's order."""
         return tuple(str(condition["name"]) for condition in self.config["conditions"])
@@ -76,35 +101,44 @@ class Run:
         return min(found, key=lambda s: s.interval != "episodes", default=None)
 
 
-def read(path: Path) -> Run:
-    """Read a run folder.
+def read(path: Path, *forms: Form) -> Run:
+    """Read a run folder of one of these forms; of a frozen run, where none is given.
 
     Raises:
         UserError: it is none, or a file of it is missing or broken.
     """
+    forms = forms or (FROZEN,)
+    makers = " or ".join(f"`{form.command}`" for form in forms)
     if not (path / "run.json").is_file():
-        raise UserError(
-            f"{printable(path)} is no run: it has no run.json; give a folder made by `harness eval`"
-        )
+        raise UserError(f"{printable(path)} is no run: it has no run.json; give a folder made by {makers}")
     config = _parsed(path / "run.json", json.loads, _text(path / "run.json"))
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        found = config.get("format") if isinstance(config, dict) else None
+    found = config.get("format") if isinstance(config, dict) else None
+    form = next((form for form in forms if form.format == found), None)
+    if form is None:
         raise UserError(
-            f"{printable(path / 'run.json')} has format {printable(found)!r}; "
-            f"this harness reads {FORMAT!r}: run `harness eval` again"
+            f"{printable(path / 'run.json')} has format {printable(found)!r}, not "
+            f"{' or '.join(repr(form.format) for form in forms)}; give a folder made by {makers}"
         )
-    _need(path / "run.json", config, NEEDED)
-    scores = _parsed(path / "summary.csv", _scores, _text(path / "summary.csv"))
+    _need(path / "run.json", config, form.needed)
+    scores = table(path / "summary.csv", _score)
     rows = []
-    for number, line in enumerate(_text(path / "rows.jsonl").split("\n"), 1):
+    for n, line in enumerate(_text(path / "rows.jsonl").split("\n"), 1):
         if line.strip():
-            where = f"{path / 'rows.jsonl'} line {number}"
+            where = f"{path / 'rows.jsonl'} line {n}"
             row = _parsed(where, json.loads, line)
-            _need(where, row, NEEDED_IN_ROW)
+            _need(where, row, form.needed_in_row)
             rows.append(row)
     if not rows:
-        raise UserError(f"{printable(path / 'rows.jsonl')} holds no decisions; run `harness eval` again")
+        raise UserError(f"{printable(path / 'rows.jsonl')} holds no decisions; make the run again")
     return Run(path, config, scores, tuple(rows))
+
+
+def table(file: Path, row: Callable[[Mapping[str, str]], T]) -> tuple[T, ...]:
+    """What `row` makes of each line of a CSV file. Raises UserError if it is missing or broken."""
+    rows: tuple[T, ...] = _parsed(
+        file, lambda text: tuple(map(row, csv.DictReader(text.splitlines()))), _text(file)
+    )
+    return rows
 
 
 def dataset_of(run: Run) -> Dataset:
@@ -129,41 +163,36 @@ def _text(file: Path) -> str:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise UserError(f"cannot read {printable(file)}: {reason}; run `harness eval` again") from None
+        raise UserError(f"cannot read {printable(file)}: {reason}; make the run again") from None
 
 
 def _parsed(where: object, reader: Any, text: str) -> Any:
     try:
         return reader(text)
     except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as error:
-        raise UserError(
-            f"{printable(where)} is broken ({printable(error)}); run `harness eval` again"
-        ) from None
+        raise UserError(f"{printable(where)} is broken ({printable(error)}); make the run again") from None
 
 
 def _need(where: object, found: Any, keys: Iterable[str]) -> None:
     missing = [key for key in keys if not isinstance(found, dict) or key not in found]
     if missing:
-        raise UserError(f"{printable(where)} lacks {', '.join(missing)}; run `harness eval` again")
+        raise UserError(f"{printable(where)} lacks {', '.join(missing)}; make the run again")
 
 
-def _scores(text: str) -> tuple[Score, ...]:
-    lines = csv.DictReader(text.splitlines())
-    return tuple(
-        Score(
-            line["condition"],
-            line["metric"],
-            _number(line["value"]),
-            _number(line["ci_low"]),
-            _number(line["ci_high"]),
-            int(line["n"]),
-            int(line["n_excluded"] or 0),
-            line["interval"],
-        )
-        for line in lines
+def _score(line: Mapping[str, str]) -> Score:
+    return Score(
+        line["condition"],
+        line["metric"],
+        number(line["value"]),
+        number(line["ci_low"]),
+        number(line["ci_high"]),
+        int(line["n"]),
+        int(line["n_excluded"] or 0),
+        line["interval"],
     )
 
 
-def _number(text: str) -> float | None:
+def number(text: str) -> float | None:
+    """A number of a CSV file; None where it is empty or NaN."""
     value = float(text or "nan")
     return None if value != value else value

@@ -46,9 +46,7 @@ class Stored:
         whole = dataset_of(self.run)
         dataset = replace(whole, scenes=tuple(scene for scene in whole.scenes if scene.id in rows))
         if len(dataset.scenes) != len(rows):
-            raise UserError(
-                f"{printable(folder)} has scenes that its dataset has not; run `harness eval` again"
-            )
+            raise UserError(f"{printable(folder)} has scenes that its dataset has not; make the run again")
         by_id = {
             f"{scene}/{viewer}": a for scene, row in rows.items() for viewer, a in row["answers"].items()
         }

@@ -30,6 +30,8 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     code, out, err = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines()[:-1])) <= 80
+    assert out.splitlines()[-1] == f"wrote {tmp_path / 'run' / 'report.html'}"
+    assert (tmp_path / "run" / "report.html").is_file()
     assert "…" not in out
     assert "n = 2 episodes (layout seeds 5 to 6) × 2 channel seeds" in out
     code, out, _ = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json")
@@ -48,6 +50,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
         ("--episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
         ("--first-seed -1", "--first-seed -1 is out of range"),
         ("--workers 0", "--workers 0 is out of range; give 1 to 256"),
+        ("--episodes 3 --save-video 4", "--save-video 4 is out of range; give 0 to 3"),
         ("--condition 5g", "unknown operating point '5g'"),
         ("--condition all --condition 6g", "--condition all stands for every operating point"),
         ("--seeds 3:3", "--seeds 3:3: give a range"),

@@ -3,13 +3,16 @@
 import json
 import sys
 from itertools import pairwise
+from pathlib import Path
 
+import imageio_ffmpeg
 import pandas as pd
 import pytest
 from driving import FROM_LEFT, spec
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from harness.cli import main
+from harness.drawing.video import write_video
 from harness.drive.replay import find, stills
 from harness.drive.run import run
 from harness.errors import UserError
@@ -40,17 +43,71 @@ def test_thinking_is_seen_frame_by_frame_and_the_rest_ten_times_a_second(out):
     assert [s.open for s in seen[:9]] == [True] * 8 + [False]
 
 
-@pytest.mark.slow
-def test_an_episode_is_drawn_as_a_gif(tmp_path, monkeypatch, capsys):
-    run(spec("cruise", seeds=(0,), first_seed=FROM_LEFT), tmp_path / "run", False, 1, lambda done: None)
-    picture = tmp_path / "episode.gif"
-    monkeypatch.setattr(sys, "argv", ["harness", "video", str(tmp_path / "run"), "0", "--out", str(picture)])
+def typed(monkeypatch, capsys, *words):
+    """A command line: its exit code, stdout and stderr."""
+    monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
     with pytest.raises(SystemExit) as end:
         main()
-    assert not end.value.code
-    assert capsys.readouterr().out == f"wrote {picture}\n"
+    return end.value.code or 0, *capsys.readouterr()
+
+
+def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, tmp_path, monkeypatch, capsys):
+    picture = tmp_path / "episode.gif"
+    assert typed(monkeypatch, capsys, "video", out, 0, "--out", picture) == (0, f"wrote {picture}\n", "")
+    seen = list(stills(find(out, 0, None, None)))
     with Image.open(picture) as image:
-        assert image.n_frames == len(list(stills(find(tmp_path / "run", 0, None, None))))
+        frames = [frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(image)]
+    assert len(frames) == len(seen)
+    assert sum(a != b for a, b in pairwise(frames)) == len(frames) - 1
+
+
+def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
+    film = tmp_path / "episode.mp4"
+    assert typed(monkeypatch, capsys, "video", out, 0, "--out", film) == (0, f"wrote {film}\n", "")
+    assert film.read_bytes()[4:8] == b"ftyp"
+    expected = 0.1 * len(list(stills(find(out, 0, None, None)))) + 2.4  # the last still stays
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert (frames, seconds) == (round(10 * expected), pytest.approx(expected, abs=0.11))
+    assert [p.name for p in tmp_path.iterdir()] == ["episode.mp4"]
+
+
+def test_the_same_episode_gives_the_same_gif(out, tmp_path):
+    played = find(out, 0, None, None)
+    for name in ("a.gif", "b.gif"):
+        write_video(played, tmp_path / name, lambda done: None)
+    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
+    out, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "folder.gif").mkdir()
+    without = [p for p in sys.path if not (Path(p) / "imageio_ffmpeg").is_dir()]
+    for name, says in (
+        ("x.avi", "end it in .gif or .mp4"),
+        ("folder.gif", "is a folder; name a file in it"),
+        ("x.mp4", "needs imageio-ffmpeg; pip install 'swarmdrive-harness[video]', or end it in .gif"),
+    ):
+        if name == "x.mp4":
+            monkeypatch.setattr(sys, "path", without)
+            monkeypatch.delitem(sys.modules, "imageio_ffmpeg", raising=False)
+        code, said, error = typed(monkeypatch, capsys, "video", out, 0, "--out", tmp_path / name)
+        assert (code, said, error.count("\n")) == (2, "", 1)
+        assert says in error
+    assert [p.name for p in tmp_path.iterdir()] == ["folder.gif"]
+
+
+def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
+    words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
+    layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
+    out = tmp_path / "run"
+    code, said, _ = typed(monkeypatch, capsys, "drive", *words, *layouts, "--save-video", 1, "--out", out)
+    table = pd.read_csv(out / "episodes.csv")
+    first = table[~table.success].episode.min()
+    name = f"{first:05d}-seed0.mp4"
+    assert code == 0
+    assert said.splitlines()[-2:] == [f"wrote {out / 'videos'}: {name}", f"wrote {out / 'report.html'}"]
+    assert [p.name for p in (out / "videos").iterdir()] == [name]
 
 
 def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
@@ -58,12 +115,12 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
         ((out, 3, None, None), "give 0 to 2"),
         ((out, 0, "5g", None), "unknown condition '5g'"),
         ((out, 0, None, 9), "unknown seed '9'"),
-        ((tmp_path, 0, None, None), "is no live run"),
+        ((tmp_path, 0, None, None), "is no run.* made by `harness drive`"),
     ):
         with pytest.raises(UserError, match=says):
             find(*arguments)
     frozen = tmp_path / "frozen"
     frozen.mkdir()
     (frozen / "run.json").write_text(json.dumps({"format": "swarmdrive-run/1"}))
-    with pytest.raises(UserError, match="was not driven"):
+    with pytest.raises(UserError, match=r"has format 'swarmdrive-run/1'.* made by `harness drive`"):
         find(frozen, 0, None, None)

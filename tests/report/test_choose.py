@@ -3,7 +3,12 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.report.choose import pick
+from harness.report import choose
+from harness.run.folder import Run
+
+
+def pick(rows, n):
+    return choose.pick(rows, choose.failures(Run(None, {}, (), rows)), n)
 
 
 def row(episode, actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict", avoidable=True):

@@ -3,13 +3,12 @@
 import base64
 import json
 import shutil
-from collections import Counter
 from dataclasses import replace
-from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import pytest
 import typer
+from reading import Page
 from sample_run import write_run
 from typer.testing import CliRunner
 
@@ -21,30 +20,6 @@ from harness.report.words import headline, latency_source
 from harness.run.folder import Score, read
 
 V2 = prompts.load("v2")
-
-
-class Page(HTMLParser):
-    """What a browser would make of a page: elements, attributes, text."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.attributes, self.pieces, self.styles = Counter(), [], [], []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, attributes):
-        self.tags[tag] += 1
-        self.attributes += [(tag, name, value or "") for name, value in attributes]
-
-    def handle_data(self, data):
-        self.pieces.append(data)
-
-    @property
-    def text(self):
-        return " ".join(" ".join(self.pieces).split())
-
-    def values(self, name):
-        return [value for _, n, value in self.attributes if n == name]
 
 
 @pytest.fixture(scope="session")
