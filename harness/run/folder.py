@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,23 @@ from harness.dataset.load import Dataset, find, load
 from harness.errors import UserError, printable
 from harness.run.spec import FORMAT
 
-NEEDED = ("model", "prompt", "dataset", "actions", "conditions", "seeds", "latency")
-NEEDED_IN_ROW = ("scene", "episode", "answers", "safe", "delay_s", "decisions")
-
 Row = dict[str, Any]  # one decision point of rows.jsonl
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of run folder: the format it states, the command that makes it, the keys it must have."""
+
+    format: str
+    command: str
+    needed: tuple[str, ...]
+    needed_in_row: tuple[str, ...]
+
+
+FROZEN = Kind(
+    FORMAT, "harness eval", ("model", "prompt", "dataset", "actions", "conditions", "seeds", "latency"),
+    ("scene", "episode", "answers", "safe", "delay_s", "decisions"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -76,34 +89,35 @@ class Run:
         return min(found, key=lambda s: s.interval != "episodes", default=None)
 
 
-def read(path: Path) -> Run:
-    """Read a run folder.
+def read(path: Path, kinds: Sequence[Kind] = (FROZEN,)) -> Run:
+    """Read a run folder of one of these kinds.
 
     Raises:
         UserError: it is none, or a file of it is missing or broken.
     """
+    commands = " or ".join(f"`{kind.command}`" for kind in kinds)
     if not (path / "run.json").is_file():
-        raise UserError(
-            f"{printable(path)} is no run: it has no run.json; give a folder made by `harness eval`"
-        )
+        raise UserError(f"{printable(path)} is no run: it has no run.json; give a folder made by {commands}")
     config = _parsed(path / "run.json", json.loads, _text(path / "run.json"))
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        found = config.get("format") if isinstance(config, dict) else None
+    found = config.get("format") if isinstance(config, dict) else None
+    by_format = {kind.format: kind for kind in kinds}
+    if not isinstance(found, str) or found not in by_format:
         raise UserError(
             f"{printable(path / 'run.json')} has format {printable(found)!r}; "
-            f"this harness reads {FORMAT!r}: run `harness eval` again"
+            f"this command reads {' and '.join(map(repr, by_format))}: give a run of {commands}"
         )
-    _need(path / "run.json", config, NEEDED)
+    kind = by_format[found]
+    _need(path / "run.json", config, kind.needed)
     scores = _parsed(path / "summary.csv", _scores, _text(path / "summary.csv"))
     rows = []
     for number, line in enumerate(_text(path / "rows.jsonl").split("\n"), 1):
         if line.strip():
             where = f"{path / 'rows.jsonl'} line {number}"
             row = _parsed(where, json.loads, line)
-            _need(where, row, NEEDED_IN_ROW)
+            _need(where, row, kind.needed_in_row)
             rows.append(row)
     if not rows:
-        raise UserError(f"{printable(path / 'rows.jsonl')} holds no decisions; run `harness eval` again")
+        raise UserError(f"{printable(path / 'rows.jsonl')} holds no decisions; make the run again")
     return Run(path, config, scores, tuple(rows))
 
 
@@ -129,22 +143,20 @@ def _text(file: Path) -> str:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise UserError(f"cannot read {printable(file)}: {reason}; run `harness eval` again") from None
+        raise UserError(f"cannot read {printable(file)}: {reason}; make the run again") from None
 
 
 def _parsed(where: object, reader: Any, text: str) -> Any:
     try:
         return reader(text)
     except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as error:
-        raise UserError(
-            f"{printable(where)} is broken ({printable(error)}); run `harness eval` again"
-        ) from None
+        raise UserError(f"{printable(where)} is broken ({printable(error)}); make the run again") from None
 
 
 def _need(where: object, found: Any, keys: Iterable[str]) -> None:
     missing = [key for key in keys if not isinstance(found, dict) or key not in found]
     if missing:
-        raise UserError(f"{printable(where)} lacks {', '.join(missing)}; run `harness eval` again")
+        raise UserError(f"{printable(where)} lacks {', '.join(missing)}; make the run again")
 
 
 def _scores(text: str) -> tuple[Score, ...]:
