@@ -46,7 +46,7 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
             if some:
                 yield f"  {name}: {words.turned(some, pair, most)}"
     if not found.answers:
-        yield "answers: none changed its status"
+        yield "answers: none changed its verdict"
     for t in found.answers:
         yield f"answers: {words.answers_turned(t, found)}"
         yield "  " + ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
@@ -78,7 +78,7 @@ def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
     for t in found.answers:
         ids = ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
         said += [f"- {code(words.answers_turned(t, found))}: {code(ids)}"]
-    said += [] if found.answers else ["- no answer changed its status"]
+    said += [] if found.answers else ["- no answer changed its verdict"]
     said += [f"- {code(f'{name}: {_setting(a)} → {_setting(b)}')}" for name, a, b in found.settings]
     return "\n".join([*said, "", "</details>"])
 

@@ -92,7 +92,7 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Pat
         ("success_rate", "cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER"),
         ("success_rate < low", "cannot be read"),
         ("success_rate < nan", "cannot be read"),
-        ("success_rate == 0", "cannot be read; with OP one of < <= > >=, such as "),
+        ("success_rate == 0", "[.low|.high] OP NUMBER with OP one of < <= > >=, such as "),
         ("success_rate < 0 or so", "cannot be read"),
         ("\x1b[31m", "cannot be read"),
         ("", "cannot be read"),
