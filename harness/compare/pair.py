@@ -160,6 +160,8 @@ def _table(run: Run) -> "pd.DataFrame":
     }).astype(float)  # fmt: skip
     decided = pd.DataFrame.from_records(list(_decisions(run)), columns=[*KEY, *PER_DECISION])
     means = decided.astype(dict.fromkeys(PER_DECISION, float)).groupby(KEY).mean()
+    if np.isinf(table.join(means)).any(axis=None):
+        raise ValueError("a number of its decisions or episodes is infinite")
     return table.join(means).assign(end=ended.failure.where(~ended.success, "success"))
 
 

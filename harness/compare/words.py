@@ -3,17 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from harness.compare.difference import (
-    RESAMPLES,
-    RESAMPLING_SEED,
-    AnswersTurned,
-    Comparison,
-    Difference,
-    InCondition,
-    Turned,
-)
+from harness.compare.difference import AnswersTurned, Comparison, Difference, InCondition, Turned
 from harness.compare.gate import Verdict
 from harness.compare.pair import Pair, Side
+from harness.compare.success import RESAMPLES, RESAMPLING_SEED
 from harness.errors import printable
 from harness.report.words import unit
 

@@ -127,6 +127,7 @@ def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: H
         (("--json", "--markdown"), "--markdown and --json: give one of them"),
         (("--show", "-1"), "--show -1 is out of range"),
         (("--html", "."), "--html . is a folder; name a file in it"),
+        (("--html", "a/run.json/page.html"), "--html a/run.json/page.html cannot be written"),
     ):
         code, out, err = harness("compare", *runs, *options)
         assert (code, out, err.count("\n")) == (2, "", 1)

@@ -11,8 +11,9 @@ from changing import SEEDS, configure, ends, rewrite
 from evaluating import run as evaluate
 from evaluating import spec_of
 
-from harness.compare.difference import Comparison, Difference, SuccessTest, Turned, compare
+from harness.compare.difference import Comparison, Difference, Turned, compare
 from harness.compare.pair import METRICS, pair
+from harness.compare.success import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.errors import UserError
@@ -226,6 +227,7 @@ def test_what_cannot_be_compared_is_refused(
         lambda run: configure(run, conditions=[{"name": "6g", "wheels": 4}]),
         lambda run: rewrite(run, lambda row: row.update(decisions=[{}])),
         lambda run: rewrite(run, lambda row: row["answers"].update(v1={})),
+        lambda run: rewrite(run, lambda row: row["decisions"][0].update(latency_ms=float("inf"))),
     ],
 )
 def test_a_damaged_run_is_one_line(
