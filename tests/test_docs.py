@@ -7,6 +7,7 @@ from typing import get_args
 import pytest
 
 from harness.backends.base import AnswerMode
+from harness.compare.pair import METRICS
 from harness.consensus import NAMES
 from harness.failures import Failures
 from harness.operating_point import POINTS, SETTINGS
@@ -54,3 +55,8 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
 @pytest.mark.parametrize("name", NAMES)
 def test_every_consensus_is_documented(name: str) -> None:
     assert f"| `{name}` |" in (ROOT / "docs/operating-points.md").read_text()
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_every_metric_that_runs_are_compared_by_is_documented(metric: str) -> None:
+    assert f"`{metric}`" in (ROOT / "docs/comparing.md").read_text()

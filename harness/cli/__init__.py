@@ -10,6 +10,7 @@ import typer
 
 from harness.cli import (
     campaign,
+    compare,
     dataset,
     distill,
     drive,
@@ -46,6 +47,7 @@ app.command("parse")(parse.command)
 app.command("distill")(distill.distill)
 app.command("sweep")(sweep.sweep)
 app.command("fidelity")(fidelity.fidelity)
+app.command("compare")(compare.compare)
 app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
 

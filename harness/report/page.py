@@ -65,7 +65,7 @@ def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -
         progress(1)
     chart = figures.success_latency(run)
     by_verdict = _count(run.rows, "verdict")
-    return _environment().get_template("page.html.j2").render(
+    return environment().get_template("page.html.j2").render(
         run=run,
         config=run.config,
         live=isinstance(run, Driven),
@@ -82,16 +82,17 @@ def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -
     )  # fmt: skip
 
 
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
+def environment(*more: Path) -> Environment:
+    """The report's templates, and those of other folders: everything is escaped and made `visible`."""
+    found = Environment(
+        loader=FileSystemLoader([*more, TEMPLATES]),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=visible,
     )
-    environment.filters |= {"number": words.number, "facts": words.facts}
-    return environment
+    found.filters |= {"number": words.number, "facts": words.facts}
+    return found
 
 
 def visible(value: Any) -> Any:

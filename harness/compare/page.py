@@ -1,0 +1,29 @@
+"""A comparison as one HTML file: needs no network and runs no script."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from harness.compare import words
+from harness.compare.difference import Comparison
+from harness.compare.gate import Verdict
+from harness.errors import UserError, printable
+from harness.files import write_whole
+from harness.report.page import environment
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def write(found: Comparison, verdicts: Sequence[Verdict], most: int, out: Path) -> None:
+    """Write the page; `most` episodes and requests are listed of each kind.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    template = environment(TEMPLATES).get_template("compare.html.j2")
+    page = template.render(found=found, pair=found.pair, verdicts=verdicts, most=most, words=words)
+    try:
+        write_whole(out, page)
+    except OSError as error:
+        raise UserError(
+            f"--html {printable(out)} cannot be written ({error.strerror}); name another file"
+        ) from None

@@ -1,0 +1,25 @@
+import shutil
+from pathlib import Path
+
+import pytest
+from changing import SEEDS
+from evaluating import run as evaluate
+from evaluating import spec_of
+
+from harness.dataset.load import Dataset
+from harness.operating_point import POINTS
+
+
+@pytest.fixture(scope="session")
+def evaluated(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The proxy on four episodes, alone and under 6g, with two seeds."""
+    points = (POINTS["single-local"], POINTS["6g"])
+    return evaluate(
+        spec_of(small, points=points, seeds=SEEDS), tmp_path_factory.mktemp("compare") / "run"
+    ).out
+
+
+@pytest.fixture
+def runs(evaluated: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """The same run twice, each to be changed by a test."""
+    return shutil.copytree(evaluated, tmp_path / "a"), shutil.copytree(evaluated, tmp_path / "b")

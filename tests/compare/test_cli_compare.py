@@ -1,0 +1,241 @@
+"""`harness compare` as typed: what it prints, its gates and its exit codes."""
+
+import json
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from changing import configure, ends, rewrite
+
+from harness.compare.text import code
+
+Said = tuple[int, str, str]
+Harness = Callable[..., Said]
+
+
+@pytest.fixture
+def worse(runs: tuple[Path, Path]) -> tuple[Path, Path]:
+    """Under 6g one success of four is lost in every seed; alone nothing changes."""
+    ends(runs[0], "6g", [["", "", "", ""]] * 2)
+    ends(runs[1], "6g", [["", "late", "", ""]] * 2)
+    return runs
+
+
+@pytest.mark.parametrize(
+    ("gates", "failed"),
+    [
+        (["success_rate < -0.25"], []),  # it is -0.25, and its interval ends at -1.05 and at +0.55
+        (["success_rate <= -0.25"], ["6g"]),
+        (["success_rate < -0.01"], ["6g"]),
+        (["success_rate<-0.01"], ["6g"]),
+        (["6g:success_rate < -0.01"], ["6g"]),
+        (["single-local:success_rate < -0.01"], []),
+        (["success_rate <= 0"], ["single-local", "6g"]),
+        (["late_rate > 0.2"], ["6g"]),
+        (["late_rate >= 0.3"], []),
+        (["success_rate.high < 0"], []),
+        (["success_rate.high < 0.6"], ["single-local", "6g"]),
+        (["6g:success_rate.low < -1"], ["6g"]),
+        (["success_rate.low < -1.1"], []),
+        (["latency_proxy_ms > 5", "late_rate > 0", "unsafe_rate > 0"], ["6g"]),
+    ],
+)
+def test_gates_decide_the_exit_code(
+    gates: list[str], failed: list[str], worse: tuple[Path, Path], harness: Harness
+) -> None:
+    options = [part for gate in gates for part in ("--fail-if", gate)]
+    code, out, err = harness("compare", *worse, *options, "--json")
+    told = json.loads(out, parse_constant=pytest.fail)
+    assert (code, err) == (1 if failed else 0, "")
+    assert told["passed"] is not bool(failed)
+    assert [where["condition"] for gate in told["gates"] for where in gate["failed_in"]] == failed
+    assert [gate["gate"] for gate in told["gates"]] == gates
+    assert harness("compare", *worse, *options)[0] == code
+    assert harness("compare", *worse, *options, "--markdown")[0] == code
+
+
+def test_rounding_decides_no_gate(runs: tuple[Path, Path], harness: Harness) -> None:
+    """A loss of 0.1 + 0.2 - 0.3 is none."""
+
+    def undecided(run: Path, nats: float) -> None:
+        rewrite(run, lambda row: [d.update(entropy_nats=nats) for d in row["decisions"]])
+
+    undecided(runs[0], 0.3)
+    undecided(runs[1], 0.1 + 0.2)
+    assert harness("compare", *runs, "--fail-if", "entropy_nats > 0")[0] == 0
+    undecided(runs[1], 0.3 + 1e-6)
+    assert harness("compare", *runs, "--fail-if", "entropy_nats > 0")[0] == 1
+
+
+def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Path], harness: Harness) -> None:
+    config = json.loads((runs[0] / "run.json").read_text())
+    name = "6g:consensus=median,window_s=0.4"
+    config["conditions"][1]["name"] = name
+    for run in runs:
+        configure(run, conditions=config["conditions"])
+        for file in ("episodes.csv", "rows.jsonl"):
+            text = (run / file).read_text()
+            quoted = f'"{name}"'
+            old = ",6g," if file.endswith("csv") else '"6g"'
+            (run / file).write_text(text.replace(old, f",{quoted}," if file.endswith("csv") else quoted))
+    code, out, _ = harness("compare", *runs, "--fail-if", f"{name}:success_rate >= 0")
+    assert code == 1
+    assert f"FAILED: {name}:success_rate >= 0 in {name} (+0)" in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("gate", "said"),
+    [
+        ("success_rate", "cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER"),
+        ("success_rate < low", "cannot be read"),
+        ("success_rate < nan", "cannot be read"),
+        ("success_rate == 0", "[.low|.high] OP NUMBER with OP one of < <= > >=, such as "),
+        ("success_rate < 0 or so", "cannot be read"),
+        ("\x1b[31m", "cannot be read"),
+        ("", "cannot be read"),
+        ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: brier, "),
+        ("success_rate.middle < 0", "interval in --fail-if 'middle'; known: high, low"),
+        ("5g:success_rate < 0", "unknown condition of --fail-if '5g:success_rate < 0' '5g'"),
+    ],
+)  # fmt: skip
+def test_a_gate_that_cannot_be_read_is_one_line(
+    gate: str, said: str, runs: tuple[Path, Path], harness: Harness
+) -> None:
+    options = ("--fail-if", "success_rate < -1", "--fail-if", gate, "--html", "page.html")
+    code, out, err = harness("compare", *runs, *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+    assert err[:-1].isprintable()
+    assert not Path("page.html").exists()
+
+
+def test_a_gate_on_what_is_not_known_is_refused_and_does_not_pass(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
+    rewrite(runs[1], lambda row: [d.update(latency_ms=None) for d in row["decisions"]])
+    code, out, err = harness("compare", *runs, "--fail-if", "latency_proxy_ms > 5")
+    assert (code, out) == (2, "")
+    assert "single-local has no such number in these runs" in err
+    assert harness("compare", *runs)[0] == 0
+
+
+def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: Harness) -> None:
+    for options, said in (
+        (("--json", "--markdown"), "--markdown and --json: give one of them"),
+        (("--show", "-1"), "--show -1 is out of range"),
+        (("--html", "."), "--html . is a folder; name a file in it"),
+        (("--html", "a/run.json/page.html"), "--html a/run.json/page.html cannot be written"),
+    ):
+        code, out, err = harness("compare", *runs, *options)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert said in err
+
+
+def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harness) -> None:
+    configure(worse[1], answer="constrained")
+    rewrite(worse[1], lambda row: row["answers"]["v1"].update(verdict="failed"))
+    code, out, err = harness("compare", *worse, "--show", "2", "--fail-if", "6g:late_rate > 0.1")
+    assert (code, err) == (1, "")
+    assert max(map(len, out.splitlines())) <= 80
+    said = " ".join(out.split())
+    for part in (
+        "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
+        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-104.6, +54.6]",
+        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1",
+        "lost: 1 late", "answers: ego strict → failed: 24 of 24", "00000-0/v1, 00000-1/v1, 22 more",
+        "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",
+    ):  # fmt: skip
+        assert part in said, part
+
+
+def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harness: Harness) -> None:
+    rewrite(worse[1], lambda row: row["answers"]["v2"].update(verdict="recovered"))
+    told = json.loads(harness("compare", *worse, "--show", "1", "--json")[1], parse_constant=pytest.fail)
+    condition = told["conditions"][1]
+    assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
+        "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
+    }  # fmt: skip
+    assert condition["lost"] == {
+        "count": 2, "episodes": 1,
+        "listed": [{"episode": 1, "seeds": [0, 1], "a": "success", "b": "late"}],
+    }  # fmt: skip
+    assert condition["test"] == {"method": "mcnemar", "p_value": 1.0, "low": None, "high": None}
+    [turned] = told["answers"]
+    assert turned == {
+        "role": "helper", "a": "strict", "b": "recovered", "count": 24, "requests": ["00000-0/v2"],
+    }  # fmt: skip
+    assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
+
+
+HOSTILE = "`<script>alert(1)</script> @everyone ![x](http://x) {{ 7 * 7 }} | ``\n\u202e"
+
+
+class Page(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[str] = []
+        self.pieces: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [name for name, _ in attrs]
+
+    def handle_data(self, data: str) -> None:
+        self.pieces.append(data)
+
+
+@pytest.fixture
+def hostile(worse: tuple[Path, Path]) -> tuple[Path, Path]:
+    """Whatever a run can say is hostile: names, ends, verdicts, ids of requests."""
+    ends(worse[1], "6g", [["", HOSTILE, "", ""]] * 2)
+    config = json.loads((worse[0] / "run.json").read_text())
+    for run in worse:
+        scenes = config["dataset"] | {"name": HOSTILE}
+        configure(run, model=config["model"] | {"name": HOSTILE}, dataset=scenes)
+    configure(worse[1], prompt=config["prompt"] | {"version": HOSTILE}, identity={HOSTILE: HOSTILE})
+
+    def spoil(row: dict[str, Any]) -> None:
+        row["scene"] += HOSTILE
+
+    rewrite(worse[0], spoil)
+    rewrite(worse[1], spoil)
+    rewrite(worse[1], lambda row: row["answers"]["v1"].update(verdict=HOSTILE))
+    return worse
+
+
+def test_nothing_a_run_says_becomes_markup(
+    hostile: tuple[Path, Path], runs: tuple[Path, Path], harness: Harness
+) -> None:
+    gate = ("--fail-if", "6g:success_rate < 0")
+    code, out, _ = harness("compare", *hostile, *gate, "--html", "page.html")
+    assert code == 1
+    assert max(map(len, out.splitlines())) <= 80
+    assert out.replace("\n", "").isprintable()
+    text = Path("page.html").read_text()
+    page = Page(text)
+    assert not {"script", "img", "link", "iframe", "form"} & set(page.tags)
+    assert not [name for name in page.attributes if name.startswith("on")]
+    assert "default-src 'none'; style-src 'unsafe-inline'" in text
+    assert "⟨U+202E⟩" in text
+    assert "\u202e" not in text
+    for part in ("{{ 7 * 7 }}", "<script>alert(1)</script>", "FAILED: 6g:success_rate < 0 in 6g (-0.25)"):
+        assert part in "".join(page.pieces)
+    marked = harness("compare", *hostile, *gate, "--markdown")[1]
+    bare = re.sub(r"(?<!`)(`+)(?!`).*?(?<!`)\1(?!`)", "", marked)
+    assert HOSTILE[1:20] in marked
+    for part in ("script", "@everyone", "![x]", "\u202e"):
+        assert part not in bare
+
+
+@pytest.mark.parametrize(
+    ("text", "marked"),
+    [("a", "`a`"), ("a`b", "`` a`b ``"), ("``", "``` `` ```"), ("a\nb", r"`a\nb`"), ("|", "`|`")],
+)
+def test_code_holds_any_text(text: str, marked: str) -> None:
+    assert code(text) == marked

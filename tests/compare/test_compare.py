@@ -1,0 +1,239 @@
+"""Two runs held against each other: differences that can be counted by hand, and what is refused."""
+
+import csv
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from changing import SEEDS, configure, ends, rewrite
+from evaluating import run as evaluate
+from evaluating import spec_of
+
+from harness.compare.difference import Comparison, Difference, Turned, compare
+from harness.compare.pair import METRICS, pair
+from harness.compare.success import SuccessTest
+from harness.dataset.build import build
+from harness.dataset.load import Dataset, load
+from harness.errors import UserError
+from harness.operating_point import POINTS
+
+Said = tuple[int, str, str]
+
+
+def found(runs: tuple[Path, Path]) -> Comparison:
+    return compare(pair(*runs))
+
+
+def differences(c: Comparison, condition: str) -> Mapping[str, Difference]:
+    [of] = [of for of in c.conditions if of.condition == condition]
+    return {d.metric: d for d in of.differences}
+
+
+def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> None:
+    c = found(runs)
+    assert (c.settings, c.answers) == ((), ())
+    assert c.answers_in_both == {"ego": 24, "helper": 72}
+    for of in c.conditions:
+        assert {d.metric for d in of.differences} == set(METRICS)
+        for d in of.differences:
+            assert (d.change.value, d.change.low, d.change.high) == (0, 0, 0)
+            assert (d.a, d.change.n, d.change.n_excluded) == (d.b, 4, 0)
+        assert (of.gained, of.lost) == ((), ())
+    assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0)
+
+
+def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) -> None:
+    with (runs[0] / "summary.csv").open() as file:
+        own = {
+            (row["condition"], row["metric"]): float(row["value"])
+            for row in csv.DictReader(file) if row["interval"] == "episodes" and row["value"]
+        }  # fmt: skip
+    c = found(runs)
+    for of in c.conditions:
+        for d in of.differences:
+            assert d.a == pytest.approx(own[of.condition, d.metric], abs=1e-3 if "_ms" in d.metric else 1e-6)
+
+
+def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
+    """Alone 1, 1, 0 and -1 change: mean 0.25, deviation 0.9574, times t(3) = 3.182 over 2."""
+    ends(runs[0], "single-local", [["late", "collision", "", ""]] * 2)
+    ends(runs[1], "single-local", [["", "", "", "time_out"]] * 2)
+    ends(runs[0], "6g", [["late"] * 4] * 2)
+    ends(runs[1], "6g", [[""] * 4] * 2)
+    c = found(runs)
+    alone = differences(c, "single-local")
+    change = alone["success_rate"].change
+    assert (alone["success_rate"].a, alone["success_rate"].b, change.value, change.n) == (0.5, 0.75, 0.25, 4)
+    assert (change.low, change.high) == pytest.approx((0.25 - 1.5235, 0.25 + 1.5235), abs=1e-4)
+    assert alone["unsafe_rate"].change.value == 0, "a collision less, and a time out more"
+    assert alone["late_rate"].change.value == -0.25
+    assert c.conditions[0].gained == (Turned(0, SEEDS, "late", "success"),
+                                      Turned(1, SEEDS, "collision", "success"))  # fmt: skip
+    assert c.conditions[0].lost == (Turned(3, SEEDS, "success", "time_out"),)
+    assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0), "two against one is nothing"
+    assert c.conditions[1].test == SuccessTest("mcnemar", p_value=2 / 2**4), "four of four, both sides"
+
+
+def test_success_that_hangs_on_the_seed_is_resampled_by_episode(runs: tuple[Path, Path]) -> None:
+    """Episodes change by 0.5, 0, 0 and 0.5: no mean of four of them is below 0 or above 0.5, and both
+    are met in 1 of 16 resamples, which is more than 2.5 %."""
+    ends(runs[0], "6g", [["late", "", "late", "late"], ["", "", "late", ""]])
+    ends(runs[1], "6g", [["", "", "late", ""], ["", "", "late", ""]])
+    c = found(runs)
+    assert differences(c, "6g")["success_rate"].change.value == 0.25
+    assert c.conditions[1].test == SuccessTest("bootstrap", low=0.0, high=0.5)
+    assert c.conditions[1].gained == (Turned(0, (0,), "late", "success"), Turned(3, (0,), "late", "success"))
+
+
+def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> None:
+    """10 ms more in episode 0 and one seed of two is 5 ms; episode 1 is unknown in B, and so left out."""
+
+    def slower(row: dict[str, Any]) -> None:
+        for d in row["decisions"]:
+            d["latency_ms"] = 100.0
+            if row["episode"] == 0 and d["seed"] == 0:
+                d["latency_ms"] = 110.0
+            if row["episode"] == 1:
+                d["latency_ms"] = None
+
+    def steady(row: dict[str, Any]) -> None:
+        for d in row["decisions"]:
+            d["latency_ms"] = 900.0 if row["episode"] == 1 else 100.0
+
+    rewrite(runs[0], steady)
+    rewrite(runs[1], slower)
+    d = differences(found(runs), "6g")["latency_proxy_ms"]
+    assert (d.a, d.b) == pytest.approx((100, 100 + 5 / 3))
+    assert d.change.value == pytest.approx(5 / 3)
+    assert d.change.low == pytest.approx(5 / 3 - 4.3027 * 5 / 3, abs=1e-3), "t(2), standard error 5/3"
+    assert (d.change.n, d.change.n_excluded) == (3, 1)
+
+
+def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path], small: Dataset) -> None:
+    """B replays A, with one ego's answer and two helpers' made unreadable or a little broken."""
+    said = {"00000-0/v1": "no idea", "00000-0/v2": "no idea", "00001-2/v3": "fence"}
+
+    def spoil(row: dict[str, Any]) -> None:
+        for viewer, answer in row["answers"].items():
+            how = said.get(f"{row['scene']}/{viewer}")
+            answer["raw"] = f"```json\n{answer['raw']}\n```" if how == "fence" else how or answer["raw"]
+
+    rewrite(runs[1], spoil)
+    points = (POINTS["single-local"], POINTS["6g"])
+    replayed = evaluate(spec_of(small, f"replay:{runs[1]}", points=points, seeds=SEEDS), Path(runs[1], "new"))
+    c = found((runs[0], replayed.out))
+    turned = {(t.role, t.a, t.b): t.requests for t in c.answers}
+    assert turned == {
+        ("ego", "strict", "failed"): ("00000-0/v1",),
+        ("helper", "strict", "failed"): ("00000-0/v2",),
+        ("helper", "strict", "recovered"): ("00001-2/v3",),
+    }
+    assert differences(c, "6g")["fallback_rate"].change.value == pytest.approx(1 / 6 / 4)
+    assert "model.name" in {name for name, _, _ in c.settings}
+
+
+def test_settings_in_which_runs_differ_are_told(runs: tuple[Path, Path]) -> None:
+    config = json.loads((runs[1] / "run.json").read_text())
+    conditions = [{k: v for k, v in c.items() if k != "on_demand"} for c in config["conditions"]]
+    conditions[1]["tau_nats"] = 0.5
+    configure(
+        runs[1], conditions=conditions, answer="constrained", prompt=config["prompt"] | {"version": "v3"},
+        identity=config["identity"] | {"build": "b2"}, versions=config["versions"] | {"numpy": "9"},
+    )  # fmt: skip
+    told = {name: (a, b) for name, a, b in found(runs).settings}
+    assert told == {
+        "prompt.version": ("v2", "v3"),
+        "answer": ("json", "constrained"),
+        "identity.build": (None, "b2"),
+        "versions.numpy": (config["versions"]["numpy"], "9"),
+        "condition.6g.tau_nats": ("0.7", "0.5"),
+    }, "a setting that an older run does not have is what it was then"
+
+
+def test_runs_of_other_lengths_and_conditions_are_compared_where_they_meet(
+    runs: tuple[Path, Path], small_path: Path
+) -> None:
+    short = evaluate(spec_of(load(small_path, 3), points=(POINTS["6g"], POINTS["v2x"])), runs[1] / "short")
+    c = found((runs[0], short.out))
+    assert (c.pair.conditions, c.pair.episodes) == (("6g",), (0, 1, 2))
+    assert c.settings == ()
+    assert all(d.change.n == 3 and d.change.value == 0 for d in c.conditions[0].differences)
+
+
+def test_one_episode_has_differences_and_no_interval(small_path: Path, tmp_path: Path) -> None:
+    one = evaluate(spec_of(load(small_path, 1), seeds=SEEDS), tmp_path / "one").out
+    for condition in found((one, one)).conditions:
+        for d in condition.differences:
+            assert d.change.value == 0
+            assert d.change.low != d.change.low
+
+
+def test_live_runs_are_compared_with_live_runs(harness: Callable[..., Said], runs: tuple[Path, Path]) -> None:
+    drive = ("drive", "--episodes", "2", "--seeds", "0:2", "--workers", "1", "--condition", "6g")
+    for model in ("cruise", "local-view"):
+        assert harness(*drive, "--model", model, "--out", model)[0] == 0
+    assert harness(*drive, "--model", "cruise", "--first-seed", "7", "--out", "other")[0] == 0
+    c = found((Path("cruise"), Path("local-view")))
+    with Path("local-view/summary.csv").open() as file:
+        own = {
+            r["metric"]: r["value"] for r in csv.DictReader(file)
+            if (r["condition"], r["interval"]) == ("6g", "episodes")
+        }  # fmt: skip
+    told = differences(c, "6g")
+    assert set(METRICS) - set(told) == {"brier", "negative_log_likelihood"}
+    for name, d in told.items():
+        assert d.b == pytest.approx(float(own[name]), abs=1e-3)
+    assert not any(d.change.value for d in differences(found((Path("cruise"),) * 2), "6g").values())
+    for other, said in ((runs[0], "one was made by"), (Path("other"), "not of the same scenes")):
+        with pytest.raises(UserError, match=said):
+            pair(Path("cruise"), other)
+
+
+def test_what_cannot_be_compared_is_refused(
+    runs: tuple[Path, Path], small: Dataset, tmp_path: Path, harness: Callable[..., Said]
+) -> None:
+    build(tmp_path / "data", 1, 7, 1, lambda done: None)
+    points = (POINTS["6g"],)
+    other = evaluate(spec_of(load(tmp_path / "data"), points=points, seeds=SEEDS), tmp_path / "other").out
+    luck = evaluate(spec_of(small, points=points, seeds=(0, 2)), tmp_path / "luck").out
+    v2x = evaluate(spec_of(small, points=(POINTS["v2x"],), seeds=SEEDS), tmp_path / "v2x").out
+    for run, said in (
+        (other, "not of the same scenes (small "),
+        (luck, "have different seeds ([0, 1] and [0, 2])"),
+        (v2x, "have no condition in common (single-local, 6g and v2x)"),
+        (tmp_path / "nowhere", "is no run: it has no run.json"),
+    ):
+        code, out, err = harness("compare", runs[0], run)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert said in err
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda run: (run / "episodes.csv").write_text("model,prompt\n"),
+        lambda run: (run / "episodes.csv").unlink(),
+        lambda run: (run / "episodes.csv").write_text(
+            "\n".join((run / "episodes.csv").read_text().splitlines()[:-1])
+        ),
+        lambda run: (run / "episodes.csv").write_text(
+            (run / "episodes.csv").read_text().replace("True", "perhaps")
+        ),
+        lambda run: (run / "episodes.csv").write_text((run / "episodes.csv").read_text().replace("6g", "7g")),
+        lambda run: configure(run, dataset="small"),
+        lambda run: configure(run, seeds=["x"]),
+        lambda run: configure(run, conditions=[{"name": "6g", "wheels": 4}]),
+        lambda run: rewrite(run, lambda row: row.update(decisions=[{}])),
+        lambda run: rewrite(run, lambda row: row["answers"].update(v1={})),
+        lambda run: rewrite(run, lambda row: row["decisions"][0].update(latency_ms=float("inf"))),
+    ],
+)
+def test_a_damaged_run_is_one_line(
+    damage: Callable[[Path], object], runs: tuple[Path, Path], harness: Callable[..., Said]
+) -> None:
+    damage(runs[1])
+    code, out, err = harness("compare", *runs, "--html", "page.html")
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert not Path("page.html").exists()
