@@ -15,6 +15,7 @@ from harness.cli import (
     drive,
     evaluate,
     fidelity,
+    ls,
     model,
     parity,
     parse,
@@ -36,6 +37,7 @@ app = typer.Typer(
 )
 app.command("eval")(evaluate.evaluate)
 app.command("drive")(drive.drive)
+app.command("ls")(ls.ls)
 app.command("video")(video.command)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(dataset.app, name="dataset")
