@@ -104,7 +104,7 @@ def load(name: str) -> Card:
     stem, _, engine = name.partition(":")
     if stem not in names():
         raise unknown("model", name, names())
-    found = _of_file(stem)
+    found = each_engine(stem)
     if engine and engine not in {card.engine for card in found}:
         raise unknown(f"engine of model {stem}", engine, [card.engine for card in found])
     return next(card for card in found if engine in ("", card.engine))
@@ -112,10 +112,11 @@ def load(name: str) -> Card:
 
 def load_all() -> list[Card]:
     """Every card at hand, on each of its engines."""
-    return [card for name in names() for card in _of_file(name)]
+    return [card for name in names() for card in each_engine(name)]
 
 
-def _of_file(stem: str) -> list[Card]:
+def each_engine(stem: str) -> list[Card]:
+    """The card of a file's name on each of its engines. Raises UserError if the file has a mistake."""
     read = card_file.read(folder("models") / f"{stem}.toml")
     first = next(iter(read))
     return [

@@ -12,6 +12,7 @@ from harness.cli import (
     campaign,
     dataset,
     distill,
+    doctor,
     drive,
     evaluate,
     fidelity,
@@ -48,6 +49,7 @@ app.command("parse")(parse.command)
 app.command("distill")(distill.distill)
 app.command("sweep")(sweep.sweep)
 app.command("fidelity")(fidelity.fidelity)
+app.command("doctor")(doctor.doctor)
 app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
 
