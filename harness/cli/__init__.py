@@ -16,6 +16,7 @@ from harness.cli import (
     drive,
     evaluate,
     fidelity,
+    init,
     ls,
     model,
     parity,
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 app.command("eval")(evaluate.evaluate)
 app.command("drive")(drive.drive)
+app.command("init")(init.init)
 app.command("ls")(ls.ls)
 app.command("video")(video.command)
 app.add_typer(prompt.app, name="prompt")
