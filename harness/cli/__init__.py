@@ -33,7 +33,6 @@ app = typer.Typer(
     name="harness",
     help="Evaluate prompts and parsing in cooperative driving.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
+from harness.cli.progress import QUIET
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def drive(
     resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Drive live episodes in highway-env: every decision is asked at its moment and acts when it is ready."""
     from harness import cards, prompts
@@ -75,7 +77,7 @@ def drive(
         first_seed=first_seed,
         episodes=episodes,
     )
-    _run(spec, out or _default_out(spec, resume), resume, workers, no_cache, as_json)
+    _run(spec, out or _default_out(spec, resume), resume, workers, no_cache, as_json, quiet)
 
 
 def _shipped() -> dict[str, Any]:
@@ -94,16 +96,19 @@ def _default_out(spec: "Drive", resume: bool) -> Path:
     return default_out(replace(spec, dataset=named), resume)
 
 
-def _run(spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, as_json: bool) -> None:
+def _run(
+    spec: "Drive", out: Path, resume: bool, workers: int, no_cache: bool, as_json: bool, quiet: bool
+) -> None:
     from harness.backends.cache import default_file
     from harness.cli.evaluate import as_mapping
     from harness.cli.progress import bar
     from harness.drive.run import run
 
-    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json) as progress:
+    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json or quiet) as progress:
         done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
+    if as_json or quiet:
         return
     _table(done)
     typer.echo(f"wrote {out / 'episodes.csv'}, summary.csv, rows.jsonl and run.json")
