@@ -14,7 +14,7 @@ from harness import card_file
 from harness.card_file import WEIGHTED, Dtype, Engine, LatencySource, Thinking
 from harness.errors import UserError, printable, unknown
 from harness.failures import Failures
-from harness.resources import folder
+from harness.resources import entries, find
 from harness.servers import Server
 
 __all__ = ["WEIGHTED", "Card", "Dtype", "Engine", "Latency", "LatencySource", "Thinking", "load", "load_all",
@@ -92,7 +92,7 @@ class Card:
 
 def names() -> list[str]:
     """Names of the card files at hand, sorted."""
-    return sorted(path.stem for path in folder("models").glob("*.toml"))
+    return sorted({path.stem for path in entries("models", "*.toml")})
 
 
 def load(name: str) -> Card:
@@ -104,7 +104,7 @@ def load(name: str) -> Card:
     stem, _, engine = name.partition(":")
     if stem not in names():
         raise unknown("model", name, names())
-    found = _of_file(stem)
+    found = each_engine(stem)
     if engine and engine not in {card.engine for card in found}:
         raise unknown(f"engine of model {stem}", engine, [card.engine for card in found])
     return next(card for card in found if engine in ("", card.engine))
@@ -112,11 +112,12 @@ def load(name: str) -> Card:
 
 def load_all() -> list[Card]:
     """Every card at hand, on each of its engines."""
-    return [card for name in names() for card in _of_file(name)]
+    return [card for name in names() for card in each_engine(name)]
 
 
-def _of_file(stem: str) -> list[Card]:
-    read = card_file.read(folder("models") / f"{stem}.toml")
+def each_engine(stem: str) -> list[Card]:
+    """The card of a file's name on each of its engines. Raises UserError if the file has a mistake."""
+    read = card_file.read(find("models", f"{stem}.toml"))
     first = next(iter(read))
     return [
         Card(

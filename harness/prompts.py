@@ -8,7 +8,7 @@ is a new version.
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from harness.errors import UserError, printable, unknown
 from harness.files import canonical_json, sha256_bytes, write_whole
-from harness.resources import folder
+from harness.resources import entries, find
 
 Graph = Mapping[str, Any]
 ROLES = ("ego", "helper")
@@ -129,20 +129,20 @@ def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
 
 
 def names(where: Path | None = None) -> list[str]:
-    """Versions there are, in a folder of versions other than the harness's own if one is given."""
-    return sorted(p.name for p in (where or folder("prompts")).iterdir() if (p / "prompt.toml").is_file())
+    """Versions there are: those that ship and the project's, or those in one folder if it is given."""
+    files = where.glob("*/prompt.toml") if where else entries("prompts", "*/prompt.toml")
+    return sorted({file.parent.name for file in files})
 
 
-@lru_cache(maxsize=32)
 def load(version: str, where: Path | None = None) -> Prompt:
     """A version by name.
 
     Raises:
         UserError: there is no such version, its files are wrong, or it was released and has changed.
     """
-    base = where or folder("prompts")
-    if version not in names(base):
-        raise unknown("prompt", version, names(base))
+    if version not in names(where):
+        raise unknown("prompt", version, names(where))
+    base = _base(version, where)
     texts = {name: _text(base / version / name) for name in FILES}
     settings = _toml(texts["prompt.toml"], f"prompt {version} prompt.toml")
     sha256 = digest(texts)
@@ -163,14 +163,18 @@ def load(version: str, where: Path | None = None) -> Prompt:
 
 def lock(version: str, where: Path | None = None) -> str:
     """Release a version: pin its digest. Returns the digest."""
-    base = where or folder("prompts")
-    prompt = load(version, base)
+    prompt = load(version, where)
+    base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
     head = "# Digests of released prompt versions (`harness prompt lock`). A changed text is a new version.\n"
     lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
     write_whole(base / "released.toml", head + "".join(lines))
-    load.cache_clear()
     return prompt.sha256
+
+
+def _base(version: str, where: Path | None) -> Path:
+    """The folder of versions that has one."""
+    return where or find("prompts", version).parent
 
 
 def digest(texts: Mapping[str, str]) -> str:

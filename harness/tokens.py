@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.cards import Card
 from harness.errors import UserError, printable
-from harness.resources import folder
+from harness.resources import find
 
 # Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
 QWEN2_SPLIT = (
@@ -85,7 +85,7 @@ def counter(
     Takes the tokenizer given, else the one that lies with the model's weights; None where there is neither.
     """
     if source is None and card and card.weights:
-        beside = folder("models") / card.weights
+        beside = find("models", card.weights)
         source = beside if (beside / "tokenizer.json").is_file() else None
     if source is None:
         return None

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from harness import cards
+from harness import cards, resources
 from harness.errors import UserError
 from harness.failures import Failures
 from harness.servers import Server
@@ -50,7 +50,7 @@ def write_card(folder: Path, text: str) -> None:
 @pytest.fixture
 def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A shelf of cards of our own."""
-    monkeypatch.setattr(cards, "folder", lambda kind: tmp_path / kind)
+    monkeypatch.setattr(resources, "folder", lambda kind: tmp_path / kind)
     return tmp_path
 
 

@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 
-from harness import readout
+from harness import readout, resources
 from harness.arrays import Floats
 from harness.backends import llama_backend
 from harness.backends.base import Request
@@ -368,7 +368,7 @@ def test_without_the_package_it_says_how_to_get_it(tiny: Path, monkeypatch: pyte
 def test_a_file_is_found_by_its_path_beside_the_cards_or_in_a_folder(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(llama_backend, "folder", lambda kind: tiny.parent)
+    monkeypatch.setattr(resources, "folder", lambda kind: tiny.parent)
     for card in (
         card_of(tiny / "F32.gguf"),
         card_of(Path("tiny-qwen3/F32.gguf")),

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import Asked, Play, completion, read_out, serving
 
-from harness import cards, cli
+from harness import cli, resources
 from harness.backends import openai_backend, openai_http
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.openai_shapes import body, read
@@ -546,8 +546,8 @@ def test_after_a_run_the_key_is_nowhere(
     """A whole `harness eval` against a server that says the key back in every way."""
     monkeypatch.setenv("MY_KEY", KEY)
     monkeypatch.chdir(tmp_path)
-    shipped = cards.folder
-    monkeypatch.setattr(cards, "folder", lambda kind: tmp_path if kind == "models" else shipped(kind))
+    shipped = resources.folder
+    monkeypatch.setattr(resources, "folder", lambda kind: tmp_path if kind == "models" else shipped(kind))
     with serving(echo) as there:
         (tmp_path / "served.toml").write_text(
             'engine = "openai"\ndescription = "d"\nweights = "m"\n'

@@ -221,7 +221,6 @@ def test_a_version_is_a_name_and_no_path(name: str) -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_released_version_whose_text_changed_is_refused(version: str, file: str, copied: Path) -> None:
     assert prompts.load(version, copied) == prompts.load(version)
-    prompts.load.cache_clear()
     with (copied / version / file).open("a", encoding="utf-8") as f:
         f.write("\n")
     with pytest.raises(UserError) as caught:
@@ -239,14 +238,12 @@ def test_a_draft_may_change_until_it_is_locked(version: str, copied: Path) -> No
     changed = copied / version / "ego.j2"
     assert not prompts.load(version, copied).released
     changed.write_text(changed.read_text(encoding="utf-8") + "\n", encoding="utf-8")
-    prompts.load.cache_clear()
 
     digest = prompts.lock(version, copied)
     locked = prompts.load(version, copied)
     assert (locked.released, locked.sha256) == (True, digest)
     assert prompts.load("v1", copied).released
     changed.write_text(changed.read_text(encoding="utf-8") + "\n", encoding="utf-8")
-    prompts.load.cache_clear()
     with pytest.raises(UserError, match="was released and its text has changed"):
         prompts.load(version, copied)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from harness.cards import Card
 from harness.errors import UserError, printable
 from harness.files import digest, sha256_file
-from harness.resources import folder
+from harness.resources import find as beside
 
 # Without these AutoTokenizer builds an empty tokenizer and says nothing.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
@@ -42,7 +42,7 @@ def find(card: Card) -> Path:
         UserError: it is nowhere, or its config, weights or tokenizer are not there.
     """
     weights = card.weights or ""
-    local = folder("models") / weights
+    local = beside("models", weights)
     where = local if local.is_dir() else _cached(card, weights)
     wanted = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
     for what, patterns in wanted.items():

@@ -10,7 +10,7 @@ from harness.backends.checkpoint import held_to_digest
 from harness.backends.child import Child
 from harness.cards import Card
 from harness.errors import UserError, printable
-from harness.resources import folder
+from harness.resources import find as beside
 
 
 def open(
@@ -45,7 +45,7 @@ def find(card: Card) -> Path:
         UserError: it is nowhere.
     """
     weights = card.weights or ""
-    local = folder("models") / weights
+    local = beside("models", weights)
     where = local / card.file if card.file else local
     if where.is_file():
         return where

@@ -6,7 +6,7 @@ from pathlib import Path
 from harness.backends import checkpoint, llama_backend
 from harness.cards import WEIGHTED, Card
 from harness.errors import UserError, printable
-from harness.resources import folder
+from harness.resources import find
 
 
 def pull(card: Card) -> Path:
@@ -21,7 +21,7 @@ def pull(card: Card) -> Path:
     """
     if card.engine not in WEIGHTED:
         raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
-    here = folder("models") / (card.weights or "")
+    here = find("models", card.weights or "")
     if here.exists():
         raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")
     _download(card)

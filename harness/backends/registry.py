@@ -1,9 +1,10 @@
 """Which backend answers for which engine. A backend's module loads when a card of its engine is opened."""
 
 from importlib import import_module
+from types import ModuleType
 
 from harness.backends.base import Backend
-from harness.cards import Card, Engine
+from harness.cards import WEIGHTED, Card, Engine
 from harness.errors import UserError
 
 _OPEN: dict[Engine, str] = {
@@ -34,18 +35,29 @@ def open_backend(
     return backend
 
 
+def missing_package(engine: Engine) -> str | None:
+    """Name of the package that an engine lacks to run here; None if none."""
+    if engine not in WEIGHTED:
+        return None
+    lacking: str | None = _weighted(engine).missing_package()
+    return lacking
+
+
 def missing(card: Card) -> str | None:
     """What a card lacks to run here, in a word: a package's name or `weights`. None if nothing."""
-    if card.engine == "transformers":
-        from harness.backends.checkpoint import find, missing_package
-    elif card.engine == "llama-cpp":
-        from harness.backends.llama_backend import find, missing_package
-    else:
+    if card.engine not in WEIGHTED:
         return None
-    if package := missing_package():
+    if package := missing_package(card.engine):
         return package
     try:
-        find(card)
+        _weighted(card.engine).find(card)
     except UserError:
         return "weights"
     return None
+
+
+def _weighted(engine: Engine) -> ModuleType:
+    """The module that knows what an engine with weights needs, and where they lie; it loads no engine."""
+    from harness.backends import checkpoint, llama_backend
+
+    return checkpoint if engine == "transformers" else llama_backend

@@ -52,6 +52,15 @@ def device_of(asked: str | None) -> str:
     return asked
 
 
+def gpus() -> list[str]:
+    """Names of the GPUs that torch sees; none where it is not installed."""
+    if checkpoint.missing_package() == "torch":
+        return []
+    import torch
+
+    return [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+
+
 class TransformersEngine:
     """A loaded model with its tokenizer.
 

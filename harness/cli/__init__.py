@@ -13,9 +13,12 @@ from harness.cli import (
     compare,
     dataset,
     distill,
+    doctor,
     drive,
     evaluate,
     fidelity,
+    init,
+    ls,
     model,
     parity,
     parse,
@@ -31,12 +34,13 @@ app = typer.Typer(
     name="harness",
     help="Evaluate prompts and parsing in cooperative driving.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 app.command("eval")(evaluate.evaluate)
 app.command("drive")(drive.drive)
+app.command("init")(init.init)
+app.command("ls")(ls.ls)
 app.command("video")(video.command)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(dataset.app, name="dataset")
@@ -48,6 +52,7 @@ app.command("distill")(distill.distill)
 app.command("sweep")(sweep.sweep)
 app.command("fidelity")(fidelity.fidelity)
 app.command("compare")(compare.compare)
+app.command("doctor")(doctor.doctor)
 app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
 

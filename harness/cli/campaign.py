@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, cast
 
 import typer
 
+from harness.cli.progress import QUIET
+
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
     from harness.run.spec import Latency
@@ -22,6 +24,7 @@ def paper(
     episodes: int = typer.Option(1500, help="Episodes a seed, to compare operating points."),
     sweep_episodes: int = typer.Option(300, help="Episodes a seed at each grid point of a sweep."),
     as_json: bool = typer.Option(False, "--json", help="Print the ledger as JSON."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Every number of the paper beside the calibrated proxy's, and its Figures A and B."""
     from harness.cli.estimates import in_range
@@ -34,10 +37,13 @@ def paper(
     in_range("--episodes", episodes, 10, 1_000_000)
     in_range("--sweep-episodes", sweep_episodes, 10, 1_000_000)
     settings = panels(episodes, sweep_episodes)
-    with bar("grid points", sum(len(panel.settings) for panel in settings), quiet=as_json) as progress:
+    with bar(
+        "grid points", sum(len(panel.settings) for panel in settings), quiet=as_json or quiet
+    ) as progress:
         ledger = run_paper(settings, out, progress)
     if as_json:
         typer.echo(ledger.to_json(orient="records"))
+    if as_json or quiet:
         return
     typer.echo(f"{'row':<4}{'what':<31}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
     for row in map(shown, ledger[ledger.kind != "cited"].itertuples()):
@@ -68,6 +74,7 @@ def closed_loop(
     latency: str | None = typer.Option(None, help="Inference times: card, measured or paper."),
     out: Path | None = typer.Option(None, help="Folder; one that was begun is gone on with."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """The paper's panels driven live in highway-env, and its Figures A and B from that."""
     from harness import cards, prompts
@@ -93,10 +100,11 @@ def closed_loop(
     )  # fmt: skip
     named = "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{spec.card.name}-{prompt}")
     where = out or Path("reports") / f"closed-loop-{named}"
-    with bar("layouts", episodes, quiet=as_json) as progress:
+    with bar("layouts", episodes, quiet=as_json or quiet) as progress:
         summary = run_closed_loop(spec, where, workers, progress, default_file())
     if as_json:
         typer.echo(summary.to_json(orient="records"))
+    if as_json or quiet:
         return
     tables(summary)
     typer.echo(f"wrote {printable(where / 'figure-a.svg')} and {printable(where / 'figure-b.svg')}")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
+from harness.cli.progress import QUIET
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def drive(
     ),
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
     from harness import cards, prompts
@@ -79,7 +81,7 @@ def drive(
         first_seed=first_seed,
         episodes=episodes,
     )
-    _run(spec, out or _default_out(spec, resume), resume, workers, save_video, no_cache, as_json)
+    _run(spec, out or _default_out(spec, resume), resume, workers, save_video, no_cache, as_json, quiet)
 
 
 def _shipped() -> dict[str, Any]:
@@ -99,23 +101,31 @@ def _default_out(spec: "Drive", resume: bool) -> Path:
 
 
 def _run(
-    spec: "Drive", out: Path, resume: bool, workers: int, save_video: int, no_cache: bool, as_json: bool
+    spec: "Drive",
+    out: Path,
+    resume: bool,
+    workers: int,
+    save_video: int,
+    no_cache: bool,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     from harness.backends.cache import default_file
     from harness.cli.evaluate import as_mapping
     from harness.cli.progress import bar
     from harness.drive.run import run
 
-    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json) as progress:
+    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json or quiet) as progress:
         done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
     # They draw with matplotlib, which no episode waits for.
     from harness.cli.report import write
     from harness.cli.video import write_failures
 
-    page = write(out, None, quiet=as_json)
-    videos = write_failures(out, save_video, quiet=as_json) if save_video else []
+    page = write(out, None, quiet=as_json or quiet)
+    videos = write_failures(out, save_video, quiet=as_json or quiet) if save_video else []
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
+    if as_json or quiet:
         return
     _table(done)
     if videos:

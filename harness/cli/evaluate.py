@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import typer
 
 from harness import resources
+from harness.cli.progress import QUIET
 from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def evaluate(
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
     tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes, and write a report."""
     from harness import cards, prompts
@@ -73,25 +75,26 @@ def evaluate(
         latency=cast("Latency | None", latency),
     )
     if dry_run:
-        _dry_run(spec, tokenizer, as_json)
+        _dry_run(spec, tokenizer, as_json, quiet)
         return
-    _run(spec, out or default_out(spec, resume), resume, no_cache, as_json)
+    _run(spec, out or default_out(spec, resume), resume, no_cache, as_json, quiet)
 
 
-def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool) -> None:
+def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, quiet: bool) -> None:
     from harness.backends.cache import default_file
     from harness.cli.progress import bar
     from harness.run.asking import request_count
     from harness.run.evaluate import evaluate as evaluate_run
 
-    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), quiet=as_json) as progress:
+    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), as_json or quiet) as progress:
         cache = None if no_cache else default_file()
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
-    page = write(out, None, quiet=as_json)
+    page = write(out, None, as_json or quiet)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
+    if as_json or quiet:
         return
     _table(done)
     typer.echo(f"wrote {page}")
@@ -199,7 +202,7 @@ def _table(done: "Evaluated") -> None:
             console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
 
 
-def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:
+def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:
     from harness.run.asking import requests
     from harness.tokens import counter, spread_of
 
@@ -215,6 +218,7 @@ def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool) -> None:
         typer.echo(
             json.dumps({**spec.settings(), "requests": asked, "prompt_tokens": stats or None}, indent=1)
         )
+    if as_json or quiet:
         return
     scenes = len(spec.dataset.scenes)
     typer.echo(f"{asked} requests for {scenes} scenes; would score {len(spec.points)} conditions × "

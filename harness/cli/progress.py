@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+QUIET = "Print nothing but errors, and what --json asks for."
+
 
 @dataclass(frozen=True)
 class Bar:

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from harness.cli.progress import QUIET
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -38,6 +40,7 @@ def sweep(
     proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
     out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON."),
+    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Play stored answers at other operating points. No model is asked, but for ego-prompt."""
     from harness.cli.evaluate import parse_seeds
@@ -66,14 +69,15 @@ def sweep(
     luck = parse_seeds(seeds) if seeds else runs_read[0].seeds
     where = out or runs[0] / f"sweep-{'-'.join(panels)}"
     points = [setting for panel in panels.values() for setting in panel]
-    with bar("asking with messages", 0, quiet=as_json) as asked:
+    with bar("asking with messages", 0, quiet=as_json or quiet) as asked:
         for run in runs_read:
             run.prepare(points, luck, Asking(asked.more, asked))
     sources: list[Source] = [*runs_read, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
-    with bar("grid points", len(sources) * len(points), quiet=as_json) as progress:
+    with bar("grid points", len(sources) * len(points), quiet=as_json or quiet) as progress:
         summary = run_sweep(sources, panels, luck, where, progress)
     if as_json:
         typer.echo(summary.to_json(orient="records"))
+    if as_json or quiet:
         return
     tables(summary)
     typer.echo(f"wrote {printable(where / 'sweep.svg')}")

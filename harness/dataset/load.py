@@ -14,7 +14,8 @@ from harness.dataset.verify import file_problems, read_manifest, records, releas
 from harness.errors import UserError, printable, unknown
 from harness.files import canonical_json
 from harness.memory import uncollected
-from harness.resources import folder
+from harness.resources import entries, folder
+from harness.resources import find as beside
 from harness.scene import WorldState
 
 
@@ -96,12 +97,12 @@ class Dataset:
 
 
 def find(name: str) -> Path:
-    """Folder of a dataset given by path or by the name of a shipped one."""
+    """Folder of a dataset given by path, or by the name of a shipped one or of the project's."""
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         return Path(name)
-    known = [manifest.parent.name for manifest in folder("datasets").glob("*/manifest.json")]
+    known = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
     if name in known:
-        return folder("datasets") / name
+        return beside("datasets", name)
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
 
 

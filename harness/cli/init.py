@@ -1,0 +1,33 @@
+"""`harness init`: a project of one's own."""
+
+from pathlib import Path
+
+import typer
+
+from harness.errors import UserError, printable
+
+PROMPT = "v2"  # what one's own prompt begins as
+
+
+def init(folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do.")) -> None:
+    """Make a project: a prompt and a model card to change, found by name by commands typed in its folder."""
+    from shutil import copyfile, copytree
+    from tempfile import TemporaryDirectory
+
+    from harness import resources
+
+    starter = Path(__file__).parent.parent / "starter"
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder) as made:  # so that a full disk leaves nothing half-written
+            # Contents alone: what is installed may be read-only, and a project is there to be changed.
+            copytree(starter, made, copy_function=copyfile, dirs_exist_ok=True)
+            copytree(resources.folder("prompts") / PROMPT, Path(made, "prompts/mine"), copy_function=copyfile)
+            for whole in Path(made).iterdir():
+                whole.rename(folder / whole.name)
+    except OSError as error:
+        reason = printable(error.strerror)
+        raise UserError(f"{printable(folder)} cannot be made ({reason}); give another folder") from None
+    typer.echo(f"made {printable(folder)}; next: cd there, `harness eval --prompt mine`; README.md says more")

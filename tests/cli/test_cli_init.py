@@ -1,0 +1,109 @@
+"""`harness init`: a project whose own prompts, cards and datasets are found beside those that ship."""
+
+import json
+import os
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from harness import cards, prompts, resources
+
+Said = tuple[int, str, str]
+Harness = Callable[..., Said]
+
+
+@pytest.fixture
+def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    code, out, err = harness("init", "project")
+    assert (code, err) == (0, "")
+    assert out == "made project; next: cd there, `harness eval --prompt mine`; README.md says more\n"
+    monkeypatch.chdir(tmp_path / "project")
+    return tmp_path / "project"
+
+
+@pytest.mark.slow
+def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Path) -> None:
+    lines = [line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")]
+    assert len(lines) == 3
+    for line in lines:
+        _, program, *args = shlex.split(line)
+        if "--episodes" in args:
+            args[args.index("--episodes") + 1] = "1"
+        code, _, err = harness(*args, *(["--limit", "1"] if "eval" in args else []))
+        assert (program, code, err) == ("harness", 0, "")
+    report = project / "reports/proxy-mine-occluded-intersection-v1"
+    assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
+    code, out, err = harness("eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["manifest"]["dataset"]["path"] == str(project / "datasets/mine")
+
+
+def test_its_own_are_found_beside_those_that_ship_and_only_there(
+    harness: Harness, project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert prompts.names() == ["mine", "v1", "v2"]
+    assert prompts.load("mine").texts == prompts.load("v2").texts
+    assert not prompts.load("mine").released
+    assert {"my-model", "proxy"} <= set(cards.names())
+    told = {m["name"]: m for m in json.loads(harness("model", "list", "--json")[1])}
+    assert told["my-model"]["missing"] == "weights"
+    assert told["swarm-tiny"]["missing"] is None
+    monkeypatch.chdir(project.parent)
+    assert prompts.names() == ["v1", "v2"]
+    assert "my-model" not in cards.names()
+
+
+def test_weights_lie_beside_its_card(harness: Harness, project: Path) -> None:
+    (project / "models/my-model").symlink_to(resources.folder("models") / "swarm-tiny")
+    told = {m["name"]: m for m in json.loads(harness("model", "list", "--json")[1])}
+    assert told["my-model"]["missing"] is None
+
+
+def test_a_name_that_ships_is_refused(harness: Harness, project: Path) -> None:
+    (project / "prompts/mine").rename(project / "prompts/v2")
+    assert harness("eval", "--prompt", "v2") == (
+        2, "", "harness: prompts/v2 is in this project and ships with the harness; give yours another name\n",
+    )  # fmt: skip
+    (project / "models/my-model.toml").rename(project / "models/proxy.toml")
+    assert harness("eval", "--prompt", "v1")[2].startswith(
+        "harness: models/proxy.toml is in this project and"
+    )
+
+
+def test_a_prompt_is_released_in_its_project(harness: Harness, project: Path) -> None:
+    shipped = (resources.folder("prompts") / "released.toml").read_bytes()
+    assert harness("prompt", "lock", "mine")[0] == 0
+    assert prompts.load("mine").released
+    assert (project / "prompts/released.toml").is_file()
+    assert (resources.folder("prompts") / "released.toml").read_bytes() == shipped
+    ego = project / "prompts/mine/ego.j2"
+    ego.write_text(ego.read_text() + "\n")
+    assert "prompt mine was released and its text has changed" in harness("eval", "--prompt", "mine")[2]
+
+
+def test_a_card_with_a_mistake_is_what_a_doctor_tells(harness: Harness, project: Path) -> None:
+    (project / "models/my-model.toml").write_text("engine = 3")
+    code, out, err = harness("doctor", "--json")
+    [told] = [m for m in json.loads(out)["models"] if m["name"] == "my-model"]
+    assert (code, err, told["missing"]) == (0, "", "a sound card")
+    assert "engine = '3'; allowed: a str" in told["remedy"]
+
+
+def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/x\x1b").touch()
+    (tmp_path / "file").touch()
+    for name in ("full", "file"):
+        said = harness("init", name)
+        assert said == (2, "", f"harness: {name} is not empty; give a new folder, or an empty one\n")
+    assert os.listdir(tmp_path / "full") == ["x\x1b"]
+    code, out, err = harness("init", "file/below")
+    assert (code, out) == (2, "")
+    assert err.startswith("harness: file/below cannot be made (")
+
+
+def test_an_empty_folder_will_do(harness: Harness, tmp_path: Path) -> None:
+    assert harness("init", ".")[0] == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"README.md", "models", "prompts", "swarmdrive.toml"}

@@ -1,0 +1,162 @@
+"""`harness ls`: what a folder of runs holds."""
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from harness import cli
+from harness.listing import runs
+
+Said = tuple[int, str, str]
+
+
+def type_in(*args: str | Path) -> None:
+    kept, sys.argv = sys.argv, ["harness", *map(str, args)]
+    try:
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    finally:
+        sys.argv = kept
+    assert not ended.value.code
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, small_path: Path) -> Path:
+    """A frozen run with a sweep in it, and a live one."""
+    folder = tmp_path_factory.mktemp("made")
+    type_in("eval", "--dataset", small_path, "--seeds", "0:2", "--out", folder / "frozen")
+    type_in("sweep", folder / "frozen", "--over", "tau", "--grid", "0.2,0.9")
+    type_in("drive", "--episodes", "1", "--seeds", "0", "--workers", "1", "--condition", "6g",
+            "--out", folder / "live")  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "reports")
+    return tmp_path / "reports"
+
+
+def changed(file: Path, **members: object) -> None:
+    file.write_text(json.dumps({**json.loads(file.read_text()), **members}))
+
+
+def test_it_lists_frozen_live_and_sweep_newest_first(folder: Path) -> None:
+    changed(folder / "frozen/run.json", created="2026-01-02T03:04:05+00:00")
+    changed(folder / "live/run.json", created="2026-01-02T03:04:05+02:00")
+    found = runs(folder)
+    assert [(one.name, one.kind, one.state) for one in found] == [
+        ("frozen/sweep-tau", "sweep", "finished"), ("frozen", "eval", "finished"),
+        ("live", "drive", "finished"),
+    ]  # fmt: skip
+    assert [(one.model, one.prompt, one.answer) for one in found] == [
+        ("proxy · v2 · json", None, None), ("proxy", "v2", "json"), ("proxy", "v2", "json"),
+    ]  # fmt: skip
+
+
+def test_success_is_that_of_the_best_condition_over_episodes(folder: Path) -> None:
+    [frozen] = [one for one in runs(folder) if one.name == "frozen"]
+    lines = (folder / "frozen/summary.csv").read_text().splitlines()
+    rates = [line.split(",") for line in lines if ",success_rate," in line and line.endswith(",episodes")]
+    best = max(rates, key=lambda row: float(row[5]))
+    assert len(rates) == 3
+    assert (frozen.condition, frozen.success, frozen.low, frozen.high) == (best[3], *map(float, best[5:8]))
+
+
+def test_people_read_it_in_eighty_columns(harness: Callable[..., Said], folder: Path) -> None:
+    (folder / "frozen").rename(folder / ("long-" * 40))
+    changed(folder / "live/run.json", model={"name": "\x1b[31mred" * 30})
+    code, out, err = harness("ls")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert "\x1b" not in out
+    assert f"\nlive{'':<60}" in f"\n{out}"
+    assert "  eval  proxy · v2 · json" in out
+
+
+def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) -> None:
+    code, out, _ = harness("ls", folder, "--json")
+    told = {one["name"]: one for one in json.loads(out, parse_constant=pytest.fail)}
+    assert code == 0
+    assert list(told["live"]) == [
+        "name", "kind", "state", "date", "why", "model", "prompt", "answer", "condition", "success", "low",
+        "high",
+    ]  # fmt: skip
+    assert told["live"]["date"] == json.loads((folder / "live/run.json").read_text())["created"]
+
+
+def test_an_unfinished_run_says_resume(harness: Callable[..., Said], folder: Path) -> None:
+    manifest = json.loads((folder / "live/run.json").read_text())
+    shutil.rmtree(folder / "live")
+    (folder / "live/.work").mkdir(parents=True)
+    begun = {"created": manifest["created"], "settings": manifest, "identity": ""}
+    (folder / "live/.work/config.json").write_text(json.dumps(begun))
+    [one] = [one for one in runs(folder) if one.name == "live"]
+    assert (one.kind, one.state, one.why, one.model) == ("drive", "unfinished", "--resume", "proxy")
+    assert "unfinished: --resume\n" in harness("ls", folder)[1]
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("run.json", None),
+        ("run.json", ""),
+        ("run.json", "[]"),
+        ("run.json", "[" * 100_000),
+        ("run.json", '{"format": "swarmdrive-run/9"}'),
+        ("run.json", '{"format": "swarmdrive-run/1", "created": "0001-01-01T00:00:00+14:00"}'),
+        ("run.json", "\udcff"),
+        ("summary.csv", None),
+        ("summary.csv", ""),
+        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,x,,,episodes\n"),
+        ("summary.csv", "\udcff"),
+    ],
+)
+def test_a_broken_run_names_the_file_at_fault(folder: Path, file: str, text: str | None) -> None:
+    if text is None:
+        (folder / "frozen" / file).unlink()
+    else:
+        (folder / "frozen" / file).write_bytes(text.encode("utf-8", "surrogateescape"))
+    [one] = [one for one in runs(folder) if one.name == "frozen"]
+    assert (one.state, one.why, one.success) == ("broken", file, None)
+
+
+def test_a_broken_sweep_is_listed_as_such(folder: Path) -> None:
+    (folder / "frozen/sweep-tau/sweep.json").write_text("{")
+    [one] = [one for one in runs(folder) if one.kind == "sweep"]
+    assert (one.state, one.why) == ("broken", "sweep.json")
+
+
+def test_no_link_leads_out_and_none_goes_round(folder: Path, tmp_path: Path) -> None:
+    (folder / "live").rename(tmp_path / "elsewhere")
+    (folder / "live").symlink_to(tmp_path / "elsewhere")
+    (folder / "round").symlink_to(folder)
+    (folder / "self").symlink_to(folder / "self")
+    (folder / "latest").symlink_to(folder / "frozen")
+    (folder / "lent").mkdir()
+    (folder / "lent/run.json").symlink_to(tmp_path / "elsewhere/run.json")
+    names = {one.name for one in runs(folder)}
+    assert {"frozen", "latest"} <= names
+    assert not {name for name in names if "live" in name or "lent" in name}
+
+
+def test_what_is_no_run_is_not_listed(folder: Path) -> None:
+    (folder / "notes").mkdir()
+    (folder / "notes/run.json").mkdir()
+    os.mkfifo(folder / "notes/summary.csv")
+    (folder / "README.md").write_text("notes")
+    assert len(runs(folder)) == 3
+
+
+def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., Said], tmp_path: Path) -> None:
+    code, out, err = harness("ls")
+    assert (code, out) == (2, "")
+    assert err.startswith("harness: reports is no folder; give one that holds runs")
+    (tmp_path / "reports").mkdir()
+    assert harness("ls") == (0, "no runs in reports; `harness eval` makes one\n", "")
+    assert harness("ls", "--json")[1] == "[]\n"

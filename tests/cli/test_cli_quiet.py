@@ -1,0 +1,62 @@
+"""`--quiet`, and what a shell is told to complete a line."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Said = tuple[int, str, str]
+DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
+
+
+def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], small_path: Path) -> None:
+    once = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out")
+    sweep = ("sweep", "run", "--over", "tau", "--grid", "0.2,0.9", "--out")
+    for args in (once, ("drive", *DRIVE, "--condition", "6g", "--out"), sweep):
+        code, out, err = harness(*args, "loud" if args is not once else "run")
+        assert (code, err) == (0, "")
+        assert "wrote" in out
+        assert harness(*args, f"quiet-{args[0]}", "--quiet") == (0, "", "")
+        assert {p.name for p in Path(f"quiet-{args[0]}").iterdir()} >= {
+            "eval": {"run.json", "report.html"}, "drive": {"run.json"}, "sweep": {"sweep.json", "sweep.svg"},
+        }[args[0]]  # fmt: skip
+        if args is not once:
+            Path("loud").rename(f"loud-{args[0]}")
+    assert harness("eval", "--dataset", small_path, "--dry-run", "--quiet") == (0, "", "")
+
+
+@pytest.mark.slow
+def test_campaigns_are_quiet(harness: Callable[..., Said]) -> None:
+    paper = ("campaign", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "paper", "--quiet")
+    assert harness(*paper) == (0, "", "")
+    assert Path("paper/index.html").is_file()
+    assert harness("campaign", "closed-loop", *DRIVE, "--out", "closed", "--quiet") == (0, "", "")
+    assert Path("closed/closed-loop.json").is_file()
+
+
+def test_quiet_says_errors_and_what_json_asks_for(harness: Callable[..., Said], small_path: Path) -> None:
+    code, out, err = harness("eval", "--model", "proxi", "--quiet")
+    assert (code, out) == (2, "")
+    assert err.startswith("harness: unknown model 'proxi'")
+    args = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--quiet", "--json")
+    assert json.loads(harness(*args)[1])["run"] == "reports/proxy-v2-small"
+
+
+def completed(line: str) -> list[str]:
+    """What bash is offered at the end of a line."""
+    asked = {"_HARNESS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    code = "import sys, harness.cli; sys.argv = ['harness']; harness.cli.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True, check=True
+    )
+    return done.stdout.split()
+
+
+def test_a_shell_completes_commands_and_options() -> None:
+    assert sorted(completed("harness d")) == ["dataset", "distill", "doctor", "drive"]
+    assert completed("harness eval --qu") == ["--quiet"]
+    assert completed("harness campaign cl") == ["closed-loop"]
