@@ -63,7 +63,7 @@ def paper(
 
 @app.command("closed-loop")
 def closed_loop(
-    model: str = typer.Option("proxy", help="Card, checkpoint directory, .gguf file or hub id."),
+    model: str = typer.Option("swarm-tiny", help="Card, checkpoint directory, .gguf file or hub id."),
     prompt: str = typer.Option("v2", help="Prompt version."),
     answer: str = typer.Option("json", help="json, constrained or readout."),
     episodes: int = typer.Option(300, help="Layouts, each driven under every grid point and seed."),

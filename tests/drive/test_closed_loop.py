@@ -10,7 +10,20 @@ import pytest
 from harness.study.closed_loop import panels
 
 Said = tuple[int, str, str]
-OPTIONS = ("campaign", "closed-loop", "--episodes", "3", "--seeds", "0:2", "--workers", "1", "--out", "study")
+OPTIONS = (
+    "campaign",
+    "closed-loop",
+    "--model",
+    "proxy",
+    "--episodes",
+    "3",
+    "--seeds",
+    "0:2",
+    "--workers",
+    "1",
+    "--out",
+    "study",
+)
 
 
 def test_every_grid_point_is_a_condition_that_its_name_tells() -> None:
