@@ -41,6 +41,11 @@ class Coordination(Exchange):
     latency_s: Floats
     deadline_missed: Bools
 
+    @property
+    def fusion_s(self) -> Floats:
+        """Part of the latency that fusion takes, `(...)`."""
+        return self.latency_s - self.exchange_s
+
 
 def coordinate(
     point: OperatingPoint,

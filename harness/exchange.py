@@ -91,6 +91,11 @@ class Exchange:
         """Of the messages, how many arrived after the window, `(...)`."""
         return np.asarray(np.sum(self.delivered & ~self.on_time, axis=-1))
 
+    @cached_property
+    def observed_loss(self) -> Floats:
+        """Share of the messages that did not arrive, `(...)`; NaN where there are none."""
+        return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
+
 
 def exchange(
     point: OperatingPoint,

@@ -80,7 +80,7 @@ def closed_loop(
     from harness import cards, prompts
     from harness.backends.cache import default_file
     from harness.cli.estimates import in_range
-    from harness.cli.evaluate import parse_seeds
+    from harness.cli.evaluate import file_name, parse_seeds
     from harness.cli.progress import bar
     from harness.cli.scenario import MOST_WORKERS
     from harness.cli.sweep import tables
@@ -98,8 +98,7 @@ def closed_loop(
         answer=cast("AnswerMode", answer), batch_size=batch_size, latency=cast("Latency | None", latency),
         first_seed=first_seed, episodes=episodes,
     )  # fmt: skip
-    named = "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{spec.card.name}-{prompt}")
-    where = out or Path("reports") / f"closed-loop-{named}"
+    where = out or Path("reports") / f"closed-loop-{file_name(spec.card.name)}-{prompt}"
     with bar("layouts", episodes, quiet=as_json or quiet) as progress:
         summary = run_closed_loop(spec, where, workers, progress, default_file())
     if as_json:

@@ -139,7 +139,7 @@ def _table(done: "Evaluated") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from harness.cli.estimates import interval
+    from harness.cli.estimates import interval, tell_answers
 
     console = Console(width=80, markup=False, highlight=False)
     rows = done.summary[done.summary.interval != "seed means"]
@@ -177,13 +177,4 @@ def _table(done: "Evaluated") -> None:
         f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
         "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means"
     )
-    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
-    if m.get("cached_answers"):
-        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
-    if m.get("engine_errors"):
-        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
-    for role in ("ego", "helper", "merge"):
-        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
-        if shares[0] is not None:
-            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
-            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
+    tell_answers(console, m, figures)

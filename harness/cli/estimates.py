@@ -1,11 +1,14 @@
-"""Estimates as people and as machines read them, and numbers held to their range."""
+"""Estimates and runs as people and as machines read them, and numbers held to their range."""
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from harness.errors import UserError
+from harness.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from harness.metrics import Estimate
 
 
@@ -29,3 +32,26 @@ def in_range(option: str, value: int, least: int, most: int) -> None:
     """Raises UserError unless `least` <= `value` <= `most`."""
     if not least <= value <= most:
         raise UserError(f"{option} {value} is out of range; give {least} to {most}")
+
+
+def tell_answers(console: "Console", manifest: Mapping[str, Any], figures: Mapping[Any, Any]) -> None:
+    """Say below the table of a run, frozen or live, where times come from and how answers were read.
+
+    `figures` has the rows of its summary by condition and metric.
+    """
+    m = manifest
+    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
+    if (m["latency"].get("load_a_core") or 0) > 1:
+        console.print(
+            f"timed on a busy machine ({m['latency']['load_a_core']} processes a core): "
+            "let it run alone, or use --latency card or paper"
+        )
+    if m.get("cached_answers"):
+        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
+    if m.get("engine_errors"):
+        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
+    for role in ("ego", "helper", "merge"):
+        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
+        if shares[0] is not None:
+            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
+            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")

@@ -117,9 +117,14 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return seeds
 
 
+def file_name(model: str) -> str:
+    """A model's name as part of a folder's."""
+    return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
+
+
 def default_out(spec: "Spec", resume: bool) -> Path:
     """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
-    safe = "".join(c if c.isalnum() or c in "._-" else "-" for c in spec.card.name).strip(".-") or "model"
+    safe = file_name(spec.card.name)
     mode = "" if spec.answer == "json" else f"-{spec.answer}"
     base = Path("reports") / f"{safe}-{spec.prompt.version}{mode}-{spec.dataset.name}"
     found, number = base, 1
@@ -148,7 +153,7 @@ def _table(done: "Evaluated") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from harness.cli.estimates import interval
+    from harness.cli.estimates import interval, tell_answers
 
     console = Console(width=80, markup=False, highlight=False)
     rows = done.summary[done.summary.interval != "seed means"]
@@ -185,21 +190,7 @@ def _table(done: "Evaluated") -> None:
         f"n = {n} episodes × {len(m['seeds'])} channel seeds; intervals over episodes; msgs an episode;"
     )
     console.print("gain is over single-local, paired by episode")
-    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
-    if (m["latency"].get("load_a_core") or 0) > 1:
-        console.print(
-            f"timed on a busy machine ({m['latency']['load_a_core']} processes a core): "
-            "let it run alone, or use --latency card or paper"
-        )
-    if m.get("cached_answers"):
-        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
-    if m.get("engine_errors"):
-        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
-    for role in ("ego", "helper", "merge"):
-        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
-        if shares[0] is not None:
-            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
-            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
+    tell_answers(console, m, figures)
 
 
 def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:

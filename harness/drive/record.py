@@ -14,7 +14,7 @@ from harness.operating_point import OperatingPoint
 from harness.outcome import Outcome
 from harness.run.intents import Intents
 from harness.run.merging import Merged
-from harness.run.record import answered, by_scene, number
+from harness.run.record import by_scene, by_viewer, number
 from harness.scenarios.occluded_intersection import Parameters
 
 if TYPE_CHECKING:
@@ -43,13 +43,7 @@ def moments(
             "episode": scene.record["episode"],
             "step": scene.record["step"],
             "danger": scene.record["danger"]["sector"],
-            "answers": {
-                viewer: answered(answer, parsed, "ego" if j == 0 else "helper")
-                for j, (viewer, answer, parsed) in enumerate(
-                    zip(scene.viewers, known.answers[i], known.parsed[i], strict=False)
-                )
-                if answer and parsed
-            },
+            "answers": by_viewer(scene, known, i),
             **({"merged": again[i]} if i in again else {}),
             "decisions": made[i],
         }
@@ -65,15 +59,13 @@ def decisions(
     actions: Sequence[str],
 ) -> Iterator[Row]:
     """One condition's decisions (n,), each of an episode with its seed; `acted` is not known yet."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        observed = np.where(c.messages > 0, c.lost / c.messages, np.nan)
     table = {
         "action": c.action, "deadline_missed": c.deadline_missed, "entropy_nats": c.entropy_nats.round(6),
         "fused": c.fused.round(6), "latency_ms": (c.latency_s * 1000).round(3),
         "normalised_entropy": c.normalised_entropy.round(6), "own_failed": c.own_failed,
         "triggered": c.triggered, "effective_loss": np.where(c.triggered, c.loss, np.nan),
-        "observed_loss": observed, "own_weight": c.weights[:, 0].round(6),
-        "fusion_ms": ((c.latency_s - c.exchange_s) * 1000).round(3),
+        "observed_loss": c.observed_loss, "own_weight": c.weights[:, 0].round(6),
+        "fusion_ms": (c.fusion_s * 1000).round(3),
         "merge_failed": np.where(c.on_time.any(axis=1) & point.asks_again, c.merge_failed, np.nan),
     }  # fmt: skip
     columns: dict[str, list[Any]] = {name: values.tolist() for name, values in table.items()}

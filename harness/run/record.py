@@ -38,17 +38,21 @@ def rows(
             "episode": scene.record["episode"],
             "step": scene.record["step"],
             "danger": scene.record["danger"]["sector"],
-            "answers": {
-                viewer: answered(answer, parsed, "ego" if j == 0 else "helper")
-                for j, (viewer, answer, parsed)
-                in enumerate(zip(scene.viewers, known.answers[i], known.parsed[i], strict=False))
-                if answer and parsed
-            },
+            "answers": by_viewer(scene, known, i),
             **({"merged": again[i]} if i in again else {}),
             "safe": laid.safe[i].tolist(),
             "delay_s": [number(d) for d in laid.delay_s[i].tolist()],
             "decisions": made,
         }) + "\n"  # fmt: skip
+
+
+def by_viewer(scene: Scene, known: Intents, i: int) -> dict[str, dict[str, Any]]:
+    """The answers of a scene, the i-th of `known`, by who gave them."""
+    said = zip(scene.viewers, known.answers[i], known.parsed[i], strict=False)
+    return {
+        viewer: answered(answer, parsed, "ego" if j == 0 else "helper")
+        for j, (viewer, answer, parsed) in enumerate(said) if answer and parsed
+    }  # fmt: skip
 
 
 def by_scene(scenes: Sequence[Scene], known: Intents, second: Merged) -> dict[int, dict[str, Any]]:

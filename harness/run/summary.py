@@ -48,11 +48,6 @@ YES_OR_NO = (
 PERCENTILES = (50, 95, 99)
 
 
-def _observed_loss(laid: Table, r: Scored) -> Any:
-    c = r.coordination
-    return np.where(c.messages > 0, c.lost / np.maximum(c.messages, 1), np.nan)
-
-
 PER_EPISODE: dict[str, Callable[[Table, Scored], Any]] = {  # values (E,)
     "success_rate": lambda laid, r: r.verdict.success,
     "unsafe_rate": lambda laid, r: r.verdict.unsafe,
@@ -66,13 +61,13 @@ PER_DECISION: dict[str, Callable[[Table, Scored], Any]] = {  # values (n,), of w
     ),
     "trigger_rate": lambda laid, r: r.coordination.triggered,
     "effective_loss": lambda laid, r: np.where(r.coordination.triggered, r.coordination.loss, np.nan),
-    "observed_reply_loss": _observed_loss,
+    "observed_reply_loss": lambda laid, r: r.coordination.observed_loss,
     "entropy_nats": lambda laid, r: r.coordination.entropy_nats,
     "normalised_entropy": lambda laid, r: r.coordination.normalised_entropy,
     "brier": lambda laid, r: brier(r.coordination.fused, safe_target(laid.safe)),
     "negative_log_likelihood": lambda laid, r: negative_log_likelihood(r.coordination.fused, laid.safe),
     "fallback_rate": lambda laid, r: r.coordination.own_failed,
-    "fusion_ms": lambda laid, r: (r.coordination.latency_s - r.coordination.exchange_s) * 1000,
+    "fusion_ms": lambda laid, r: r.coordination.fusion_s * 1000,
     "merge_failed_rate": lambda laid, r: np.where(
         r.coordination.on_time.any(axis=1) & r.point.asks_again, r.coordination.merge_failed, np.nan
     ),

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from harness.channel import density_coupled_loss
 from harness.drive.run import run
 from harness.drive.spec import Drive
@@ -50,8 +52,6 @@ def panels() -> dict[str, list[Setting]]:
 
 
 def _coupled(vehicles: int) -> float:
-    import numpy as np
-
     return float(density_coupled_loss(np.array(vehicles)))
 
 

@@ -1,17 +1,16 @@
 """`harness fidelity`: the comparison of frozen with closed as tables, a picture and a page."""
 
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from harness.drawing.pictures import COLOURS, GREY, MARKERS, PALE, styled, uri
 from harness.files import write_whole
 from harness.study.fidelity import WHO, Fidelity, disagreements
 from harness.study.figures import save_all
+from harness.study.html import render
 from harness.study.tables import write_table
 
 if TYPE_CHECKING:
@@ -27,12 +26,8 @@ def write(found: Fidelity, out: Path) -> Path:
     write_table(found.table, out / "fidelity")
     write_table(found.episodes, out / "episodes")
     save_all(scatter(found.table), out / "fidelity")
-    environment = Environment(
-        loader=PackageLoader("harness.study"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    page = environment.get_template("fidelity.html.j2").render(
-        style=(files("harness.report") / "templates" / "style.css").read_text(encoding="utf-8"),
+    page = render(
+        "fidelity.html.j2",
         figure=uri((out / "fidelity.svg").read_bytes()),
         rows=[shown(row) for row in found.table.to_dict("records")],
         headline=" ".join(headline(found)),

@@ -1,13 +1,11 @@
 """The page of the paper's study: figures, every number, what was fitted."""
 
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from harness.drawing.pictures import uri
+from harness.study.html import render
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,20 +17,13 @@ UNITS = {"count": "", "pct": ", %"}
 
 def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> str:
     """The page, with the figures that lie in `folder` in it."""
-    environment = Environment(
-        loader=PackageLoader("harness.study"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    style = (files("harness.report") / "templates" / "style.css").read_text(encoding="utf-8")
     rows = [shown(row) for row in ledger.itertuples()]
     totals = tally(ledger)
     pictures = {
         key: uri((folder / f"{key.replace('_', '-')}.svg").read_bytes()) for key in ("figure_a", "figure_b")
     }
     off = {v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF}
-    return environment.get_template("paper.html.j2").render(
-        manifest=manifest, rows=rows, off=off, style=style, **pictures, **totals
-    )
+    return render("paper.html.j2", manifest=manifest, rows=rows, off=off, **pictures, **totals)
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:

@@ -1,28 +1,8 @@
 """`harness drive` as it is typed."""
 
 import json
-import sys
 
 import pytest
-
-from harness.cli import main
-
-
-@pytest.fixture
-def harness(monkeypatch, capsys):
-    """Runs one command line; gives exit code, stdout and stderr."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code or 0
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run
 
 
 def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):

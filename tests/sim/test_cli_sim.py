@@ -2,30 +2,9 @@
 
 import json
 import shutil
-import sys
 
 import jsonschema
 import pytest
-
-from harness.cli import main
-
-
-@pytest.fixture
-def harness(monkeypatch, capsys):
-    """Runs one command line; gives exit code, stdout and stderr."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["harness", *map(str, words)])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code or 0
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run
-
 
 NAME = "occluded-intersection"
 
