@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import Bools, Floats
+from harness.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -96,21 +96,54 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 def rate_interval(outcomes_by_episode: Floats, level: float = 0.95) -> Estimate:
     """Share of ones among 0/1 outcomes `(E,)` with Wilson's score interval (Wilson 1927)."""
-    from scipy.special import ndtri
-
     outcomes = outcomes_by_episode[~np.isnan(outcomes_by_episode)]
     n = len(outcomes)
     n_excluded = len(outcomes_by_episode) - n
     if n == 0:
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
     rate = float(np.mean(outcomes))
+    return Estimate(rate, *wilson(rate, n, level), n, n_excluded)
+
+
+def wilson(rate: float, n: float, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a share among n (Wilson 1927)."""
+    from scipy.special import ndtri
+
     z = float(ndtri(0.5 + level / 2))
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     # At 0 and 1 the end is the rate itself; only rounding says otherwise.
-    low = min(max(centre - half, 0.0), rate)
-    high = max(min(centre + half, 1.0), rate)
-    return Estimate(rate, low, high, n, n_excluded)
+    return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
+
+
+def share_interval(hits: Floats, episodes: Ints, level: float = 0.95) -> Estimate:
+    """Share of ones among decisions, with Wilson's interval for as many as they are worth.
+
+    Decisions of one episode go together, so n of them say as much as n / deff independent ones, deff being
+    the variance of the share over episodes as clusters against that of independent decisions, 1 at least
+    (Korn and Graubard 1998). Where all are alike nobody can tell deff, and an episode counts as one.
+
+    Args:
+        hits: 0 or 1, `(n,)`; NaN is left out.
+        episodes: of which episode each is, `(n,)`.
+        level: confidence level.
+
+    Returns:
+        The share, with the number of decisions as n.
+    """
+    known = ~np.isnan(hits)
+    y, _, cluster = hits[known], *np.unique(episodes[known], return_inverse=True)
+    n, clusters = len(y), int(cluster.max()) + 1 if len(y) else 0
+    if n == 0:
+        return Estimate(math.nan, math.nan, math.nan, 0, len(hits))
+    rate = float(np.mean(y))
+    worth = float(clusters)
+    if clusters > 1 and 0.0 < rate < 1.0:
+        totals = np.bincount(cluster, weights=y - rate)
+        variance = clusters / (clusters - 1) * float(np.sum(totals**2)) / n**2
+        worth = n / max(variance / (rate * (1 - rate) / n), 1.0)
+    low, high = wilson(rate, worth, level)
+    return Estimate(rate, low, high, n, len(hits) - n)
 
 
 def paired_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:

@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 from harness import errors
 from harness.answer_schema import ROLES
-from harness.parsing import reasoning
+from harness.parsing import candidates, reasoning
 from harness.parsing.answer import Answer, read
-from harness.parsing.candidates import Candidate, candidates, whole
+from harness.parsing.candidates import Candidate, whole
 from harness.parsing.mend import unreadable
 from harness.parsing.status import Failure, Repair, Status
 
-__all__ = ["Parsed", "Repair", "Status", "parse"]
+__all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
 
 _SAME = 1e-9  # two renderings of one distribution (0.5, 50%) differ by less
 _SPECIAL = re.compile(
@@ -117,6 +117,21 @@ def parse(
     )
 
 
+def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) -> list[tuple[int, int]]:
+    """Where in a completion its answers stand, for people to see: start and end of each, as `parse` reads it.
+
+    Empty where nothing was found, or where the text had to be rewritten before anything was.
+    """
+    try:
+        rest = reasoning.split(text, thinking)[1] if text.strip() else ""
+    except Failure:
+        return []
+    start = text.rfind(rest)
+    if start < 0:
+        return []
+    return [(start + a, start + b) for a, b in candidates.spans(rest, role, tuple(actions))]
+
+
 def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     """The answer if the text is nothing but that and needs no repair."""
     candidate = whole(text, role, actions)
@@ -134,7 +149,7 @@ def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Ans
     text, zero_width = _INVISIBLE.subn(lambda found: " " if found.group().isspace() else "", text)
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
-    answer = _choose(candidates(text, role, actions, cut), role, actions)
+    answer = _choose(candidates.candidates(text, role, actions, cut), role, actions)
     if special:
         answer = answer.mended(Repair.SPECIAL_TOKENS)
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer

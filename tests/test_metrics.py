@@ -16,6 +16,8 @@ from harness.metrics import (
     rate_interval,
     safe_target,
     seed_interval,
+    share_interval,
+    wilson,
 )
 
 NAN = math.nan
@@ -134,3 +136,25 @@ def test_in_the_mean_no_forecast_beats_the_truth(seed):
     q, p = rng.dirichlet(np.ones(3), 2)
     outcomes = np.eye(3, dtype=bool)
     assert q @ brier(q, safe_target(outcomes)) <= q @ brier(p, safe_target(outcomes)) + 1e-12
+
+
+def test_decisions_of_one_episode_are_worth_less_than_as_many_alone():
+    alike = np.repeat([1.0, 0.0, 1.0, 1.0], 6)
+    together = share_interval(alike, np.repeat(np.arange(4), 6))
+    alone = share_interval(alike, np.arange(24))
+    assert together.value == alone.value == 0.75
+    assert (together.n, alone.n) == (24, 24)
+    # By hand: the variance over four clusters is 4/3 * 27/576 = 1/16, eight times that of 24 alone.
+    assert (together.low, together.high) == pytest.approx(wilson(0.75, 3.0))
+    assert (alone.low, alone.high) == pytest.approx(wilson(0.75, 23.0))
+
+
+def test_where_all_decisions_are_alike_an_episode_counts_as_one():
+    share = share_interval(np.ones(60), np.repeat(np.arange(10), 6))
+    assert (share.low, share.high) == wilson(1.0, 10.0)
+
+
+def test_unknown_decisions_are_left_out_and_none_gives_no_share():
+    share = share_interval(np.array([1.0, np.nan, 0.0]), np.array([0, 0, 1]))
+    assert (share.value, share.n, share.n_excluded) == (0.5, 2, 1)
+    assert np.isnan(share_interval(np.array([np.nan]), np.array([0])).value)

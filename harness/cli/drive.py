@@ -121,7 +121,7 @@ def _run(
     from harness.cli.report import write
     from harness.cli.video import write_failures
 
-    page = write(out, None, quiet=as_json or quiet)
+    page = write([out], quiet=as_json or quiet)
     videos = write_failures(out, save_video, quiet=as_json or quiet) if save_video else []
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))

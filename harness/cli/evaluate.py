@@ -91,7 +91,7 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, q
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
-    page = write(out, None, as_json or quiet)
+    page = write([out], quiet=as_json or quiet)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
     if as_json or quiet:

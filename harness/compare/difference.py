@@ -9,8 +9,8 @@ import numpy as np
 
 from harness.arrays import Floats
 from harness.compare.pair import METRICS, Pair
-from harness.compare.success import SuccessTest, success_test
 from harness.metrics import Estimate, known_mean, paired_difference
+from harness.paired import SuccessTest, success_test
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from harness.compare.difference import AnswersTurned, Comparison, Difference, InCondition, Turned
 from harness.compare.gate import Verdict
 from harness.compare.pair import Pair, Side
-from harness.compare.success import RESAMPLES, RESAMPLING_SEED
 from harness.errors import printable
+from harness.paired import RESAMPLES, RESAMPLING_SEED
 from harness.report.words import unit
 
 

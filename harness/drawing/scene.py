@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
+from harness.arrays import Floats
 from harness.dataset.load import Scene
 from harness.drawing.ground import ground, north_up
 from harness.drawing.labels import Labels
@@ -141,12 +142,19 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
     labels.add(centre, radius_m, text, bold=look in ("ego", "danger"))
 
 
-def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
-    eye, ego = scene.state.vehicle(viewer), printable(scene.state.ego.id)
+def conflict_points(scene: Scene, viewer: str) -> Floats:
+    """Where a viewer sees paths cross, (n, 2) m to the east and north, as its graph orders them."""
+    eye = scene.state.vehicle(viewer)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
     conflicts = scene.record["graphs"][viewer]["conflicts"]
     relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
-    points = north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
+    return north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
+
+
+def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
+    ego = printable(scene.state.ego.id)
+    conflicts = scene.record["graphs"][viewer]["conflicts"]
+    points = conflict_points(scene, viewer)
     for conflict, point in zip(conflicts, points, strict=True):
         axes.plot(
             *point, marker="X", markersize=7, color=PURPLE, markeredgecolor=INK, markeredgewidth=0.7, zorder=4

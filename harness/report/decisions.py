@@ -1,26 +1,35 @@
-"""What the report shows of a decision: the scene, who answered what to which prompt, and what came of it."""
+"""What a page knows of each decision: an index of all, and details in blocks that are read when opened."""
 
-import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from harness import prompts as versions
 from harness import readout
 from harness.dataset.load import Scene
-from harness.drawing.pictures import uri
-from harness.drawing.scene import draw
+from harness.drawing.scene import conflict_points
 from harness.drive.folder import Driven
 from harness.drive.replay import scene_of
 from harness.errors import UserError, printable
 from harness.files import digest
-from harness.report.choose import Pick, decisions_of
-from harness.run.folder import Row, Run, dataset_of
+from harness.parse import Status, spans
+from harness.report.choose import failures, pick
+from harness.report.runs import Runs, answers_of
+from harness.run.folder import Row, Run
+
+BLOCK = 24  # scenes that are compressed and read together
+REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
 
 Messages = Sequence[Mapping[str, Any]]
-Prompts = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
+Prompts = Callable[[Run], Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]] | None]
+GOOD, SLOW, BAD, BLAMELESS, ABSENT = "s", "d", "u", "n", "-"
+KEPT = (
+    "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
+    "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
+)  # fmt: skip
+LEFT_OUT = ("seed", "safe", "delay_s", "fusion_ms", "effective_loss", "observed_loss", "normalised_entropy")
 
 
-def prompts_of(run: Run) -> Prompts | None:
+def prompts_of(run: Run) -> Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]] | None:
     """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
     version, actions = str(run.config["prompt"]["version"]), tuple(run.config["actions"])
     if version not in versions.names():
@@ -36,68 +45,175 @@ def prompts_of(run: Run) -> Prompts | None:
     return sent
 
 
-def cards(run: Run, picks: Sequence[Pick], prompts: Prompts | None) -> Iterator[dict[str, Any]]:
-    """What the template shows of each decision."""
-    if isinstance(run, Driven):
-        for chosen in picks:
-            scene = scene_of(run, chosen.row)
-            same = scene.id == chosen.row["scene"]  # or this simulator is not what the run's was
-            ends = _ends(chosen, run)
-            good = {condition: end["result"] == "cleared" for condition, end in ends.items()}
-            card = _card(chosen, scene if same else None, run, prompts, good)
-            yield {**card, "ends": ends, "seed": chosen.seed}
-        return
-    scenes = {scene.id: scene for scene in dataset_of(run).scenes}
-    for chosen in picks:
-        if chosen.row["scene"] not in scenes:
-            raise UserError(
-                f"{printable(run.path / 'rows.jsonl')} has scene {printable(chosen.row['scene'])!r}, "
-                "which its dataset has not; make the run again"
-            )
-    for chosen in picks:
-        scene = scenes[chosen.row["scene"]]
-        safe = {d["condition"]: d["safe"] for d in decisions_of(chosen.row, chosen.seed)}
-        card = _card(chosen, scene, run, prompts, safe)
-        outcomes = _outcomes(scene, run.config["actions"], chosen.row)
-        yield {**card, "outcomes": outcomes, "avoidable": any(chosen.row["safe"])}
+class Decisions:
+    """Everything that runs have to say of single scenes, in order of episode and step.
 
-
-def _card(
-    chosen: Pick, scene: Scene | None, run: Run, prompts: Prompts | None, good: Mapping[str, bool | None]
-) -> dict[str, Any]:
-    """What decisions of any run have; without a scene there is no picture and no prompt.
-
-    `good` says by condition whether the decision, or what it was a part of, came to a good end.
+    Attributes:
+        ids: of the scenes that any run has.
+        index: what the list shows and filters by, for the page.
     """
-    actions, row, picture = run.config["actions"], chosen.row, io.BytesIO()
-    if scene:
-        draw(scene, picture, "svg")
 
-    def prompt(viewer: str, answer: Mapping[str, Any]) -> Sequence[Mapping[str, str]] | None:
-        if not scene or not prompts:
-            return None
-        sent = prompts(scene, viewer.partition("+")[0], _heard(row, viewer))
-        return sent if answer.get("prompt_sha256") in (None, digest(sent)) else None
+    def __init__(self, runs: Runs, prompts: Prompts = prompts_of) -> None:
+        self._runs = runs
+        self._prompts = [prompts(run) for run in runs.runs]
+        self._rows = [{str(row["scene"]): row for row in run.rows} for run in runs.runs]
+        first = {scene: row for rows in reversed(self._rows) for scene, row in rows.items()}
+        order = sorted(first.items(), key=lambda one: (one[1]["episode"], one[1]["step"], one[0]))
+        self.ids = [scene for scene, _ in order]
+        self._scenes = self._frozen() if runs.dataset else self._played()
+        failed = [failures(run) for run in runs.runs]
+        self.index = {
+            "actions": runs.actions,
+            "scenes": [[scene, row["episode"], row["step"], row["danger"]] for scene, row in order],
+            "block": BLOCK,
+            "live": runs.live,
+            "statuses": list(map(str, Status)),
+            "runs": [
+                self._indexed(run, rows, [str(run.rows[i]["scene"]) for i in first_failures])
+                for run, rows, first_failures in zip(runs.runs, self._rows, failed, strict=True)
+            ],
+        }
 
-    return {
-        "id": row["scene"],
-        "danger": row["danger"],
-        "why": chosen.why,
-        "picture": uri(picture.getvalue()) if scene else None,
-        "choices": [
-            {**d, "good": good[d["condition"]], "bars": _bars(actions, d["fused"])}
-            for d in decisions_of(row, chosen.seed)
-        ],
-        "answers": [
-            {
-                **answer,
-                "viewer": viewer,
-                "bars": _bars(actions, answer.get("intent")),
-                "prompt": prompt(viewer, answer),
+    def _frozen(self) -> dict[str, Scene]:
+        assert self._runs.dataset is not None
+        scenes = {scene.id: scene for scene in self._runs.dataset.scenes}
+        for run in self._runs.runs:
+            for row in run.rows:
+                if row["scene"] not in scenes:
+                    raise UserError(
+                        f"{printable(run.path / 'rows.jsonl')} has scene {printable(row['scene'])!r}, "
+                        "which its dataset has not; make the run again"
+                    )
+        return scenes
+
+    def _played(self) -> dict[str, Scene]:
+        """The telling moments, played again; none where this simulator is not what the run's was."""
+        found: dict[str, Scene] = {}
+        for run in self._runs.runs:
+            for chosen in pick(run.rows, failures(run), REPLAYED):
+                if chosen.row["scene"] not in found:
+                    scene = scene_of(run, chosen.row)
+                    if scene.id == chosen.row["scene"]:
+                        found[scene.id] = scene
+        return found
+
+    def _indexed(self, run: Run, rows: Mapping[str, Row], first_failures: Iterable[str]) -> dict[str, Any]:
+        """One run's part of the index: a letter a scene, condition and seed, in this order."""
+        actions, statuses = list(run.config["actions"]), list(map(str, Status))
+        acted, ended, asked, verdicts = [], [], [], []
+        place = {scene: n for n, scene in enumerate(self.ids)}
+        for scene in self.ids:
+            row = rows.get(scene)
+            made = {(d["condition"], d["seed"]): d for d in row["decisions"]} if row else {}
+            for key in ((c, s) for c in run.conditions for s in run.config["seeds"]):
+                d = made.get(key)
+                acted.append(str(actions.index(d["action"])) if d else ABSENT)
+                ended.append(_end(run, row, d) if row and d else ABSENT)
+                asked.append("1" if d and d["triggered"] else "0")
+            met = {a["status"] for a in answers_of(row).values()} if row else ()
+            verdicts.append(sum(1 << statuses.index(status) for status in met if status in statuses))
+        return {
+            "conditions": run.conditions, "seeds": run.config["seeds"], "acted": "".join(acted),
+            "ended": "".join(ended), "asked": "".join(asked), "statuses": verdicts,
+            "first": [place[scene] for scene in first_failures],
+        }  # fmt: skip
+
+    def blocks(self) -> Iterator[list[dict[str, Any]]]:
+        """Details of the scenes, so many a block."""
+        for start in range(0, len(self.ids), BLOCK):
+            yield [self._detail(scene) for scene in self.ids[start : start + BLOCK]]
+
+    def _detail(self, name: str) -> dict[str, Any]:
+        scene, rows = self._scenes.get(name), [of.get(name) for of in self._rows]
+        sent: dict[str, Any] = {}
+        told = [self._told(n, row, scene, sent) if row else None for n, row in enumerate(rows)]
+        row = next(row for row in rows if row)
+        return {
+            "world": scene and _world(scene),
+            "outcomes": _outcomes(scene, self._runs.actions, row) if scene and "safe" in row else None,
+            "prompts": list(sent.values()),
+            "runs": told,
+        }
+
+    def _told(self, n: int, row: Row, scene: Scene | None, sent: dict[str, Any]) -> dict[str, Any]:
+        run, prompts = self._runs.runs[n], self._prompts[n]
+        answers = []
+        for viewer, answer in answers_of(row).items():
+            shown = {key: answer[key] for key in KEPT if answer.get(key) not in (None, [], 0, False)}
+            found = _read_in(answer, run) if answer["repairs"] else []
+            asked = None
+            if scene and prompts:
+                messages = prompts(scene, viewer.partition("+")[0], _heard(row, viewer))
+                key = digest(messages)
+                if answer.get("prompt_sha256") in (None, key):
+                    sent.setdefault(key, messages)
+                    asked = list(sent).index(key)
+            answers.append({**shown, "viewer": viewer, "spans": found, "prompt": asked})
+        decisions: dict[str, dict[str, Any]] = {}  # seeds that came to the same are told once
+        for d in row["decisions"]:
+            made = {key: value for key, value in d.items() if key not in LEFT_OUT} | {
+                "end": _end(run, row, d)
             }
-            for viewer, answer in (*row["answers"].items(), *row.get("merged", {}).items())
+            decisions.setdefault(repr(made), {**made, "seeds": []})["seeds"].append(d["seed"])
+        ends = None
+        if isinstance(run, Driven):
+            ends = [
+                {"condition": c, "seed": s, **run.ends[c, s, row["episode"]]}
+                for c in run.conditions for s in run.config["seeds"]
+            ]  # fmt: skip
+        return {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
+
+
+def _read_in(answer: Row, run: Run) -> list[tuple[int, int]]:
+    """Where in a recovered completion its answers stand."""
+    role = "helper" if answer["role"] == "helper" else "ego"
+    return spans(answer["raw"], role, run.config["actions"], bool(run.config.get("thinking")))
+
+
+def _end(run: Run, row: Row, d: Row) -> str:
+    """What came of a decision; live, what its episode came to."""
+    if isinstance(run, Driven):
+        result = run.ends[d["condition"], d["seed"], row["episode"]]["result"]
+        return {"cleared": GOOD, "late": SLOW}.get(result, BAD)
+    if not any(row["safe"]):
+        return BLAMELESS
+    if not d["safe"]:
+        return BAD
+    return SLOW if d["delay_s"] else GOOD
+
+
+def _world(scene: Scene) -> dict[str, Any]:
+    """What is where, in m to the east and to the north, and what each viewer sees of it."""
+    state, danger = scene.state, scene.record["danger"]["vehicle"]
+    return {
+        "time_s": round(state.time_s, 3),
+        "vehicles": [
+            {
+                "id": v.id, "kind": v.kind, "part": "danger" if v.id == danger else v.part,
+                "x": round(v.x_m, 2), "y": round(-v.y_m, 2), "heading": round(-v.heading_rad, 4),
+                "length": v.length_m, "width": v.width_m, "speed": round(v.speed_mps, 2),
+                "crashed": v.crashed,
+            }
+            for v in state.vehicles
         ],
-    }
+        "buildings": [
+            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()} for b in state.buildings
+        ],
+        "viewers": {
+            viewer: {
+                "role": graph["role"],
+                "seen": [node["id"] for node in graph["nodes"]],
+                "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
+                "conflicts": [
+                    {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
+                    for c, (x, y) in zip(
+                        graph["conflicts"], conflict_points(scene, viewer).round(1).tolist(), strict=True
+                    )
+                ],
+            }
+            for viewer, graph in scene.record["graphs"].items()
+        },
+    }  # fmt: skip
 
 
 def _outcomes(scene: Scene, actions: Sequence[str], row: Row) -> list[dict[str, Any]]:
@@ -108,20 +224,7 @@ def _outcomes(scene: Scene, actions: Sequence[str], row: Row) -> list[dict[str, 
     ]
 
 
-def _ends(chosen: Pick, run: Driven) -> dict[str, dict[str, Any]]:
-    """What became of the episode in each condition, whether it still came to this moment or not."""
-    here = {d["condition"] for d in decisions_of(chosen.row, chosen.seed)}
-    return {
-        condition: {**run.ends[condition, chosen.seed, chosen.row["episode"]], "here": condition in here}
-        for condition in run.conditions
-    }
-
-
 def _heard(row: Row, viewer: str) -> Messages:
     """What an ego that answered a second time had heard, from its key in `merged`: itself and the senders."""
     said = {sender: row["answers"][sender] for sender in viewer.split("+")[1:] if sender in row["answers"]}
     return [{"sender": s, "intent": a["intent"], **(a["message"] or {})} for s, a in said.items()]
-
-
-def _bars(actions: Sequence[str], p: Sequence[float] | None) -> list[tuple[str, float]]:
-    return list(zip(actions, map(float, p), strict=True)) if p else []

@@ -1,85 +1,126 @@
-"""One HTML file about one run: needs no network and runs no script.
+"""One HTML file about one run or several: opens from disk, needs no network.
 
-Whatever a model, a prompt or a file name says is text: templates escape everything, characters that show
-nothing or turn the line around are spelt out, and the page's own policy forbids scripts and requests.
+Whatever a model, a prompt or a file name says is text: templates escape everything, the page's script makes
+text nodes and nothing else of what it reads, characters that show nothing or turn the line around are spelt
+out, and the page's own policy lets two scripts run, named by their digests, and forbids every request.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
+from harness.drawing.ground import roads
 from harness.drawing.pictures import uri
-from harness.drive.folder import LIVE, Driven, driven
+from harness.drawing.scene import VIEW_M
+from harness.drive.folder import Driven
 from harness.errors import UserError, printable
 from harness.files import write_whole
-from harness.report import figures, words
-from harness.report.choose import failures, pick
-from harness.report.decisions import Prompts, cards, prompts_of
-from harness.run.folder import FROZEN, Row, Run, read
+from harness.parse import Repair, Status
+from harness.report import library, matrix, words
+from harness.report.decisions import Decisions, Prompts, prompts_of
+from harness.report.panels import panels
+from harness.report.runs import Runs
+from harness.run.folder import Run
 
-DECISIONS = 60
 TEMPLATES = Path(__file__).parent / "templates"
+EXAMPLES = 3  # of each status of answers
 
 
 def write_report(
-    run: Path,
-    out: Path | None = None,
-    prompts: Prompts | None = None,
+    runs: Runs,
+    out: Path,
+    prompts: Prompts = prompts_of,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Path:
-    """Write a run's report.
+    """Write a report about one run, or about several on the same scenes.
 
     Args:
-        run: the run's folder.
-        out: file to replace; None for `report.html` in the run's folder.
-        prompts: gives the chat messages that a viewer was sent in a scene, with what it had heard; None
-            renders the run's own prompt version, where it is here and unchanged.
-        progress: called with the number of decisions just drawn, `DECISIONS` at most in all.
+        runs: what to report.
+        out: file to replace.
+        prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
+            had heard; None where nobody knows. By default the run's own prompt version, if it is here.
+        progress: called with the number of scenes just packed.
 
     Returns:
         The file written.
 
     Raises:
-        UserError: the folder is no run, its dataset is gone or has changed, or `out` is a folder.
+        UserError: a run has a scene that its dataset has not, or `out` cannot be written.
     """
-    out = run / "report.html" if out is None else out
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    found = read(run, FROZEN, LIVE)
-    if found.config["format"] == LIVE.format:
-        found = driven(found)
-    write_whole(out, render(found, prompts or prompts_of(found), progress))
+    page = render(runs, prompts, progress)
+    try:
+        write_whole(out, page)
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(out)} cannot be written ({error.strerror}); name another file"
+        ) from None
     return out
 
 
-def render(run: Run, prompts: Prompts | None, progress: Callable[[int], None]) -> str:
+def render(
+    runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
+) -> str:
     """The page."""
-    picks = pick(run.rows, failures(run), DECISIONS)
-    decisions = []
-    for card in cards(run, picks, prompts):
-        decisions.append(card)
-        progress(1)
-    chart = figures.success_latency(run)
-    by_verdict = _count(run.rows, "verdict")
+    lines = matrix.lines(runs)
+    charts = list(panels(runs))
+    decisions = Decisions(runs, prompts)
+    blocks = []
+    for block in decisions.blocks():
+        blocks.append(library.packed(block))
+        progress(len(block))
     return environment().get_template("page.html.j2").render(
-        run=run,
-        config=run.config,
-        live=isinstance(run, Driven),
-        title=run.config.get("name") or run.path.name,
-        headline=words.headline(run),
-        latency=words.latency_source(run.config["latency"]),
-        points=_table(run.config["conditions"]),
-        metrics=_metrics(run, run.conditions),
-        answers=_metrics(run, ["all"]),
-        chart=chart and uri(chart),
-        statuses=_count(run.rows, "status"),
-        verdicts=uri(figures.verdicts(by_verdict)),
-        decisions=decisions,
+        runs=runs,
+        title=runs.names[0] if len(runs.names) == 1 else f"{len(runs.names)} runs",
+        policy=library.policy(library.vega(), library.script()),
+        headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
+        lines=lines,
+        grids=matrix.grids(lines),
+        summaries=[_summary(run) for run in runs.runs],
+        answers=_answers(runs),
+        charts=charts,
+        examples=_examples(decisions, runs),
+        sweeps=[panel for run in runs.runs for panel in _sweeps(run)],
+        licence=library.licence(),
+        vega=library.packed(library.vega()),
+        script=library.script(),
+        about=library.packed(_about(runs, charts)),
+        index=library.packed(decisions.index),
+        blocks=blocks,
     )  # fmt: skip
+
+
+def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
+    """What the page's script has to know of the runs, besides the decisions."""
+    from harness.report.charts import policies, timeline
+
+    outline, marks, stops = roads(VIEW_M + 5.0)
+    return {
+        "names": runs.names,
+        "runs": [
+            {
+                "model": run.config["model"].get("name"),
+                "inference_s": run.config["latency"]["inference_s"],
+                "points": {
+                    c["name"]: {"window_s": c.get("window_s"), "tau_nats": c.get("tau_nats")}
+                    for c in run.config["conditions"]
+                },
+            }
+            for run in runs.runs
+        ],
+        "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
+        "ground": {
+            "view_m": VIEW_M, "outline": outline.round(2).tolist(),
+            "marks": [m.tolist() for m in marks], "stops": [s.tolist() for s in stops],
+        },
+        "charts": {chart.id: chart.spec for chart in charts},
+        "policies": policies(),
+        "timeline": timeline(),
+    }  # fmt: skip
 
 
 def environment(*more: Path) -> Environment:
@@ -91,7 +132,10 @@ def environment(*more: Path) -> Environment:
         lstrip_blocks=True,
         finalize=visible,
     )
-    found.filters |= {"number": words.number, "facts": words.facts}
+    found.filters |= {
+        "number": words.number, "facts": words.facts, "shown": words.shown,
+        "latency_source": words.latency_source, "columns": _table,
+    }  # fmt: skip
     return found
 
 
@@ -106,30 +150,50 @@ def visible(value: Any) -> Any:
     return "".join(c if c.isprintable() or c in "\n\t" else f"⟨U+{ord(c):04X}⟩" for c in value)
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
     """Head and body of a table with a column for every key."""
     head = list(dict.fromkeys(key for row in rows for key in row))
     return head, [[row.get(key) for key in head] for row in rows]
 
 
-def _metrics(run: Run, conditions: Sequence[str]) -> list[dict[str, Any]]:
-    """The summary: a metric a line, with its value in each condition."""
+def _summary(run: Run) -> list[dict[str, Any]]:
+    """A run's summary: a metric a line, with its value in each condition."""
     meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
-    known = {s.metric: None for s in run.scores if s.condition in conditions}
     return [
         {
             "name": words.metric_name(metric),
             "meaning": meanings.get(metric, ""),
-            "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in conditions],
+            "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
-        for metric in known
+        for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
     ]
 
 
-def _count(rows: Iterable[Row], key: str) -> dict[str, Counter[str]]:
-    """How many answers have which `status` or `verdict`, by role."""
-    counts: dict[str, Counter[str]] = {}
-    for row in rows:
-        for answer in (*row["answers"].values(), *row.get("merged", {}).values()):
-            counts.setdefault(answer["role"], Counter())[answer[key]] += 1
-    return counts
+def _answers(runs: Runs) -> list[tuple[str, list[Any]]]:
+    """What does not depend on the condition: a metric a line, with its value in each run."""
+    metrics = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
+    return [
+        (words.metric_name(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
+        for m in metrics
+    ]
+
+
+def _examples(decisions: Decisions, runs: Runs) -> list[dict[str, Any]]:
+    """The first answers of each status but strict, and where each stands."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for n, run in enumerate(runs.runs):
+        for row in run.rows:
+            for viewer, answer in {**row["answers"], **row.get("merged", {})}.items():
+                of = found.setdefault(answer["status"], [])
+                if answer["status"] != "strict" and len(of) < EXAMPLES:
+                    of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
+    return [{"status": status, "answers": of} for status, of in found.items() if of]
+
+
+def _sweeps(run: Run) -> list[dict[str, str]]:
+    """Pictures of the sweeps that lie in the run's folder."""
+    return [
+        {"name": f"{manifest.parent.name}: {picture.stem}", "src": uri(picture.read_bytes())}
+        for manifest in sorted(run.path.glob("*/sweep.json"))
+        for picture in sorted(manifest.parent.glob("*.svg"))
+    ]

@@ -122,8 +122,13 @@ def headline(run: Run) -> str:
 
 
 def _clears(score: Score) -> str:
+    return f"clears {success_of(score)} of the episodes"
+
+
+def success_of(score: Score) -> str:
+    """A success rate and its interval, where it has one."""
     bounds = f" (95 % interval {interval(score)})" if interval(score) else ""
-    return f"clears {shown(score)['value']}{bounds} of the episodes"
+    return shown(score)["value"] + bounds
 
 
 def latency_source(latency: Mapping[str, Any]) -> str:

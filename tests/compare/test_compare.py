@@ -13,11 +13,11 @@ from evaluating import spec_of
 
 from harness.compare.difference import Comparison, Difference, Turned, compare
 from harness.compare.pair import METRICS, pair
-from harness.compare.success import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.errors import UserError
 from harness.operating_point import POINTS
+from harness.paired import SuccessTest
 
 Said = tuple[int, str, str]
 

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from driving import FROM_LEFT, spec
-from reading import Page
+from reading import Page, details
 
 from harness import prompts
 from harness.drive.folder import read
@@ -14,7 +14,8 @@ from harness.drive.run import run
 from harness.errors import UserError
 from harness.operating_point import named_point
 from harness.report.choose import FAILURE, failures, pick
-from harness.report.page import write_report
+from harness.report.page import render
+from harness.report.runs import gather
 from harness.run import folder
 
 V2 = prompts.load("v2")
@@ -28,9 +29,18 @@ def driven(tmp_path_factory):
     return out
 
 
+def written(run):
+    return render(gather([run]))
+
+
 @pytest.fixture(scope="module")
-def page(driven):
-    return Page(write_report(driven).read_text())
+def text(driven):
+    return written(driven)
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
 
 
 def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
@@ -51,23 +61,17 @@ def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
     assert "decision that leads to a collision" not in page.text  # a frozen run's unsafe rate
 
 
-def test_a_moment_shows_what_was_decided_when_it_acted_and_who_was_hit_by_whose_fault(driven, page):
-    found = read(driven)
-    shown = pick(found.rows, failures(found), 60)
-    for row, seed, _ in shown:
-        for made in row["decisions"]:
-            if made["seed"] == seed and made["acted"]:
-                assert f"acts at {made['acts_at_s']:.2f} s" in page.text
-    crashes = {
-        (end["partner"], end["fault"], end["time_s"])
-        for row, seed, _ in shown
-        for name in found.conditions
-        if (end := found.ends[name, seed, row["episode"]])["result"] == "collision"
-    }
-    assert crashes
-    for partner, fault, time_s in crashes:
-        assert f"collision with {partner}, fault: {fault}" in page.text
-        assert f"{time_s:.2f} s" in page.text
+def test_a_moment_has_what_was_decided_when_it_acted_and_what_became_of_each_episode(driven, text):
+    found, every = read(driven), details(text)
+    assert list(every) == [row["scene"] for row in found.rows]
+    for row in found.rows:
+        [told] = every[row["scene"]]["runs"]
+        again = {(d["condition"], seed): d.get("acts_at_s") for d in told["decisions"] for seed in d["seeds"]}
+        assert again == {(d["condition"], d["seed"]): d.get("acts_at_s") for d in row["decisions"]}
+        for end in told["ends"]:
+            known = found.ends[end["condition"], end["seed"], row["episode"]]
+            assert end.items() >= known.items()
+    assert any(end["result"] == "collision" for d in every.values() for end in d["runs"][0]["ends"])
 
 
 def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
@@ -89,11 +93,21 @@ def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
     assert FAILURE in {chosen.why for chosen in pick(found.rows, failures(found), 60)}
 
 
-def test_prompts_are_the_very_ones_that_were_sent(driven, page):
-    assert "prompt: not rendered" not in page.text
-    [row] = [r for r in read(driven).rows if (r["episode"], r["step"]) == (0, 0)]
-    sent = V2.render(scene_of(read(driven), row).record["graphs"]["v1"], read(driven).config["actions"], [])
-    assert sent[-1]["content"] in "".join(page.pieces)
+def shown(every):
+    """What each answer of each moment was asked, as far as the page knows."""
+    return {
+        (scene, a["viewer"]): a["prompt"] is not None and d["prompts"][a["prompt"]]
+        for scene, d in every.items() for a in d["runs"][0]["answers"]
+    }  # fmt: skip
+
+
+def test_prompts_are_the_very_ones_that_were_sent(driven, text):
+    found = shown(details(text))
+    assert all(found.values())
+    run = read(driven)
+    [row] = [r for r in run.rows if (r["episode"], r["step"]) == (0, 0)]
+    sent = V2.render(scene_of(run, row).record["graphs"]["v1"], run.config["actions"], [])
+    assert found[row["scene"], "v1"] == [dict(message) for message in sent]
 
 
 @pytest.mark.slow
@@ -101,10 +115,12 @@ def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path
     point = named_point("6g:consensus=ego-prompt")
     of = spec("swarm-tiny", points=[point], seeds=(0,), first_seed=FROM_LEFT, latency="paper")
     run(of, tmp_path / "run", False, 1, lambda done: None)
-    heard = [key for row in read(tmp_path / "run").rows for key in row.get("merged", {})]
-    found = Page(write_report(tmp_path / "run").read_text())
-    assert "prompt: not rendered" not in found.text
-    assert found.text.count(", merge") == len(heard) > 0
+    heard = {(row["scene"], key) for row in read(tmp_path / "run").rows for key in row.get("merged", {})}
+    found = shown(details(written(tmp_path / "run")))
+    assert all(found.values())
+    assert heard
+    assert {key for key in found if "+" in key[1]} == heard
+    assert all("MESSAGES" in found[key][-1]["content"] for key in heard)
 
 
 def changed(driven, tmp_path, name, edit):
@@ -121,45 +137,18 @@ def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_pa
             row["answers"]["v2"]["prompt_sha256"] = "0" * 64
         return "".join(json.dumps(row) + "\n" for row in rows)
 
-    found = Page(write_report(changed(driven, tmp_path, "rows.jsonl", edit)).read_text())
-    moments = found.values("class").count("decision")
-    assert found.text.count("prompt: not rendered") == moments
-    assert found.tags["img"] == moments + 2
+    found = shown(details(written(changed(driven, tmp_path, "rows.jsonl", edit))))
+    assert {viewer for (_, viewer), sent in found.items() if not sent} == {"v2"}
+    assert all(sent for (_, viewer), sent in found.items() if viewer != "v2")
 
 
 def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(driven, tmp_path):
     other = changed(
         driven, tmp_path, "run.json", lambda text: text.replace('"first_seed": 6', '"first_seed": 600')
     )
-    found = Page(write_report(other).read_text())
-    assert found.tags["img"] == 2
-    assert found.text.count("No picture: played again here") == found.values("class").count("decision")
-    assert "prompt, 2 messages" not in found.text
-
-
-PAYLOADS = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "{{ 7 * 7 }}", "</pre></details>")
-
-
-def test_nothing_that_a_model_or_a_file_says_becomes_markup(driven, tmp_path, page):
-    payload = "".join(PAYLOADS)
-
-    def edit(text):
-        rows = [json.loads(line) for line in text.splitlines()]
-        for row in rows:
-            for answer in row["answers"].values():
-                answer |= {"raw": payload, "detail": payload, "error": payload}
-        return "".join(json.dumps(row) + "\n" for row in rows)
-
-    hostile = changed(driven, tmp_path, "rows.jsonl", edit)
-    quoted = payload.replace('"', '""')
-    episodes = (hostile / "episodes.csv").read_text().replace(",ego,", f',"{quoted}",')
-    (hostile / "episodes.csv").write_text(episodes.replace(",other,", f',"{quoted}",'))
-    found = Page(write_report(hostile).read_text())
-    assert "script" not in found.tags
-    assert not any(name.startswith("on") for _, name, _ in found.attributes)
-    same = {"html", "head", "body", "main", "style", "title", "img", "section", "details", "pre"}
-    assert {tag: found.tags[tag] for tag in same} == {tag: page.tags[tag] for tag in same}
-    assert f"fault: {' '.join(payload.split())}" in found.text
+    every = details(written(other))
+    assert all(detail["world"] is None for detail in every.values())
+    assert not any(shown(every).values())
 
 
 @pytest.mark.parametrize(
@@ -173,7 +162,7 @@ def test_nothing_that_a_model_or_a_file_says_becomes_markup(driven, tmp_path, pa
 )
 def test_a_broken_live_run_is_one_line_that_names_the_file(driven, tmp_path, name, edit, message):
     with pytest.raises(UserError, match=message) as error:
-        write_report(changed(driven, tmp_path, name, edit))
+        gather([changed(driven, tmp_path, name, edit)])
     assert "\n" not in str(error.value)
 
 

@@ -73,6 +73,13 @@ def write_run(folder, dataset, model="rule-of-thumb", change=lambda scene, viewe
     ]
     (folder / "run.json").write_text(json.dumps(config))
     (folder / "rows.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    with (folder / "episodes.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["condition", "seed", "episode", "success"])
+        numbers = sorted({s.record["episode"] for s in dataset.scenes})
+        for (name, seed), of in decided.items():
+            for number, success in zip(numbers, _success(of, dataset, safe), strict=True):
+                writer.writerow([name, seed, number, bool(success)])
     with (folder / "summary.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -164,13 +171,18 @@ def _row(c, i, name, seed, scene, actions, safe, delay_s):
     }
 
 
+def _success(decided, dataset, safe):
+    """Of each episode, 0 or 1."""
+    episode = np.array([s.record["episode"] for s in dataset.scenes])
+    good = safe[np.arange(len(episode)), decided.action]
+    return np.array([good[episode == e].all() for e in np.unique(episode)], dtype=float)
+
+
 def _summary(name, decided, dataset, safe):
     episode = np.array([s.record["episode"] for s in dataset.scenes])
-    rows = np.arange(len(episode))
 
     def success(seed):
-        good = safe[rows, decided[name, seed].action]
-        return np.array([good[episode == e].all() for e in np.unique(episode)], dtype=float)
+        return _success(decided[name, seed], dataset, safe)
 
     def mean(field, seed=SEEDS[0]):
         values = np.asarray(getattr(decided[name, seed], field), dtype=float)

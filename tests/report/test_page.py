@@ -1,81 +1,132 @@
 """The report page of a real, small run."""
 
 import base64
+import hashlib
 import json
 import shutil
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import pytest
 import typer
-from reading import Page
+from reading import Page, details, packed
 from sample_run import write_run
 from typer.testing import CliRunner
 
 from harness import prompts
 from harness.cli.report import command
 from harness.errors import UserError
-from harness.report.page import visible, write_report
+from harness.report.decisions import prompts_of
+from harness.report.page import render, visible
+from harness.report.runs import gather
 from harness.report.words import headline, latency_source
 from harness.run.folder import Score, read
 
 V2 = prompts.load("v2")
 
 
+def told(viewer_says):
+    """Prompts of a run, as `render` takes them."""
+    return lambda run: lambda scene, viewer, heard: viewer_says(viewer)
+
+
+def written(*folders, prompts=prompts_of):
+    return render(gather(list(folders)), prompts)
+
+
 @pytest.fixture(scope="session")
-def page(run, tmp_path_factory):
-    def prompts(scene, viewer, heard):
-        return [{"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}]
-
-    return Page(write_report(run, tmp_path_factory.mktemp("page") / "page.html", prompts).read_text())
-
-
-def test_at_least_fifty_decisions_open_one_by_one_each_with_its_picture_on_a_light_page(run, tmp_path):
-    many = changed(run, tmp_path, "rows.jsonl", lambda text: text * 6)
-    written = write_report(many)
-    assert written == many / "report.html"
-    assert written.stat().st_size < 6_000_000
-    page = Page(written.read_text())
-    assert page.values("class").count("decision") >= 50
-    assert len(page.values("src")) == page.values("class").count("decision") + 2
+def text(run):
+    return written(
+        run,
+        prompts=told(lambda viewer: [
+            {"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}
+        ]),
+    )  # fmt: skip
 
 
-def test_a_decision_shows_answers_messages_and_outcomes(run, page):
-    row = json.loads((run / "rows.jsonl").read_text().splitlines()[2])
-    assert row["answers"]["v3"]["raw"] in "".join(page.pieces)
-    arrived = [m for d in row["decisions"] if d["seed"] == 0 for m in d["messages"] if m["delivered"]]
-    assert arrived
-    for message in arrived:
-        assert f"{message['from']}: {message['arrival_ms']:.1f} ms" in page.text
-        assert f"weight {message['weight']:.3f}" in page.text
-    assert "code_fence" in page.text
-    assert "none: no_json" in page.text
-    assert "✗ unsafe" in page.text
+@pytest.fixture(scope="session")
+def page(text):
+    return Page(text)
 
 
-def test_prompts_are_those_given_and_said_to_be_missing_where_none_are(run, page, tmp_path):
-    assert "I am v3." in page.text
-    assert "prompt: not rendered" not in page.text
-    assert "prompt: not rendered" in Page(write_report(run, tmp_path / "bare.html").read_text()).text
+@pytest.fixture(scope="session")
+def opened(text):
+    return details(text)
 
 
-def test_a_page_names_the_answer_mode_and_shows_the_prompt_of_a_read_out(dataset, tmp_path):
+def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened):
+    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
+    assert list(opened) == [row["scene"] for row in rows]
+    for row in rows:
+        detail = opened[row["scene"]]
+        [found] = detail["runs"]
+        assert {a["viewer"]: a["raw"] for a in found["answers"]} == {
+            v: a["raw"] for v, a in row["answers"].items()
+        }
+        again = {
+            (d["condition"], seed): (d["action"], d["fused"], d["messages"])
+            for d in found["decisions"] for seed in d["seeds"]
+        }  # fmt: skip
+        assert again == {
+            (d["condition"], d["seed"]): (d["action"], d["fused"], d["messages"]) for d in row["decisions"]
+        }
+        assert [o["safe"] for o in detail["outcomes"]] == row["safe"]
+        assert set(detail["world"]["viewers"]) == set(row["answers"])
+
+
+def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, text):
+    index = json.loads(packed(text, "index"))
+    [of] = index["runs"]
+    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
+    keys = [(c, s) for c in of["conditions"] for s in of["seeds"]]
+    for n, row in enumerate(rows):
+        made = {(d["condition"], d["seed"]): d for d in row["decisions"]}
+        for k, key in enumerate(keys):
+            at = n * len(keys) + k
+            assert index["actions"][int(of["acted"][at])] == made[key]["action"]
+            assert of["asked"][at] == str(int(made[key]["triggered"]))
+            good = not any(row["safe"]) or made[key]["safe"]
+            assert of["ended"][at] in ("sdn" if good else "u")
+        statuses = {s for k, s in enumerate(index["statuses"]) if of["statuses"][n] & 1 << k}
+        assert statuses == {a["status"] for a in row["answers"].values()}
+
+
+def test_what_was_read_in_a_recovered_answer_is_marked(opened):
+    fenced = [
+        a for d in opened.values() for a in d["runs"][0]["answers"] if a.get("repairs") == ["code_fence"]
+    ]
+    assert fenced
+    for answer in fenced:
+        [(start, end)] = answer["spans"]
+        assert answer["raw"][start:end] == answer["raw"].removeprefix("```json\n").removesuffix("\n```")
+
+
+def prompts_in(opened):
+    return [m["content"] for d in opened.values() for sent in d["prompts"] for m in sent]
+
+
+def test_prompts_are_those_given_and_none_where_none_are(run, opened):
+    assert "I am v3." in prompts_in(opened)
+    bare = details(written(run))  # the sample's prompt is nobody's
+    assert prompts_in(bare) == []
+    assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
+
+
+def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, tmp_path):
     change = {"label_mass": 0.25, "retries": 2, "cached": True}
     run = write_run(tmp_path / "run", dataset, change=lambda scene, viewer, answer: {**answer, **change})
-    before = Page(write_report(run).read_text()).text
-    assert "prompt v2, answers json" in before  # as runs of older versions, which name none
-    asks = f"Answer with one letter: A {dataset.actions[0]}"
-    assert asks not in before
+    before = written(run)
+    assert "prompt v2, answers json" in Page(before).text  # as runs of older versions, which name none
     config = json.loads((run / "run.json").read_text())
     config |= {"answer": "readout", "cached_answers": 48, "prompt": {"version": "v2", "sha256": V2.sha256}}
     (run / "run.json").write_text(json.dumps(config))
-    page = Page(write_report(run).read_text())
-    assert "prompt v2, answers readout" in page.text
-    assert "48 answers came from the cache" in page.text
-    assert "25.00 % of the probability on the letters; 2 failed attempts before; from the cache" in page.text
-    prompts = [piece for piece in page.pieces if piece.startswith("EGO")]
-    assert prompts
-    assert all(asks in prompt for prompt in prompts)
+    after = written(run)
+    assert "prompt v2, answers readout" in Page(after).text
+    assert "48 answers came from the cache" in Page(after).text
+    found = details(after)
+    assert all(a.items() >= change.items() for d in found.values() for a in d["runs"][0]["answers"])
+    asked = [text for text in prompts_in(found) if text.startswith("EGO")]
+    assert asked
+    assert all(f"Answer with one letter: A {dataset.actions[0]}" in text for text in asked)
 
 
 def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, page):
@@ -101,48 +152,43 @@ def test_the_page_names_model_prompt_dataset_versions_and_where_latency_comes_fr
         assert fact in page.text
 
 
-def test_the_page_needs_no_network_and_no_script(page):
+def test_the_page_asks_for_nothing_and_runs_two_scripts_that_it_names(text, page):
     metas = [value for tag, name, value in page.attributes if tag == "meta" and name == "content"]
-    assert metas[0].startswith("default-src 'none'; style-src 'unsafe-inline'; img-src data:;")
-    assert not page.tags.keys() & {"script", "link", "iframe", "object", "embed", "base", "form"}
-    assert all(src.startswith("data:image/svg+xml;base64,") for src in page.values("src"))
-    assert set(page.values("href")) == {"#run"}
+    assert metas[0].startswith("default-src 'none'; script-src 'sha256-")
+    assert metas[0].count("'sha256-") == 2
+    assert "unsafe-eval" not in metas[0]
+    assert not page.tags.keys() & {"link", "iframe", "object", "embed", "base"}
+    assert all(href.startswith("#") for href in page.values("href"))
+    assert not page.values("src")
     assert not any(name.startswith("on") for _, name, _ in page.attributes)
+    own = text[text.rindex("<script>") + len("<script>") : text.rindex("</script>")]
+    for script in (own, packed(text, "vega")):
+        assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in metas[0]
 
 
-def test_pictures_in_the_page_are_sound_xml(page):
-    for src in page.values("src"):
-        root = ElementTree.fromstring(base64.b64decode(src.partition(",")[2]))
-        assert root.tag == "{http://www.w3.org/2000/svg}svg"
+def test_the_same_runs_give_the_same_page(run):
+    assert written(run) == written(run)
 
 
-def test_the_same_run_gives_the_same_page(run, tmp_path):
-    first, second = (write_report(run, tmp_path / name).read_bytes() for name in ("a.html", "b.html"))
-    assert first == second
+def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_path):
+    brave = write_run(
+        tmp_path / "brave", dataset, model="brave",
+        change=lambda s, v, answer: answer | {"intent": [0.02, 0.08, 0.9]} if answer["intent"] else answer,
+    )  # fmt: skip
+    text = written(run, brave)
+    found = Page(text).text
+    assert "rule-of-thumb · v2" in found
+    assert "brave · v2" in found
+    assert found.count("★ best") >= 3
+    every = details(text)
+    assert all(len([r for r in d["runs"] if r]) == 2 for d in every.values())
 
 
-PAYLOADS = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "{{ 7 * 7 }}", "</pre></details>")
-
-
-def test_nothing_that_a_model_a_prompt_or_a_file_says_becomes_markup(dataset, tmp_path, page):
-    """Payloads in completions, messages, the model's name and the prompts stay text."""
-    payload = "".join(PAYLOADS)
-
-    def change(scene, viewer, answer):
-        if answer["role"] == "helper" and answer["message"]:
-            answer["message"]["evidence"] = payload
-        return answer | {"raw": payload, "detail": payload, "error": payload}
-
-    run = write_run(tmp_path / "run", dataset, model=payload, change=change)
-    out = write_report(run, prompts=lambda scene, viewer, heard: [{"role": payload, "content": payload}] * 2)
-    found = Page(out.read_text())
-    assert "script" not in found.tags
-    assert not any(name.startswith("on") for _, name, _ in found.attributes)
-    same = {"html", "head", "body", "main", "style", "title", "img", "section", "details", "pre"}
-    assert {tag: found.tags[tag] for tag in same} == {tag: page.tags[tag] for tag in same}
-    text = "".join(found.pieces)
-    for part in PAYLOADS:
-        assert text.count(part) >= 5 * found.tags["section"]
+def test_runs_on_other_scenes_are_not_reported_together(run, dataset, tmp_path):
+    other = changed(run, tmp_path, "run.json", lambda t: t.replace(dataset.sha256, "f" * 64))
+    with pytest.raises(UserError, match="are not of the same scenes") as error:
+        gather([run, other])
+    assert "report them apart" in str(error.value)
 
 
 def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
@@ -152,7 +198,7 @@ def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
 
 def test_a_lone_surrogate_in_an_answer_does_not_break_the_page(dataset, tmp_path):
     run = write_run(tmp_path / "run", dataset, change=lambda s, v, answer: answer | {"raw": "\ud800"})
-    assert "⟨U+D800⟩" in write_report(run).read_text()
+    assert {a["raw"] for d in details(written(run)).values() for a in d["runs"][0]["answers"]} == {"\ud800"}
 
 
 def scored(run, *scores):
@@ -238,14 +284,14 @@ def changed(run, tmp_path, name, edit):
 )
 def test_a_broken_run_is_one_line_that_names_the_file(run, tmp_path, name, edit, message):
     with pytest.raises(UserError, match=message) as error:
-        write_report(changed(run, tmp_path, name, edit))
+        written(changed(run, tmp_path, name, edit))
     assert "\n" not in str(error.value)
 
 
 def test_a_run_on_another_dataset_than_lies_there_is_refused(run, tmp_path):
     other = changed(run, tmp_path, "run.json", lambda t: t.replace('"sha256": "', '"sha256": "0'))
     with pytest.raises(UserError, match=r"is not the one that .* was made on"):
-        write_report(other)
+        gather([other])
 
 
 def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_path):
@@ -255,7 +301,11 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     done = CliRunner().invoke(app, [str(run), "--out", str(out)])
     assert done.output == f"wrote {out}\n"
     assert out.is_file()
-    with pytest.raises(UserError, match=r"is no run: it has no run.json"):
-        CliRunner().invoke(app, [str(tmp_path)], catch_exceptions=False)
-    with pytest.raises(UserError, match="is a folder; name a file in it"):
-        CliRunner().invoke(app, [str(run), "--out", str(tmp_path)], catch_exceptions=False)
+    for arguments, message in (
+        ([tmp_path], r"is no run: it has no run.json"),
+        ([run, "--out", tmp_path], "is a folder; name a file in it"),
+        ([run, "--out", out / "page.html"], "cannot be written"),
+        ([run, run.parent], "2 runs and no --out; name the file to write"),
+    ):
+        with pytest.raises(UserError, match=message):
+            CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)

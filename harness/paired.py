@@ -1,4 +1,4 @@
-"""The test of a difference in success."""
+"""The test of a difference in success between two runs of the same episodes."""
 
 from dataclasses import dataclass
 

@@ -1,0 +1,183 @@
+"""Prompts and models side by side: what each run scored, and which cannot be told from the best."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from harness.arrays import Floats
+from harness.errors import UserError, printable
+from harness.metrics import Estimate, paired_difference
+from harness.paired import success_test
+from harness.report.runs import Runs, answers_of
+from harness.report.words import LATENCY, SUCCESS, success_of
+from harness.run.folder import Run, Score, table
+
+P_VALUE = 0.05
+BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One run under one condition.
+
+    Attributes:
+        name: of the run.
+        model: of its card.
+        prompt: version.
+        answer: answer mode.
+        condition: operating point.
+        scores: metrics by name; None where the run has none.
+        tokens: median tokens of a prompt and of an answer; None where the engine counts none.
+        mark: `BEST` success under its condition, `CLOSE` or `WORSE`; empty where runs cannot be paired.
+        behind: its success minus the best one's over the episodes of both; None for the best.
+    """
+
+    name: str
+    model: str
+    prompt: str
+    answer: str
+    condition: str
+    scores: Mapping[str, Score | None]
+    tokens: tuple[float | None, float | None]
+    mark: str
+    behind: Estimate | None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Success under one condition, prompts across and models down.
+
+    Attributes:
+        condition: operating point.
+        prompts: heads of the columns: version, and the answer mode where runs differ in it.
+        rows: a model, and what was run with each of these prompts: several if it was run again.
+    """
+
+    condition: str
+    prompts: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[tuple[Line, ...], ...]], ...]
+
+
+METRICS = (
+    SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", "brier",
+    "deadline_miss_rate", "trigger_rate",
+)  # fmt: skip
+
+
+def lines(runs: Runs) -> list[Line]:
+    """Every run under each of its conditions, by condition and then in the runs' order."""
+    ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
+    lengths = [_tokens(run) for run in runs.runs]
+    found = []
+    for condition in runs.conditions:
+        marks = _marks([of.get(condition) for of in ended])
+        for n, run in enumerate(runs.runs):
+            if condition in run.conditions:
+                scores = {metric: _score(run, condition, metric) for metric in METRICS}
+                model, prompt = str(run.config["model"].get("name")), str(run.config["prompt"]["version"])
+                found.append(
+                    Line(runs.names[n], model, prompt, run.answer, condition, scores, lengths[n], *marks[n])
+                )
+    return found
+
+
+def grids(found: Sequence[Line]) -> list[Grid]:
+    """The lines as a table a condition."""
+    modes = {line.answer for line in found}
+
+    def asked(line: Line) -> str:
+        return line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
+
+    prompts, models = (tuple(dict.fromkeys(map(of, found))) for of in (asked, lambda line: line.model))
+    return [
+        Grid(condition, prompts, tuple(
+            (model, tuple(
+                tuple(x for x in found if (x.condition, x.model, asked(x)) == (condition, model, prompt))
+                for prompt in prompts
+            ))
+            for model in models
+        ))
+        for condition in dict.fromkeys(line.condition for line in found)
+    ]  # fmt: skip
+
+
+def _score(run: Run, condition: str, metric: str) -> Score | None:
+    """A condition's; for answers the ego's, which are the same under all."""
+    return run.score(condition, metric) or run.score("all", f"{metric}_ego")
+
+
+def _tokens(run: Run) -> tuple[float | None, float | None]:
+    answers = [a for row in run.rows for a in answers_of(row).values()]
+    counts = [
+        [a[key] for a in answers if a.get(key) is not None] for key in ("prompt_tokens", "completion_tokens")
+    ]
+    sent, answered = (float(median(of)) if of else None for of in counts)
+    return sent, answered
+
+
+def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
+    """Success, 0 or 1, by condition and, in each, by episode and seed."""
+
+    def one(line: Mapping[str, str]) -> tuple[str, tuple[int, int], float]:
+        return line["condition"], (int(line["episode"]), int(line["seed"])), float(line["success"] == "True")
+
+    file = run.path / "episodes.csv"
+    found: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
+    for condition, key, success in table(file, one):
+        if condition not in found:
+            raise UserError(f"{printable(file)} has another condition than its run; make the run again")
+        found[condition][key] = success
+    return found
+
+
+def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Estimate | None]]:
+    """What each run is against the best, paired by episode; nothing where there is only one."""
+    known = [n for n, of in enumerate(ended) if of]
+    if len(known) < 2:
+        return [("", None)] * len(ended)
+    best = max(known, key=lambda n: np.mean(list((ended[n] or {}).values())))
+    found: list[tuple[str, Estimate | None]] = []
+    for n, of in enumerate(ended):
+        if n == best:
+            found.append((BEST, None))
+        else:
+            found.append(_against(of or {}, ended[best] or {}))
+    return found
+
+
+def _against(
+    one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]
+) -> tuple[str, Estimate | None]:
+    both = sorted(one.keys() & best.keys())
+    episodes, seeds = ({key[place] for key in both} for place in (0, 1))
+    if len(episodes) < 2 or len(both) != len(episodes) * len(seeds):
+        return "", None
+    a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) for of in (one, best))
+    return (CLOSE if _undecided(a, b) else WORSE), paired_difference(a, b)
+
+
+def _undecided(a: Floats, b: Floats) -> bool:
+    test = success_test(b, a)
+    if test is None:
+        return True
+    if test.p_value is not None:
+        return test.p_value > P_VALUE
+    return test.low is None or test.high is None or test.low <= 0.0 <= test.high
+
+
+def headline(found: Sequence[Line]) -> str:
+    """What came out of several runs: under each condition the best, and which cannot be told from it."""
+    told = []
+    for line in found:
+        success = line.scores[SUCCESS]
+        if line.mark == BEST and success:
+            close = [o.name for o in found if o.condition == line.condition and o.mark == CLOSE]
+            rest = f", not told apart from {', '.join(close)}" if close else ""
+            told.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
+    return (
+        f"Best under {'; '.join(told)}."
+        if told
+        else "The runs share no episodes, so none is called the best."
+    )

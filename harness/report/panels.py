@@ -1,0 +1,130 @@
+"""Which charts a report has, in what part of it, and what is to be read from each."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from harness.drivers import DRIVERS
+from harness.frozen import driver_choices, judge_choices, table
+from harness.report import charts, statistics
+from harness.report.runs import Runs
+from harness.run.folder import Run
+
+Part = Literal["overview", "answers", "communication"]
+BUDGET = (200, 400)  # tokens of a prompt: the paper's
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart of the page.
+
+    Attributes:
+        id: its name in the page, and of the files it is saved as.
+        part: of the page.
+        title: what is drawn over what.
+        caption: how to read it, and what it is conditional on.
+        spec: Vega-Lite.
+    """
+
+    id: str
+    part: Part
+    title: str
+    caption: str
+    spec: dict[str, Any]
+
+
+def panels(runs: Runs) -> Iterator[Panel]:
+    """The charts of which there is anything to draw."""
+
+    def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
+        return [
+            {"run": name, **row} for name, run in zip(runs.names, runs.runs, strict=True) for row in of(run)
+        ]
+
+    laid = {run.path: statistics.decisions(run) for run in runs.runs}
+    points = [c for run in runs.runs for c in run.config["conditions"] if c.get("profile")]
+    tau_nats = sorted({c["tau_nats"] for c in points})
+    windows_ms = sorted({c["window_s"] * 1000 for c in points})
+
+    if rows := joined(statistics.success):
+        references = _references(runs)
+        yield Panel(
+            "success-latency", "overview", "Success and latency",
+            "Lines through a point are 95 % intervals, over episodes where the summary has one. Shaded: the "
+            "paper's reaction window in an urban intersection." + (
+                " Dashed: reference drivers that need no model, on the same scenes, at no latency."
+                if references else ""
+            ),
+            charts.success_latency(rows, references),
+        )  # fmt: skip
+    if rows := joined(statistics.statuses):
+        yield Panel(
+            "statuses", "answers", "How answers were read",
+            "Share of the answers of a role. Strict needed no mending, recovered was read after repairs, "
+            "the others gave no distribution.",
+            charts.statuses(rows),
+        )  # fmt: skip
+    if rows := joined(lambda run: statistics.reliability(run, laid[run.path])):
+        yield Panel(
+            "reliability", "answers", "Is the policy as safe as it is sure?",
+            "Each point is the decisions whose fused probability of the action taken lies in one tenth: "
+            "how often that action was safe. On the dashed line the two agree; above it the policy is too"
+            " modest. A probability spread over two safe actions is no mistake, so this is not the "
+            "calibration of one label. All seeds; decisions without a safe action are left out; intervals"
+            " are over episodes.",
+            charts.reliability(rows),
+        )  # fmt: skip
+    if rows := joined(statistics.entropies):
+        yield Panel(
+            "entropy", "answers", "Entropy of the ego's own answers",
+            "One count an answer that could be read. Dashed: τ, above which the ego asks for help.",
+            charts.entropies(rows, tau_nats, statistics.ENTROPY_NATS),
+        )  # fmt: skip
+    if rows := joined(lambda run: statistics.errors(run, laid[run.path])):
+        yield Panel(
+            "entropy-error", "answers", "Entropy against error",
+            "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
+            "fusion. If entropy tells when the ego errs, the condition without V2V rises to the right; "
+            "what the others have less is what helpers mend. All seeds; intervals are over episodes.",
+            charts.errors(rows, tau_nats),
+        )  # fmt: skip
+    if rows := joined(statistics.tokens):
+        yield Panel(
+            "tokens", "answers", "Length of prompts",
+            "Tokens as the engine counted them. Shaded: the paper's budget of 200 to 400.",
+            charts.tokens(rows, BUDGET, statistics.TOKENS),
+        )  # fmt: skip
+    if rows := joined(statistics.replies):
+        yield Panel(
+            "replies", "communication", "What became of replies",
+            "Replies that were scheduled, all seeds. On time: fused. Late: arrived after the decision "
+            "window. Lost: request or reply did not cross.",
+            charts.replies(rows),
+        )  # fmt: skip
+    if rows := joined(statistics.arrivals):
+        yield Panel(
+            "arrivals", "communication", "When replies arrive",
+            "Replies that were not lost, all seeds. Dashed: the end of the decision window.",
+            charts.arrivals(rows, windows_ms, statistics.ARRIVAL_MS),
+        )  # fmt: skip
+
+
+def _references(runs: Runs) -> dict[str, float]:
+    """Success of the reference drivers: on frozen scenes by the rule, live where a run was driven by one."""
+    if runs.dataset is None:
+        found = {
+            run.config["model"]["name"]: run
+            for run in runs.runs
+            if run.config["model"].get("engine") == "driver"
+        }
+        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in found.items()}
+        return {name: score.value for name, score in scores.items() if score and score.value is not None}
+    episodes = {row["episode"] for run in runs.runs for row in run.rows}
+    driven = replace(
+        runs.dataset, scenes=tuple(s for s in runs.dataset.scenes if s.record["episode"] in episodes)
+    )
+    laid = table(driven)
+    return {
+        driver: float(judge_choices(laid, driver_choices(driven, driver)).success.mean())
+        for driver in DRIVERS
+    }

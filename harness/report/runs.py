@@ -1,0 +1,103 @@
+"""The runs that one report holds side by side."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.dataset.load import Dataset
+from harness.drive.folder import LIVE, Driven, driven
+from harness.errors import UserError, printable
+from harness.run.folder import FROZEN, Row, Run, dataset_of, read
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Finished runs on the same scenes, all frozen or all live.
+
+    Attributes:
+        runs: in the order given.
+        names: what to call each: model, prompt and, where that is no name yet, more. No two are the same.
+        dataset: where the scenes of frozen runs are from; None for live runs.
+    """
+
+    runs: tuple[Run, ...]
+    names: tuple[str, ...]
+    dataset: Dataset | None
+
+    @property
+    def live(self) -> bool:
+        """Whether they were driven live."""
+        return self.dataset is None
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the order of every distribution."""
+        return tuple(self.runs[0].config["actions"])
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of all operating points."""
+        return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
+
+
+def gather(paths: Sequence[Path]) -> Runs:
+    """Read runs to be reported together.
+
+    Raises:
+        UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
+    """
+    found = []
+    for path in dict.fromkeys(paths):
+        run = read(path, FROZEN, LIVE)
+        found.append(driven(run) if run.config["format"] == LIVE.format else run)
+    first, *others = found
+    for other in others:
+        one, two = _scenes(first), _scenes(other)
+        if one != two:
+            raise UserError(
+                f"{printable(first.path)} and {printable(other.path)} are not of the same scenes "
+                f"({_shown(first)} and {_shown(other)}); report them apart"
+            )
+    dataset = None if isinstance(first, Driven) else dataset_of(first)
+    return Runs(tuple(found), _names(found), dataset)
+
+
+def answers_of(row: Row) -> dict[str, Row]:
+    """All answers of a row: by viewer, and the ego's second ones by whose messages they had."""
+    return {**row["answers"], **row.get("merged", {})}
+
+
+def _scenes(run: Run) -> Any:
+    """What pins a run's scenes."""
+    if isinstance(run, Driven):
+        return [run.config["actions"], run.config["scenario"], run.config["first_seed"]]
+    return [run.config["actions"], run.config["dataset"]["sha256"]]
+
+
+def _shown(run: Run) -> str:
+    if isinstance(run, Driven):
+        return f"driven live from layout seed {printable(run.config['first_seed'], 20)}"
+    return f"{printable(run.source, 40)} {printable(run.config['dataset']['sha256'], 12)}"
+
+
+def _names(runs: Sequence[Run]) -> tuple[str, ...]:
+    parts = [
+        (
+            str(run.config["model"].get("name")),
+            str(run.config["prompt"]["version"]),
+            run.answer,
+            run.path.name,
+        )
+        for run in runs
+    ]
+    for many in (2, 3, 4):
+        names = [" · ".join(part[:many]) for part in parts]
+        if len(set(names)) == len(names):
+            return tuple(names)
+    count: Counter[str] = Counter()
+    for n, name in enumerate(names):
+        count[name] += 1
+        names[n] += f" ({count[name]})" if names.count(name) > 1 or count[name] > 1 else ""
+    return tuple(names)

@@ -1,0 +1,64 @@
+// Charts by Vega-Lite. Its library is unpacked only when the first chart is wanted, after the page can be read.
+
+let library;
+function vega() {
+  library ??= unpacked("vega").then((code) => {
+    // The page's policy lets exactly this text run.
+    const script = document.createElement("script");
+    script.textContent = code;
+    document.head.append(script);
+    return window.vegaEmbed;
+  });
+  return library;
+}
+
+const LOOK = {
+  background: null,
+  font: "system-ui, 'DejaVu Sans', sans-serif",
+  view: { stroke: null },
+  axis: {
+    labelColor: "currentColor", titleColor: "currentColor", domainColor: "currentColor", tickColor: "currentColor",
+    gridColor: "currentColor", gridOpacity: 0.14, titleFontWeight: "normal", labelFontSize: 11, titleFontSize: 11.5,
+  },
+  legend: { labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220, symbolLimit: 40 },
+};
+
+async function chart(place, name, spec, values = {}) {
+  const embed = await vega();
+  const found = await embed(place, spec, {
+    ast: true, // expressions are interpreted: the page's policy forbids to compile them
+    renderer: "svg",
+    config: { ...LOOK, legend: { ...LOOK.legend, columns: place.clientWidth < 520 ? 2 : 4 } },
+    actions: { export: { svg: true, png: true }, source: false, compiled: false, editor: false },
+    downloadFileName: name,
+    tooltip: { disableDefaultStyle: true },
+    defaultStyle: false,
+    scaleFactor: { png: 2 },
+    patch: (compiled) => {
+      for (const data of compiled.data) if (data.name in values) data.values = values[data.name];
+      return compiled;
+    },
+  });
+  return found.view;
+}
+
+function tableOf(spec) {
+  const rows = spec.data.values;
+  const names = Object.keys(rows[0] ?? {}).filter((name) => name !== "order");
+  return [names, ...rows.map((row) => names.map((name) => row[name]))];
+}
+
+async function drawAll(specs) {
+  for (const place of document.querySelectorAll("[data-chart]")) {
+    const name = place.dataset.chart, spec = specs[name];
+    try {
+      await chart(place, name, spec);
+    } catch (error) {
+      place.replaceChildren(h("p", { class: "bad" }, `This chart cannot be drawn: ${error.message}`));
+    }
+    const button = h("button", { type: "button", class: "small", onclick: () => copy(button, csvOf(tableOf(spec))) }, "Copy as CSV");
+    (place.querySelector(".vega-actions") ?? place).append(button);
+    await new Promise((done) => setTimeout(done)); // the page answers between two charts
+  }
+  document.body.dataset.drawn = "true";
+}
