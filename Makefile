@@ -7,13 +7,17 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
 
-.PHONY: eval test check bench clean
+.PHONY: eval test check browser bench clean
 
 eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
 
-test: check ## every check and every test
+test: check browser ## every check and every test
 	$(BIN)/python -m pytest -n 2
+
+browser: ## the browser that tests open pages in, where it can be installed
+	@command -v chromium >/dev/null || ! command -v apt-get >/dev/null || (apt-get update --quiet=2 && \
+		apt-get install --quiet=2 --yes --no-install-recommends chromium fonts-dejavu-core >/dev/null)
 
 check: .venv/dev
 	$(BIN)/ruff check .

@@ -20,9 +20,19 @@ VERDICTS = {
     "failed": [VERMILLION, ORANGE, PURPLE, "#8C510A", "#F0E442", "#B2A1C7", "#999999"],
 }
 REPLIES = {"on time": BLUE, "late": ORANGE, "lost": VERMILLION}
+# Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
+TAKEN = {
+    "__proto__", "constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable", "toLocaleString",
+    "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
+}  # fmt: skip
 RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
 INTERVAL: Spec = {"type": "rule", "strokeWidth": 1.4}
 RUN = "run"  # name of the parameter that chooses one of several runs
+
+
+def named(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row in which no text is one that Vega stumbles over; what is added is not to be seen."""
+    return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
 
 
 def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:

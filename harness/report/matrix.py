@@ -84,23 +84,20 @@ def lines(runs: Runs) -> list[Line]:
 
 
 def grids(found: Sequence[Line]) -> list[Grid]:
-    """The lines as a table a condition."""
+    """The lines as a table a condition, with the models and prompts that were run under it."""
     modes = {line.answer for line in found}
-
-    def asked(line: Line) -> str:
-        return line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
-
-    prompts, models = (tuple(dict.fromkeys(map(of, found))) for of in (asked, lambda line: line.model))
-    return [
-        Grid(condition, prompts, tuple(
-            (model, tuple(
-                tuple(x for x in found if (x.condition, x.model, asked(x)) == (condition, model, prompt))
-                for prompt in prompts
-            ))
-            for model in models
-        ))
-        for condition in dict.fromkeys(line.condition for line in found)
-    ]  # fmt: skip
+    tables: dict[str, dict[tuple[str, str], list[Line]]] = {}
+    for line in found:
+        asked = line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
+        tables.setdefault(line.condition, {}).setdefault((line.model, asked), []).append(line)
+    grids = []
+    for condition, cells in tables.items():
+        models, prompts = (tuple(dict.fromkeys(key[place] for key in cells)) for place in (0, 1))
+        rows = tuple(
+            (model, tuple(tuple(cells.get((model, prompt), ())) for prompt in prompts)) for model in models
+        )
+        grids.append(Grid(condition, prompts, rows))
+    return grids
 
 
 def _score(run: Run, condition: str, metric: str) -> Score | None:

@@ -38,7 +38,9 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
     def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
         return [
-            {"run": name, **row} for name, run in zip(runs.names, runs.runs, strict=True) for row in of(run)
+            charts.named({"run": name, **row})
+            for name, run in zip(runs.names, runs.runs, strict=True)
+            for row in of(run)
         ]
 
     laid = {run.path: statistics.decisions(run) for run in runs.runs}

@@ -20,7 +20,8 @@ const LOOK = {
     labelColor: "currentColor", titleColor: "currentColor", domainColor: "currentColor", tickColor: "currentColor",
     gridColor: "currentColor", gridOpacity: 0.14, titleFontWeight: "normal", labelFontSize: 11, titleFontSize: 11.5,
   },
-  legend: { labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220, symbolLimit: 40 },
+  legend: { labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220, symbolLimit: 0,
+    symbolBaseFillColor: "currentColor", symbolBaseStrokeColor: "currentColor" },
 };
 
 async function chart(place, name, spec, values = {}) {

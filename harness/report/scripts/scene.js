@@ -32,7 +32,7 @@ function birdsEye(world, ground, viewer, messages, half) {
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
   const seen = new Set([viewer, ...sees.seen]);
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
-  const size = half / 26, within = (v) => Math.abs(v.x) < half - 1 && Math.abs(v.y) < half - 1;
+  const size = half / 23, within = (v) => Math.abs(v.x) < half - 1 && Math.abs(v.y) < half - 1;
   const hidden = world.vehicles.filter((v) => !seen.has(v.id)).map((v) => v.id);
   const told = `${viewer} (${sees.role}) sees ${sees.seen.join(", ") || "nobody"}; hidden: ${hidden.join(", ") || "nobody"}; `
     + `occluded sectors: ${sees.occluded.join(", ") || "none"}`;

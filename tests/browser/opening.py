@@ -1,0 +1,21 @@
+"""Pages in a browser: when they are drawn, and what they look like."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PICTURES = ROOT / "test-pictures"  # for people to look at; nothing compares them
+WIDE, NARROW = {"width": 1440, "height": 1000}, {"width": 390, "height": 844}
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+
+
+def wait(page):
+    """Until what the address asks for is drawn."""
+    page.wait_for_selector("body[data-ready]", state="attached")
+    one = page.evaluate("new URLSearchParams(location.hash.slice(1)).has('scene')")
+    page.wait_for_selector("#decision[data-drawn]" if one else "body[data-drawn]", state="attached")
+
+
+def picture(page, name):
+    """Keep what the page looks like."""
+    PICTURES.mkdir(exist_ok=True)
+    page.screenshot(path=PICTURES / f"{name}.png", full_page=True)

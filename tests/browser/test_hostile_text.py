@@ -1,0 +1,134 @@
+"""Hostile text in every place that a model, a prompt, a file or its name can write to: nothing of it runs.
+
+Each payload stands alone in every field: one report is of as many runs as there are payloads, another of one
+run under as many conditions; in answers they come in turn.
+"""
+
+import csv
+import itertools
+import json
+
+import pytest
+from opening import wait
+from reading import Page, details, packed
+from sample_hostile import PAYLOADS, hostile
+
+from harness.report.page import render, visible
+from harness.report.runs import gather
+
+WRITTEN = """
+  html head meta title style body nav a button noscript main section h1 h2 h3 p strong code span small br
+  table thead tbody tr th td details summary div figure figcaption pre script
+"""
+WATCH = """
+window.ran = [];
+for (const name of ["alert", "confirm", "prompt", "open"])
+  window[name] = (...words) => { window.ran.push([name, words]); };
+addEventListener("securitypolicyviolation", (e) => window.ran.push([e.violatedDirective, e.sample]), true);
+"""
+# Elements that the report never makes, and attributes that run.
+FOREIGN = """
+  [...document.querySelectorAll("*")].filter((element) =>
+    /^(iframe|object|embed|base|marquee|video|audio|img|link|math|template|animate)$/i.test(element.tagName)
+    || [...element.attributes].some(({ name, value }) => /^on/i.test(name)
+      || /^(href|src|xlink:href|action|formaction)$/i.test(name) && !/^(#|blob:|data:image)/.test(value)))
+  .map((element) => element.outerHTML.slice(0, 200))
+"""
+GO = """(where) => {
+  delete document.getElementById("decision").dataset.drawn;
+  location.hash = new URLSearchParams(where);
+}"""
+TOUCH = """(where) => {
+  for (const found of document.querySelectorAll(`${where} details`)) found.open = true;
+  for (const found of document.querySelectorAll(`${where} :is(.chart path, .chart rect, .tag)`))
+    for (const kind of ["mouseover", "mousemove", "focus"])
+      found.dispatchEvent(new MouseEvent(kind, { bubbles: true }));
+}"""
+
+
+def test_there_are_a_hundred_payloads_and_each_is_another():
+    assert len(set(PAYLOADS)) == len(PAYLOADS) >= 100
+
+
+@pytest.fixture(scope="module", params=["many runs", "many conditions"])
+def attacked(request, small_path, tmp_path_factory):
+    """The report and its text."""
+    base = tmp_path_factory.mktemp("hostile")
+    if request.param == "many runs":
+        folders = [hostile(base / str(n), small_path, n) for n in range(len(PAYLOADS))]
+    else:
+        folders = [hostile(base / "0", small_path, 0, PAYLOADS)]
+
+    def prompts(run):
+        turn = itertools.cycle(PAYLOADS)
+        return lambda scene, viewer, heard: [{"role": next(turn), "content": next(turn)} for _ in range(2)]
+
+    text = render(gather(folders), prompts)
+    (base / "report.html").write_text(text, encoding="utf-8")
+    return base / "report.html", text
+
+
+def test_nothing_in_the_file_is_markup_that_the_report_did_not_write(attacked):
+    _, text = attacked
+    page = Page(text)
+    assert page.tags.keys() <= set(WRITTEN.split())
+    assert page.tags["script"] == text.count('<script type="application/gzip" id="') + 1
+    assert not any(name.startswith("on") for _, name, _ in page.attributes)
+    assert all(href.startswith("#") for href in page.values("href"))
+
+
+def test_every_payload_is_shown_as_the_text_it_is(attacked):
+    _, text = attacked
+    shown = Page(text).text
+    assert all(" ".join(visible(payload).split()) in shown for payload in PAYLOADS)
+    answers = [a for d in details(text).values() for run in d["runs"] if run for a in run["answers"]]
+    for field in ("raw", "detail", "error", "status", "finish_reason"):
+        said = {a[field] for a in answers}
+        assert said <= set(PAYLOADS)
+        assert len(said) == (len(PAYLOADS) if len(gathered(text)) > 1 else len(answers))
+
+
+def gathered(text):
+    return json.loads(packed(text, "index"))["runs"]
+
+
+@pytest.mark.slow
+def test_nothing_runs_in_the_overview_nor_in_any_decision(browser, attacked):
+    file, text = attacked
+    context = browser.new_context(offline=True)
+    context.add_init_script(WATCH)
+    page, heard = context.new_page(), []
+    page.on("dialog", lambda dialog: (heard.append(dialog.message), dialog.dismiss()))
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    page.on("console", lambda message: heard.append(message.text))
+    page.on("framenavigated", lambda frame: heard.append(frame.url) if frame.parent_frame else None)
+    page.goto(f"file://{file}")
+    wait(page)
+    page.evaluate(TOUCH, "#report")
+    foreign = page.evaluate(FOREIGN)
+    scenes, runs = list(details(text)), len(gathered(text))
+    for n in range(0, len(PAYLOADS), 1 if runs > 1 else 12):
+        where = {
+            "scene": scenes[n % len(scenes)],
+            "run": str(n % runs),
+            "condition": PAYLOADS[n % len(PAYLOADS)],
+        }
+        page.evaluate(GO, where)
+        page.wait_for_selector("#decision[data-drawn]")
+        page.evaluate(TOUCH, "#decision")
+        foreign += page.evaluate(FOREIGN)
+    ran = page.evaluate("window.ran")
+    context.close()
+    assert (ran, foreign, heard) == ([], [], [])
+
+
+def test_a_copied_cell_is_no_formula_in_a_spreadsheet(opened, attacked):
+    file, text = attacked
+    if len(gathered(text)) == 1:
+        pytest.skip("the table is of several runs")
+    page = opened(file)
+    page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
+    page.locator("#matrix > div.scroll + button").click()
+    cells = [cell for row in csv.reader(page.evaluate("window.copied").splitlines()) for cell in row]
+    assert any("cmd|" in cell for cell in cells)
+    assert not any(cell.startswith(("=", "@", "+c", "-2+")) for cell in cells)

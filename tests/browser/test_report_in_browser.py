@@ -1,0 +1,239 @@
+"""The report as it is used: opened from disk, filtered, followed, sorted, saved and printed."""
+
+import json
+import re
+import sys
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from opening import NARROW, picture, wait
+from playwright.sync_api import expect
+from reading import packed
+
+from harness import cli
+
+RUNS = (("proxy", "v1"), ("proxy", "v2"), ("proxy-faulty", "v2"), ("local-view", "v2"))
+
+
+def typed(*words):
+    """The command as typed."""
+    sys.argv = ["harness", *map(str, words)]
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert not ended.value.code
+
+
+@pytest.fixture(scope="session")
+def report(small_path, tmp_path_factory):
+    """Two models, two prompts and two more, under three conditions."""
+    base = tmp_path_factory.mktemp("browser")
+    folders = []
+    for model, prompt in RUNS:
+        folders.append(base / f"{model}-{prompt}")
+        typed(
+            "eval", "--model", model, "--prompt", prompt, "--dataset", small_path, "--out", folders[-1],
+            "--seeds", "0:2", "--latency", "paper", "--quiet",
+        )  # fmt: skip
+    typed("report", *folders, "--out", base / "report.html")
+    return base / "report.html"
+
+
+@pytest.fixture(scope="session")
+def index(report):
+    return json.loads(packed(report.read_text(), "index"))
+
+
+def count(page):
+    return int(re.match(r"\d+", page.locator("#list > p[aria-live]").inner_text())[0])
+
+
+def choose(page, name, value):
+    page.locator(f"#list select[name={name}]").select_option(value)
+
+
+def test_it_opens_from_disk_with_every_chart_drawn(opened, report):
+    page = opened(report)
+    assert "SwarmDrive Harness report" in page.title()
+    charts = page.locator("[data-chart]")
+    assert charts.count() >= 7
+    for n in range(charts.count()):
+        assert charts.nth(n).locator("svg").count() == 1, charts.nth(n).get_attribute("data-chart")
+    assert page.get_by_text("cannot be drawn").count() == 0
+    picture(page, "report-1440")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, scheme):
+    page = opened(report, size=NARROW, scheme=scheme)
+    assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    picture(page, f"report-390-{scheme}")
+    page = opened(report, f"#scene={index['scenes'][2][0]}", NARROW, scheme)
+    assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    picture(page, f"decision-390-{scheme}")
+
+
+def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, index):
+    page = opened(report)
+    assert count(page) == len(index["scenes"])
+    sectors = [danger for *_, danger in index["scenes"]]
+    for sector in set(sectors):
+        choose(page, "danger", sector or "none")
+        assert count(page) == sectors.count(sector)
+    page.get_by_role("button", name="Clear").click()
+    choose(page, "run", "2")
+    masks = index["runs"][2]["statuses"]
+    [*failed] = (k for k, s in enumerate(index["statuses"]) if k > 1 and any(mask >> k & 1 for mask in masks))
+    assert failed
+    for k in failed:
+        choose(page, "status", index["statuses"][k])
+        assert count(page) == sum(mask >> k & 1 for mask in masks)
+    page.get_by_role("button", name="Clear").click()
+    wait(page)
+    choose(page, "condition", "single-local")
+    choose(page, "outcome", "u")
+    run = index["runs"][0]
+    every = len(run["conditions"]) * len(run["seeds"])
+    assert count(page) == sum(run["ended"][n * every] == "u" for n in range(len(index["scenes"])))
+    # The address has the filters: whoever is sent it sees the same list.
+    again = opened(report, page.evaluate("location.hash"))
+    assert count(again) == count(page)
+
+
+def test_runs_that_disagree_are_found(opened, report, index):
+    page = opened(report)
+    choose(page, "differ", "runs")
+    runs = index["runs"]
+    every = len(runs[0]["conditions"]) * len(runs[0]["seeds"])
+    places = [k * len(runs[0]["seeds"]) for k in range(len(runs[0]["conditions"]))]
+    disagree = sum(
+        any(len({run["acted"][n * every + place] for run in runs}) > 1 for place in places)
+        for n in range(len(index["scenes"]))
+    )
+    assert 0 < count(page) == disagree
+
+
+def test_a_text_is_searched_in_names_at_once_and_in_answers_on_enter(opened, report, index):
+    page = opened(report)
+    search = page.locator("input[name=q]")
+    search.fill(index["scenes"][3][0])
+    assert count(page) == 1
+    search.fill("I am sorry, I cannot")
+    assert count(page) == 0
+    search.fill("```json")
+    search.press("Enter")
+    expect(page.locator("#list > p[aria-live]")).to_have_text(re.compile(r"^[1-9]\d* of"))
+    found = count(page)
+    assert 0 < found < len(index["scenes"])
+
+
+def test_a_decision_opens_by_its_link_and_keys_lead_on(opened, report, index):
+    scene = index["scenes"][1][0]
+    page = opened(report, f"#scene={scene}&run=1&condition=v2x&viewer=v2")
+    assert scene in page.locator("#decision h1").inner_text()
+    assert not page.locator("#report").is_visible()
+    assert page.locator("svg.scene").get_attribute("aria-label").startswith("v2 (helper) sees")
+    assert page.locator("#decision .chart svg").count() == 2
+    page.locator(".answer details summary").first.click()
+    assert page.get_by_text("CONFLICTS", exact=False).first.is_visible()
+    picture(page, "decision-1440")
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#decision h1")).to_contain_text(index["scenes"][2][0])
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#report", state="visible")
+    page.go_back()
+    page.wait_for_selector("#decision", state="visible")
+
+
+def test_a_decision_opens_from_the_list_by_keyboard_alone(opened, report, index):
+    page = opened(report, "#decisions")
+    link = page.locator("#list a[data-n]").first
+    link.focus()
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#decision h1")
+    assert page.evaluate("document.activeElement.tagName") == "H1"
+    assert index["scenes"][0][0] in page.locator("#decision h1").inner_text()
+
+
+def test_a_link_to_no_decision_says_so(opened, report):
+    page = opened(report, "#scene=99999-9")
+    assert "has no decision 99999-9" in page.locator("#decision").inner_text()
+
+
+def test_what_was_read_in_a_recovered_answer_is_marked(opened, report, index):
+    odd = index["statuses"].index("recovered")
+    n = next(n for n, mask in enumerate(index["runs"][2]["statuses"]) if mask >> odd & 1)
+    page = opened(report, f"#scene={index['scenes'][n][0]}&run=2")
+    assert page.locator("mark").count() > 0
+    assert page.locator("mark").first.inner_text().lstrip().startswith("{")
+
+
+def test_the_matrix_is_sorted_by_a_click_on_a_head(opened, report):
+    page = opened(report, "#matrix")
+    table = page.locator("table.sortable")
+
+    def column():
+        cells = table.locator("tbody tr td:nth-child(3)")
+        return [float(x) for x in cells.evaluate_all("cells => cells.map(cell => cell.dataset.value)")]
+
+    before = column()
+    table.get_by_role("button", name="success").click()
+    assert column() == sorted(before, reverse=True)
+    table.get_by_role("button", name="success").click()
+    assert column() == sorted(before)
+    assert table.locator("th[aria-sort=ascending]").inner_text() == "success"
+
+
+def test_a_table_is_copied_as_csv(opened, report):
+    page = opened(report, "#matrix")
+    page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
+    page.locator("#matrix > div.scroll + button").click()
+    lines = page.evaluate("window.copied").strip().split("\r\n")
+    assert lines[0].startswith('"run","condition","success"')
+    assert len(lines) == 1 + 4 * 3
+    page.locator("#chart-replies button").click()
+    assert page.evaluate("window.copied").startswith('"run","condition","reply","count"')
+
+
+def test_figures_are_saved_as_svg_and_png(opened, report, index):
+    page = opened(report)
+    for kind, begins in (("SVG", b"<svg"), ("PNG", b"\x89PNG")):
+        with page.expect_download() as saved:
+            page.locator("#chart-success-latency").get_by_text(f"Save as {kind}").click()
+        assert saved.value.suggested_filename == f"success-latency.{kind.lower()}"
+        assert begins in saved.value.path().read_bytes()[:60]
+    page = opened(report, f"#scene={index['scenes'][0][0]}")
+    with page.expect_download() as saved:
+        page.locator(".picture button").click()
+    assert saved.value.path().read_bytes().startswith(b"<svg")
+
+
+def paper(page):
+    return page.evaluate("getComputedStyle(document.body).backgroundColor")
+
+
+def test_dark_is_the_systems_choice_or_ones_own(opened, report):
+    light, dark = opened(report), opened(report, scheme="dark")
+    assert paper(light) == "rgb(255, 255, 255)" != paper(dark)
+    light.get_by_role("button", name="Dark").click()
+    assert paper(light) == paper(dark)
+    picture(light, "report-1440-dark")
+    light.get_by_role("button", name="Light").click()
+    assert paper(light) == "rgb(255, 255, 255)"
+
+
+def test_it_prints_light_and_without_controls(opened, report):
+    page = opened(report, scheme="dark")
+    page.emulate_media(media="print", color_scheme="dark")
+    assert paper(page) == "rgb(255, 255, 255)"
+    assert not page.locator("nav").is_visible()
+    assert not page.locator("#list form").is_visible()
+    printed = page.pdf()
+    assert printed.startswith(b"%PDF")
+    assert len(printed) > 50_000
+
+
+@pytest.mark.parametrize("where", ["", "#scene"])
+def test_it_can_be_read_by_who_does_not_see_it(opened, report, index, where):
+    page = opened(report, where and f"#scene={index['scenes'][0][0]}")
+    found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa"]}).response["violations"]
+    assert [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found] == []
