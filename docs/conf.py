@@ -9,4 +9,5 @@ myst_heading_anchors = 3  # those that GitHub gives, where the pages are read as
 html_theme = "furo"
 html_title = f"{project} {release}"
 html_copy_source = False
+html_show_copyright = False
 smartquotes = False  # -- begins an option
