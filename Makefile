@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
 
-.PHONY: eval test check browser bench clean
+.PHONY: eval test check browser docs bench clean
 
 eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
@@ -25,6 +25,9 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: .venv/docs ## the documentation as a site: build/docs/index.html
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --nitpicky docs build/docs
+
 bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python benchmarks/own_time.py
@@ -40,9 +43,13 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(LLAMA_CPP) $(INSTALL) --editable '.[llama-cpp]'
 	touch $@
 
+.venv/docs: .venv/bin/python pyproject.toml requirements.lock
+	$(INSTALL) --editable '.[docs]'
+	touch $@
+
 .venv/dev: .venv/bin/python pyproject.toml requirements.lock
 	$(LLAMA_CPP) $(INSTALL) --editable '.[transformers,llama-cpp,dev]'
-	touch $@ .venv/base
+	touch $@ .venv/base .venv/docs
 
 clean:
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

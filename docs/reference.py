@@ -1,0 +1,83 @@
+"""Writes docs/commands.md out of the program: `python docs/reference.py`. A test holds the page to it.
+
+Examples are not written here: each is a command of another page, which the tests run.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from typer import Context
+from typer.main import get_command
+
+from harness.cli import app
+
+DOCS = Path(__file__).parent
+PAGE = DOCS / "commands.md"
+HEAD = """\
+# Commands
+
+Written by `python docs/reference.py` out of the program, which says the same with `--help`. Bad input is one
+line on stderr and exit code 2.
+"""
+
+
+def pages() -> list[Path]:
+    """The documents whose commands are run, in the order in which examples are looked for."""
+    return [DOCS.parent / "README.md", *sorted(page for page in DOCS.rglob("*.md") if page != PAGE)]
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """A page's blocks of `console` and `python`, each with its language, in order."""
+    return re.findall(r"^```(console|python)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def typed(block: str) -> list[tuple[str, str]]:
+    """What a console block has a reader type, each with what it shows below; a backslash joins two lines."""
+    lines = re.split(r"^\$ ", block.replace("\\\n", ""), flags=re.MULTILINE)[1:]
+    return [(line, shown) for line, _, shown in (each.partition("\n") for each in lines)]
+
+
+def all_typed() -> list[str]:
+    """What the documents have a reader type, line by line."""
+    found = [block for page in pages() for language, block in blocks(page) if language == "console"]
+    return [line for block in found for line, _ in typed(block)]
+
+
+def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """All commands that do something, each with what is typed for it."""
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        yield path, command
+    for name, each in (inner or {}).items():
+        yield from commands(each, f"{path} {name}")
+
+
+def section(path: str, command: Any, example: str) -> str:
+    """A command's purpose, arguments, options with their defaults, and an example."""
+    context = Context(command)
+    usage = " ".join([path, *command.collect_usage_pieces(context)])
+    lines = [f"## {path}", "", command.help, "", "```text", usage, "```", ""]
+    records = [parameter.get_help_record(context) for parameter in command.get_params(context)]
+    rows = [f"| `{name}` | {_cell(text)} |" for name, text in filter(None, records) if name != "--help"]
+    if rows:
+        lines += ["| argument or option | meaning |", "|---|---|", *rows, ""]
+    return "\n".join([*lines, "```console", f"$ {example}", "```", ""])
+
+
+def reference() -> str:
+    """The page."""
+    lines = [" ".join(line.partition(" #")[0].split()) for line in all_typed()]
+    found = list(commands(get_command(app), "harness"))
+    # A command without an example ends this here: the documents have to show each of them.
+    examples = {path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found}
+    return "\n".join([HEAD, *(section(path, command, examples[path]) for path, command in found)])
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"([<>|*\[\]])", r"\\\1", " ".join(text.split()))
+
+
+if __name__ == "__main__":
+    PAGE.write_text(reference())

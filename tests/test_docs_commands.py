@@ -1,0 +1,150 @@
+"""Every command and every piece of Python in the documents is run.
+
+A page is a story, from top to bottom in one folder. A command that is neither run nor excused by name fails
+its page.
+"""
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from reference import PAGE, all_typed, blocks, commands, pages, reference, typed
+from typer.main import get_command
+
+from harness.cli import app
+
+ROOT = Path(__file__).parent.parent
+COMMANDS = dict(commands(get_command(app), "harness"))
+
+# What a reader is taken to have: the model that ships stands for his own.
+READER_HAS = {
+    "my-checkpoint": ROOT / "models/swarm-tiny",
+    "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
+}
+
+# Added to what is typed, where it would take minutes; of an option given twice the last one counts.
+CUT = {
+    "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
+    "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
+    "harness campaign paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
+    "harness campaign closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
+    "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
+    "harness scenario check": "--episodes 2 --workers 1",  # of 100 and of 500
+    "harness distill": "--samples 16,16,16,16",  # of 226 000 sequences
+    "harness parity": "--prompts 1",  # of 64, on two engines
+}
+
+# Ends otherwise than its page shows, since what it reads was cut.
+CUT_ENDS = {
+    # Two episodes pass the gates that 240 fail.
+    "harness compare reports/v1 reports/v2"
+    " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0
+}
+
+# Held against the program's options, and not run.
+NOT_RUN = {
+    "harness model pull qwen3-4b": "fetches weights from a hub",
+    "harness model check qwen3-4b": "needs those weights",
+    "harness eval --model qwen3-4b": "needs those weights",
+    "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
+    "harness dataset rank occluded-intersection-v1 --json": "long; docs/datasets.md ranks a small one",
+}
+OTHER_PROGRAMS = {
+    "make": "CI runs it",
+    "source": "the tests are in an environment already",
+    "pip": "as above",
+}
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def parsed(args: list[str]) -> tuple[str, list[str]]:
+    """The command that is meant, and what stands behind it. Fails if there is no such command."""
+    for words in (2, 1):
+        path = " ".join(["harness", *args[:words]])
+        if path in COMMANDS:
+            return path, args[words:]
+    return pytest.fail(f"no such command: harness {shlex.join(args)}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in pages() if blocks(page)], ids=name)
+def test_a_page_can_be_followed(
+    page: Path, harness: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file, stands_for in READER_HAS.items():
+        (tmp_path / file).symlink_to(stands_for)
+    known: dict[str, Any] = {}
+    for language, block in blocks(page):
+        if language == "python":
+            exec(compile(block, page.name, "exec"), known)
+            continue
+        lines = typed(block)
+        for (line, _), (then, shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
+            program, *args = shlex.split(line, comments=True)
+            command = shlex.join([program, *args])
+            if program == "cd":
+                monkeypatch.chdir(args[0])
+            elif command in NOT_RUN:
+                path, rest = parsed(args)
+                COMMANDS[path].make_context(path, rest)
+            elif program == "harness":
+                path, _ = parsed(args)
+                code, _, err = harness(*args, *CUT.get(path, "").split())
+                # A page that shows `echo $?` says how the line before it ends.
+                says = int(shown.split()[0]) if then == "echo $?" else 0
+                assert code == CUT_ENDS.get(command, says), f"{line}\n{err}"
+            elif program in ("cp", "echo"):
+                subprocess.run(line, shell=True, check=True)
+            else:
+                assert program in OTHER_PROGRAMS, line
+
+
+def test_what_is_excused_is_still_in_the_documents() -> None:
+    lines = {shlex.join(shlex.split(line, comments=True)) for line in all_typed()}
+    assert {*NOT_RUN, *CUT_ENDS} <= lines
+    assert set(OTHER_PROGRAMS) <= {line.split()[0] for line in lines}
+    assert set(CUT) <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("page", pages(), ids=name)
+def test_commands_named_in_a_sentence_exist_with_their_options(page: Path) -> None:
+    prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for mention in re.findall(r"`harness\s+([a-z][^`]*)`", prose):
+        group, *rest = mention.replace("\\|", "|").split()
+        # `dataset build|check` are two commands.
+        each = [[group, one, *rest[1:]] for one in rest[0].split("|")] if rest else [[group]]
+        for path, words in map(parsed, each):
+            options = {option for parameter in COMMANDS[path].params for option in parameter.opts}
+            assert {word for word in words if word.startswith("--")} <= options, mention
+
+
+def test_the_reference_is_the_program() -> None:
+    assert PAGE.read_text() == reference(), "run `python docs/reference.py`"
+
+
+def test_console_is_the_one_form_of_a_shell_block() -> None:
+    for page in pages():
+        assert not re.search(r"^```(sh|bash|shell|shell-session)", page.read_text(), re.MULTILINE), page
+
+
+@pytest.mark.slow
+def test_the_site_has_no_broken_link_and_asks_no_other_host(tmp_path: Path) -> None:
+    strict = ("--quiet", "--fail-on-warning", "--nitpicky")
+    command = [sys.executable, "-m", "sphinx", *strict, "docs", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (built.returncode, built.stderr) == (0, "")
+    loads = re.compile(
+        r"""(<(link|script|img|iframe)\b[^>]*(href|src)="|@import ?["']|url\(["']?)(https?:)?//"""
+    )
+    files = [file for file in (tmp_path / "site").rglob("*") if file.suffix in (".html", ".css")]
+    assert len(files) > len(pages())
+    for file in files:
+        assert not loads.search(file.read_text()), file

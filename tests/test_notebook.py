@@ -1,0 +1,19 @@
+"""The example notebook runs from top to bottom, as someone would who has just opened it."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOK = Path(__file__).parent.parent / "examples/run-as-tables.ipynb"
+
+
+@pytest.mark.slow
+def test_the_example_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in code)
+    code[0].source = code[0].source.replace("LIMIT = 40", "LIMIT = 4")
+    NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert [cell.outputs[0].output_type for cell in code[1:]] == ["execute_result"] * 5 + ["display_data"]
