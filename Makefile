@@ -35,6 +35,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/study.py
 	$(BIN)/python benchmarks/answer_modes.py
 	$(BIN)/python benchmarks/drive.py
+	$(BIN)/python benchmarks/report.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -1,0 +1,131 @@
+"""What a report weighs, how long it takes to write, and how long a browser takes to open it.
+
+The proxy's run on the shipped dataset; for more decisions its scenes are repeated as further episodes. A page
+is *readable* at its first contentful paint, *ready* when every decision can be filtered and opened, and *drawn*
+when the last chart is. The limit is a page of the same bytes whose script is taken out.
+
+    python benchmarks/report.py [--decisions 1440 20160] [--repeats 5]
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+from playwright.sync_api import Browser, sync_playwright
+
+from harness import cards, prompts
+from harness.dataset.load import Scene, find, load
+from harness.operating_point import POINTS
+from harness.report.page import render
+from harness.report.runs import Runs, gather
+from harness.resources import DATASET
+from harness.run.evaluate import evaluate
+from harness.run.folder import Row
+from harness.run.spec import Spec
+
+READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
+PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"
+
+
+def main() -> None:
+    """Print a table and one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--decisions", type=int, nargs="+", default=[1440, 20160])
+    arguments.add_argument("--repeats", type=int, default=5)
+    given = arguments.parse_args()
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        raise SystemExit("no chromium here; `make browser` installs it")
+    found = []
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        base = Path(folder)
+        spec = Spec(
+            cards.resolve("proxy"),
+            prompts.load("v2"),
+            load(find(DATASET)),
+            tuple(POINTS.values()),
+            tuple(range(5)),
+        )
+        evaluate(spec, base / "run", False, lambda done: None, None)
+        runs = gather([base / "run"])
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        for n in given.decisions:
+            found.append(measured(repeated(runs, n), base / f"{n}.html", browser, given.repeats))
+        browser.close()
+    names = list(found[0])
+    for name in names:
+        print(f"{name:<42}" + "".join(f"{one[name]:>12}" for one in found))
+    print(json.dumps(found))
+
+
+def repeated(runs: Runs, decisions: int) -> Runs:
+    """The same run on so many scenes: those it has, again and again as other episodes."""
+    [run], dataset = runs.runs, runs.dataset
+    assert dataset is not None
+    scenes: list[Scene] = []
+    rows: list[Row] = []
+    for turn in range(-(-decisions // len(run.rows))):
+        for row in run.rows[: decisions - len(rows)]:
+            episode = row["episode"] + turn * 10_000
+            rows.append({**row, "episode": episode, "scene": f"{episode:05d}-{row['step']}"})
+        for scene in dataset.scenes:
+            episode = scene.record["episode"] + turn * 10_000
+            named = {"episode": episode, "scene": f"{episode:05d}-{scene.record['step']}"}
+            scenes.append(Scene({**scene.record, **named}))
+    return replace(
+        runs, runs=(replace(run, rows=tuple(rows)),), dataset=replace(dataset, scenes=tuple(scenes))
+    )
+
+
+def measured(runs: Runs, out: Path, browser: Browser, repeats: int) -> dict[str, Any]:
+    """Weight and times of one report, each the median of the repeats."""
+    start = perf_counter()
+    page = render(runs)
+    written_s = perf_counter() - start
+    out.write_text(page, encoding="utf-8")
+    bare = out.with_suffix(".bare.html")
+    bare.write_text(page[: page.rindex("<script>")] + "</body></html>", encoding="utf-8")
+    last = runs.runs[0].rows[-1]["scene"]
+    opened = [times(browser, out, "body[data-drawn]") for _ in range(repeats)]
+    alone = [times(browser, out, "#decision[data-drawn]", f"#scene={last}") for _ in range(repeats)]
+    plain = [times(browser, bare, "body") for _ in range(repeats)]
+    readable, ready, drawn = (median(of) for of in zip(*opened, strict=True))
+    limit = median(of[1] for of in plain)
+    return {
+        "decisions (scenes)": len(runs.runs[0].rows),
+        "with conditions and seeds": sum(len(row["decisions"]) for row in runs.runs[0].rows),
+        "written, s": round(written_s, 1),
+        "size, MB": round(out.stat().st_size / 1e6, 1),
+        "readable, s": round(readable, 2),
+        "ready, s": round(ready, 2),
+        "every chart drawn, s": round(drawn, 2),
+        "one decision opened by its link, s": round(median(of[2] for of in alone), 2),
+        "limit: same bytes without script, s": round(limit, 2),
+        "ready / limit": round(ready / limit, 1),
+    }
+
+
+def times(browser: Browser, file: Path, drawn: str, where: str = "") -> tuple[float, float, float]:
+    """Seconds until a page is readable, ready and drawn."""
+    context = browser.new_context(offline=True)
+    page = context.new_page()
+    start = perf_counter()
+    page.goto(f"file://{file}{where}")
+    while not page.evaluate(READY):
+        pass
+    ready = perf_counter() - start
+    page.wait_for_selector(drawn, state="attached")
+    done = perf_counter() - start
+    readable = float(page.evaluate(PAINT)) / 1000
+    context.close()
+    return readable, ready, done
+
+
+if __name__ == "__main__":
+    main()
