@@ -19,6 +19,10 @@ VERDICTS = {
     "recovered": [SKY],
     "failed": [VERMILLION, ORANGE, PURPLE, "#8C510A", "#F0E442", "#B2A1C7", "#999999"],
 }
+TIMES = {
+    "inference": SKY, "reply on time": BLUE, "reply late": ORANGE, "reply lost": VERMILLION, "fusion": PURPLE,
+    "decision": GREEN,
+}  # fmt: skip
 REPLIES = {"on time": BLUE, "late": ORANGE, "lost": VERMILLION}
 # Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
 TAKEN = {
@@ -160,8 +164,8 @@ def timeline() -> Spec:
                     "field": "what",
                     "type": "nominal",
                     "scale": {
-                        "domain": ["inference", "reply on time", "reply late", "reply lost", "decision"],
-                        "range": [SKY, BLUE, ORANGE, VERMILLION, GREEN],
+                        "domain": list(TIMES),
+                        "range": list(TIMES.values()),
                     },
                     "legend": {"orient": "top", "title": None},
                 },

@@ -105,8 +105,9 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
             {
                 "model": run.config["model"].get("name"),
                 "inference_s": run.config["latency"]["inference_s"],
+                "merge_s": run.config["latency"].get("merge_s"),
                 "points": {
-                    c["name"]: {"window_s": c.get("window_s"), "tau_nats": c.get("tau_nats")}
+                    c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}
                     for c in run.config["conditions"]
                 },
             }

@@ -87,6 +87,8 @@ function policyRows(told, chosen, actions) {
   return rows;
 }
 
+const acted = (d) => (d.acts_at_s == null ? null : h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time"));
+
 function timelineRows(told, chosen, about) {
   const seconds = about.inference_s, by = (a) =>
     1000 * (a.seconds && seconds == null ? a.seconds : typeof seconds === "object" && seconds ? seconds[a.role] ?? seconds.ego ?? 0 : seconds ?? 0);
@@ -101,6 +103,9 @@ function timelineRows(told, chosen, about) {
       rows.push({ who, what: m.on_time ? "reply on time" : m.delivered ? "reply late" : "reply lost", from: Math.min(ready, to), to });
     }
   }
+  // ego-prompt infers once more when the exchange is over; a rule takes no time.
+  const point = about.points[chosen.condition], fusion = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time) ? 1000 * (about.merge_s ?? 0) : 0;
+  if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: chosen.latency_ms - fusion, to: chosen.latency_ms });
   if (chosen.latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: chosen.latency_ms });
   return rows;
 }

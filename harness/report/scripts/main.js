@@ -52,7 +52,7 @@ async function decision(params) {
     told ? table("decided", ["condition", "own entropy", "own weight", "replies", "fused", "action", "latency"], made.map((d) => [
       d.condition, `${number(d.entropy_nats, 3)}${d.triggered ? "; asked" : ""}${d.own_failed ? "; own answer failed" : ""}`, number(d.own_weight, 3),
       d.messages.length ? d.messages.map((m) => h("div", {}, `${m.from}: ${m.delivered ? `${m.arrival_ms.toFixed(1)} ms${m.on_time ? `, weight ${m.weight.toFixed(3)}` : ", too late"}` : "lost"}`)) : "none",
-      distribution(index.actions, d.fused), [d.action, " ", mark(d.end, index.live)], `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", outlasts the window" : ""}`])) : null,
+      distribution(index.actions, d.fused), [d.action, " ", mark(d.end, index.live), acted(d)], `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", outlasts the window" : ""}`])) : null,
     about.names.length > 1 ? [h("h3", {}, "The same decision in every run"), table("runs", ["run", ...new Set(index.runs.flatMap((run) => run.conditions))], about.names.map((name, r) =>
       [name, ...[...new Set(index.runs.flatMap((run) => run.conditions))].map((c) => [list.action(n, r, c, state.seed) ?? "–", " ", mark(list.letter("ended", n, r, c, state.seed), index.live)])]))] : null,
     h("div", { class: "figures" },
