@@ -7,7 +7,8 @@ from opening import FLAGS, WIDE, wait
 from playwright.sync_api import sync_playwright
 
 
-@pytest.fixture(scope="session")
+# A module's and no longer: while Playwright runs, so does its event loop, and other tests have loops of their own.
+@pytest.fixture(scope="module")
 def browser():
     chromium = shutil.which("chromium")
     if chromium is None:

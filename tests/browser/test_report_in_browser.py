@@ -202,9 +202,10 @@ def test_figures_are_saved_as_svg_and_png(opened, report, index):
         assert saved.value.suggested_filename == f"success-latency.{kind.lower()}"
         assert begins in saved.value.path().read_bytes()[:60]
     page = opened(report, f"#scene={index['scenes'][0][0]}")
-    with page.expect_download() as saved:
-        page.locator(".picture button").click()
-    assert saved.value.path().read_bytes().startswith(b"<svg")
+    for kind, begins in (("SVG", b"<svg"), ("PNG", b"\x89PNG")):
+        with page.expect_download() as saved:
+            page.locator(".picture").get_by_text(f"Save as {kind}").click()
+        assert saved.value.path().read_bytes().startswith(begins)
 
 
 def paper(page):

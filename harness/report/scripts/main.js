@@ -62,7 +62,7 @@ async function decision(params) {
     (told?.answers ?? []).map((answer) => answerSection(answer, detail, index.actions, about.meanings)));
   if (detail.world) {
     const [drawn_scene, said] = birdsEye(detail.world, about.ground, viewer, chosen?.messages ?? [], half);
-    picture.append(drawn_scene, h("p", { class: "quiet" }, `${said}. `, KEY), h("button", { type: "button", class: "small", onclick: () => saved(drawn_scene, id) }, "Save as SVG"));
+    fill(picture, {}, [drawn_scene, h("p", { class: "quiet" }, `${said}. `, KEY), ["svg", "png"].map((kind) => [h("button", { type: "button", class: "small", onclick: () => saved(drawn_scene, id, kind) }, `Save as ${kind.toUpperCase()}`), " "])]);
   } else picture.append(h("p", {}, "No picture: this moment was not played again, or playing it again here does not come to it. `harness video` draws the whole episode."));
   if (told && chosen) {
     const shares = policyRows(told, chosen, index.actions), times = timelineRows(told, chosen, of);
@@ -78,12 +78,22 @@ async function decision(params) {
 const KEY = "Blue: ego; green: helper; red with a ring: the dangerous vehicle; dashed: hidden from the viewer. Thin lines: sight. An arrow is the way in 1 s, × where paths cross. Thick lines to the ego: replies.";
 
 // The picture with its look inside, as it has to stand alone.
-function saved(picture, id) {
-  const copy = picture.cloneNode(true), looks = ["fill", "stroke", "stroke-width", "stroke-dasharray", "opacity", "font-family", "font-weight", "text-anchor", "dominant-baseline", "paint-order"];
+async function saved(picture, id, kind) {
+  const copy = picture.cloneNode(true), looks = ["fill", "stroke", "stroke-width", "stroke-dasharray", "opacity", "font-family", "font-weight", "text-anchor", "dominant-baseline", "paint-order", "vector-effect", "stroke-linejoin"];
   const from = picture.querySelectorAll("*"), to = copy.querySelectorAll("*");
   from.forEach((element, n) => to[n].setAttribute("style", looks.map((look) => `${look}:${getComputedStyle(element)[look]}`).join(";")));
   copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
-  download(`scene-${id}.svg`, new Blob([new XMLSerializer().serializeToString(copy)], { type: "image/svg+xml" }));
+  const side = 1200, paper = getComputedStyle(picture).backgroundColor;
+  copy.setAttribute("style", `background:${paper}`);
+  copy.setAttribute("width", side);
+  copy.setAttribute("height", side);
+  const text = new XMLSerializer().serializeToString(copy);
+  if (kind === "svg") return download(`scene-${id}.svg`, new Blob([text], { type: "image/svg+xml" }));
+  const image = new Image(), canvas = h("canvas", { width: side, height: side });
+  image.src = `data:image/svg+xml,${encodeURIComponent(text)}`;
+  await image.decode();
+  canvas.getContext("2d").drawImage(image, 0, 0);
+  canvas.toBlob((content) => download(`scene-${id}.png`, content));
 }
 
 async function route() {
