@@ -7,7 +7,7 @@ from opening import FLAGS, WIDE, wait
 from playwright.sync_api import sync_playwright
 
 
-# A module's and no longer: while Playwright runs, so does its event loop, and other tests have loops of their own.
+# A module's and no longer: while Playwright runs, so does its event loop, and other tests have their own.
 @pytest.fixture(scope="module")
 def browser():
     chromium = shutil.which("chromium")
