@@ -108,7 +108,7 @@ def _one(path: str, root: str) -> Listed | None:
         try:
             begun = _json(path, WORK, CONFIG)
             made = Listed("", _kind(begun["settings"]), "unfinished", _date(begun["created"]), "--resume")
-            return _described(made, {"tags": begun.get("tags", ()), **begun["settings"]})
+            return _described(made, {**begun["settings"], "tags": begun.get("tags", ())})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     for name, kind in STUDIES.items():
