@@ -14,9 +14,12 @@ are not.
 """
 
 import asyncio
+import traceback
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from threading import Thread
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -148,6 +151,7 @@ class View:
 
     def bug(self, request: Request, error: Exception) -> Response:
         """The same for a bug, of which the terminal has the traceback."""
+        traceback.print_exception(error)
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 
     def _found(self, names: Sequence[str]) -> Sequence[Listed]:
@@ -176,5 +180,16 @@ class View:
         return HTMLResponse(pages.study(one, pictures(self.folder, one.name)))
 
     async def _drawn(self, page: Callable[[], str]) -> Response:
+        made: Future[str] = Future()
+        made.set_running_or_notify_cancel()
+
+        def make() -> None:
+            try:
+                made.set_result(page())
+            except BaseException as error:
+                made.set_exception(error)
+
         async with self._drawing:
-            return HTMLResponse(await run_in_threadpool(page), headers=OF_RUNS)
+            # No pool: Ctrl-C would wait for the threads of one.
+            Thread(target=make, daemon=True).start()
+            return HTMLResponse(await asyncio.wrap_future(made), headers=OF_RUNS)

@@ -41,5 +41,5 @@ def pictures(root: Path, run: str) -> list[str]:
     return [
         name for name in names
         if Path(name).suffix in PICTURES and (name.endswith(".svg") or Path(name).stem not in scaled)
-        and own_file(root, run, name)
+        and name.isprintable() and own_file(root, run, name)
     ]  # fmt: skip

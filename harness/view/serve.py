@@ -34,7 +34,7 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
             raise UserError(f"--port {port} {what}; give another, or 0 for a free one") from None
         listening(f"http://{LOOPBACK}:{listener.getsockname()[1]}/")
         config = uvicorn.Config(
-            app(folder), log_level="warning", access_log=False, lifespan="off", ws="none",
+            app(folder), log_level="critical", access_log=False, lifespan="off", ws="none",
             proxy_headers=False, server_header=False, timeout_graceful_shutdown=1,
         )  # fmt: skip
         uvicorn.Server(config).run(sockets=[listener])

@@ -67,8 +67,7 @@ def test_the_command_serves_on_loopback_alone_until_it_is_interrupted(
         assert listeners(port) == [f"0100007F:{port:04X}"]
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (0, "")
-    assert "Traceback" not in err
+    assert (process.returncode, out, err) == (0, "", "")
 
 
 def listeners(port: int) -> list[str]:

@@ -57,6 +57,7 @@ def test_a_picture_is_one_of_the_studys_own(name: str, browser: TestClient, hidi
     (study / ".hidden.svg").write_text(SECRET)
     (study / "folder.svg").mkdir()
     os.mkfifo(study / "pipe.svg")
+    Path(os.fsdecode(os.fsencode(study) + b"/not \xff.svg")).write_text("<svg>")
     answer = browser.get("/picture", params={"path": "first/sweep-tau", "name": name})
     assert answer.status_code == 404
     assert said(answer).startswith("first/sweep-tau has no picture ")

@@ -144,10 +144,13 @@ def test_what_cannot_be_shown_is_one_readable_line(
     assert "\n" not in said(answer)
 
 
-def test_a_bug_is_a_page_too(browser: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
+    browser: TestClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(pages, "report", lambda folders: 1 / 0)
     answer = browser.get("/report?path=second")
     assert (answer.status_code, said(answer)) == (500, "this page cannot be made; the terminal says why")
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
