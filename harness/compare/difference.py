@@ -9,7 +9,8 @@ import numpy as np
 
 from harness.arrays import Floats
 from harness.compare import percentiles
-from harness.compare.pair import MEANS, Pair, Side
+from harness.compare.pair import Pair, Side
+from harness.compare.table import MEANS
 from harness.metrics import Estimate, known_mean, paired_difference
 from harness.paired import SuccessTest, success_test
 

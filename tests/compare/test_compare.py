@@ -12,7 +12,8 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 
 from harness.compare.difference import Comparison, Difference, Turned, compare
-from harness.compare.pair import LIVE_ENDS, LIVE_PER_EPISODE, METRICS, pair
+from harness.compare.pair import pair
+from harness.compare.table import LIVE_ENDS, LIVE_PER_EPISODE, METRICS
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.errors import UserError
