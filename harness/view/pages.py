@@ -9,12 +9,9 @@ from urllib.parse import urlencode
 from harness.compare import page as comparison
 from harness.compare.difference import compare
 from harness.compare.pair import pair
-from harness.drive.folder import LIVE, driven
-from harness.errors import UserError
 from harness.listing import Listed, runs
-from harness.report.decisions import prompts_of
 from harness.report.page import environment, render
-from harness.run.folder import FROZEN, read
+from harness.report.runs import gather
 
 RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
@@ -31,12 +28,8 @@ COLUMNS: dict[str, Callable[[Listed], Any]] = {
 
 
 def report(folders: Sequence[Path]) -> str:
-    """The report of one run or several: the seam to `harness/report/page.py`."""
-    if len(folders) > 1:
-        raise UserError(f"{len(folders)} runs are picked; a report is of one; pick one, or two to compare")
-    found = read(folders[0], FROZEN, LIVE)
-    found = driven(found) if found.config["format"] == LIVE.format else found
-    return render(found, prompts_of(found), lambda done: None)
+    """The report of one run or several."""
+    return render(gather(folders))
 
 
 def compared(a: Path, b: Path) -> str:

@@ -10,6 +10,7 @@ from viewing import SECRET, configure
 from harness.dataset.load import Dataset
 from harness.operating_point import POINTS
 from harness.report.page import write_report
+from harness.report.runs import gather
 from harness.view.app import app
 
 
@@ -20,7 +21,7 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = (POINTS["single-local"], POINTS["6g"])
     for name, model in (("first", "proxy"), ("second", "cruise")):
         evaluate(spec_of(small, model, points=points, tags=(f"tag of {name}",)), folder / name)
-    write_report(folder / "first")
+    write_report(gather([folder / "first"]), folder / "first/report.html")
     (folder / "first/sweep-tau").mkdir()
     (folder / "first/sweep-tau/sweep.json").write_text('{"sources": [{"name": "proxy · v2 · json"}]}')
     for name in ("sweep.svg", "sweep.png", "more.png", "sweep.pdf", "sweep.csv"):
