@@ -9,8 +9,8 @@ Other sites get nothing: names other than this machine's are refused, which ends
 may be framed, embedded or posted to. The list runs no script. Pages of runs were written by whoever made the
 run, so they are kept apart from it and from each other: `sandbox` gives them an origin of their own, from
 which they can read nothing here, and they may load nothing. Their inline scripts may run as far as their own
-policy lets them. Browsers show no page that is both in a sandbox and `same-origin` with its opener, so these
-are not.
+policy lets them, and save files if they are clicked. Browsers show no page that is both in a sandbox and
+`same-origin` with its opener, so these are not.
 """
 
 import asyncio
@@ -50,7 +50,7 @@ HEADERS = {
 OF_RUNS = {  # in the place of those above, for what a run's folder holds
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
-    "sandbox allow-scripts",
+    "sandbox allow-scripts allow-downloads",
     "Cross-Origin-Opener-Policy": "unsafe-none",
 }
 
