@@ -43,6 +43,7 @@ class Listed:
         model: name of its card; of a sweep, its sources.
         prompt: version.
         answer: answer mode.
+        tags: words that it was given to be found by.
         condition: the one of the highest success rate; the first of several.
         success: that rate, 0 to 1, over episodes.
         low: lower end of its 95 % interval; None where the data cannot bound it.
@@ -57,6 +58,7 @@ class Listed:
     model: str | None = None
     prompt: str | None = None
     answer: str | None = None
+    tags: tuple[str, ...] = ()
     condition: str | None = None
     success: float | None = None
     low: float | None = None
@@ -106,7 +108,7 @@ def _one(path: str, root: str) -> Listed | None:
         try:
             begun = _json(path, WORK, CONFIG)
             made = Listed("", _kind(begun["settings"]), "unfinished", _date(begun["created"]), "--resume")
-            return _described(made, begun["settings"])
+            return _described(made, {**begun["settings"], "tags": begun.get("tags", ())})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     for name, kind in STUDIES.items():
@@ -155,6 +157,7 @@ def _described(made: Listed, config: dict[str, Any]) -> Listed:
         model=str(config["model"]["name"]),
         prompt=str(config["prompt"]["version"]),
         answer=str(config.get("answer", "json")),  # runs of older versions name none, and had one
+        tags=tuple(map(str, config.get("tags", ()))),
     )
 
 

@@ -20,7 +20,7 @@ from harness.errors import UserError
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",
-    "highway_env", "gymnasium", "shapely", "matplotlib", "rich",
+    "highway_env", "gymnasium", "shapely", "matplotlib", "rich", "starlette", "uvicorn",
 )  # fmt: skip
 
 

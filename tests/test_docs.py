@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from harness.backends.base import AnswerMode
-from harness.compare.pair import METRICS
+from harness.compare.table import METRICS
 from harness.consensus import NAMES
 from harness.failures import Failures
 from harness.operating_point import POINTS, SETTINGS

@@ -48,6 +48,7 @@ CUT_ENDS = {
 
 # Held against the program's options, and not run.
 NOT_RUN = {
+    "harness view": "serves until it is interrupted; tests/view starts it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",

@@ -27,6 +27,7 @@ from harness.cli import (
     scenario,
     sweep,
     video,
+    view,
 )
 from harness.errors import UserError, printable
 
@@ -41,6 +42,7 @@ app.command("eval")(evaluate.evaluate)
 app.command("drive")(drive.drive)
 app.command("init")(init.init)
 app.command("ls")(ls.ls)
+app.command("view")(view.view)
 app.command("video")(video.command)
 app.add_typer(prompt.app, name="prompt")
 app.add_typer(dataset.app, name="dataset")

@@ -45,6 +45,7 @@ def drive(
         0, help="Draw the first so many failed episodes of the last condition into the run's videos/."
     ),
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
+    tag: list[str] = typer.Option([], help="Word to find the run by. Repeatable."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
     quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
@@ -78,6 +79,7 @@ def drive(
         device=device,
         dtype=dtype,
         latency=cast("Latency | None", latency),
+        tags=tuple(dict.fromkeys(tag)),
         first_seed=first_seed,
         episodes=episodes,
     )

@@ -49,6 +49,7 @@ def evaluate(
     no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
     tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
+    tag: list[str] = typer.Option([], help="Word to find the run by. Repeatable."),
     as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
     quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
@@ -73,6 +74,7 @@ def evaluate(
         device=device,
         dtype=dtype,
         latency=cast("Latency | None", latency),
+        tags=tuple(dict.fromkeys(tag)),
     )
     if dry_run:
         _dry_run(spec, tokenizer, as_json, quiet)

@@ -33,6 +33,8 @@ def ls(
         left = WIDTH - 9 - len(said)
         parts = " · ".join(part for part in (one.model, one.prompt, one.answer) if part is not None)
         typer.echo(f"  {one.kind:<6}{printable(parts, left):<{left}} {said}".rstrip())
+        if one.tags:
+            typer.echo(f"{'':8}{printable('tags: ' + ', '.join(one.tags), WIDTH - 8)}")
     if not found:
         typer.echo(f"no runs in {printable(folder)}; `harness eval` makes one")
 

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.arrays import Floats
-from harness.compare.pair import METRICS, Pair
+from harness.compare import percentiles
+from harness.compare.pair import Pair, Side
+from harness.compare.table import MEANS
 from harness.metrics import Estimate, known_mean, paired_difference
 from harness.paired import SuccessTest, success_test
 
@@ -22,9 +24,10 @@ class Difference:
 
     Attributes:
         metric: its name.
-        a: mean of A over the episodes and seeds in which both know it.
+        a: mean of A over the episodes and seeds in which both know it; of a latency percentile, itself.
         b: mean of B over the same.
-        change: B - A, paired by episode and seed, with a 95 % interval over episodes.
+        change: B - A, paired by episode and seed, with a 95 % interval over episodes: Student's t; of a
+            latency percentile, a bootstrap's.
     """
 
     metric: str
@@ -137,7 +140,13 @@ def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
 
 def _in_condition(pair: Pair, condition: str) -> InCondition:
     a, b = (_of(side.table, condition, pair) for side in (pair.a, pair.b))
-    differences = [_difference(name, _laid(a[name], pair), _laid(b[name], pair)) for name in METRICS]
+    differences = [_difference(name, _laid(a[name], pair), _laid(b[name], pair)) for name in MEANS]
+    differences += [
+        Difference(f"latency_p{percent}_ms", before, after, change)
+        for percent, before, after, change in percentiles.differences(
+            _decided(pair.a, condition, pair), _decided(pair.b, condition, pair), len(pair.episodes)
+        )
+    ]
     return InCondition(
         condition=condition,
         differences=tuple(d for d in differences if d.change.n),
@@ -154,6 +163,18 @@ def _of(table: "pd.DataFrame", condition: str, pair: Pair) -> "pd.DataFrame":
     rows = pd.MultiIndex.from_product([pair.seeds, pair.episodes], names=["seed", "episode"])
     there = table.index.get_level_values("condition") == condition
     return table[there].droplevel("condition").reindex(rows)
+
+
+def _decided(side: Side, condition: str, pair: Pair) -> list[percentiles.Decided]:
+    """Each seed's latencies, with the places of their episodes."""
+    index = side.latency_ms.index
+    there = (index.get_level_values("condition") == condition) & index.get_level_values("episode").isin(
+        pair.episodes
+    )
+    found = side.latency_ms[there]
+    place = np.searchsorted(pair.episodes, found.index.get_level_values("episode")).astype(np.int64)
+    seed, value = np.asarray(found.index.get_level_values("seed")), np.asarray(found, dtype=np.float64)
+    return [(place[seed == s], value[seed == s]) for s in pair.seeds]
 
 
 def _laid(column: "pd.Series[float]", pair: Pair) -> Floats:

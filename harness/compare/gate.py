@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from harness.compare.difference import Comparison
-from harness.compare.pair import METRICS
+from harness.compare.table import METRICS
 from harness.errors import UserError, printable, unknown
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {

@@ -13,14 +13,19 @@ from harness.report.page import environment
 TEMPLATES = Path(__file__).parent / "templates"
 
 
+def render(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+    """The page; `most` episodes and requests are listed of each kind."""
+    template = environment(TEMPLATES).get_template("compare.html.j2")
+    return template.render(found=found, pair=found.pair, verdicts=verdicts, most=most, words=words)
+
+
 def write(found: Comparison, verdicts: Sequence[Verdict], most: int, out: Path) -> None:
-    """Write the page; `most` episodes and requests are listed of each kind.
+    """Write the page.
 
     Raises:
         UserError: the file cannot be written.
     """
-    template = environment(TEMPLATES).get_template("compare.html.j2")
-    page = template.render(found=found, pair=found.pair, verdicts=verdicts, most=most, words=words)
+    page = render(found, verdicts, most)
     try:
         write_whole(out, page)
     except OSError as error:

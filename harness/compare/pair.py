@@ -5,12 +5,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from harness.compare.table import tables
 from harness.drive.folder import LIVE
 from harness.drive.spec import FORMAT as DRIVEN
 from harness.errors import UserError, printable
-from harness.metrics import brier, negative_log_likelihood, safe_target
 from harness.operating_point import OperatingPoint
 from harness.report.words import facts
 from harness.run.folder import FROZEN, Run, read
@@ -18,13 +16,6 @@ from harness.run.folder import FROZEN, Run, read
 if TYPE_CHECKING:
     import pandas as pd
 
-KEY = ["condition", "seed", "episode"]
-PER_EPISODE = ("success_rate", "unsafe_rate", "late_rate", "messages_per_episode")
-PER_DECISION = (
-    "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "entropy_nats", "brier",
-    "negative_log_likelihood", "fallback_rate",
-)  # fmt: skip
-METRICS = (*PER_EPISODE, *PER_DECISION)
 SETTINGS = ("model", "prompt", "answer", "thinking", "dtype", "latency", "identity", "versions")
 
 
@@ -38,8 +29,8 @@ class Side:
         on: its scenes, for people.
         seeds: of the channel's luck, ascending.
         settings: what may make a difference, by dotted name; None is left out.
-        table: a row a condition, seed and episode (the index, `KEY`), with `METRICS`, each a mean over the
-            episode's decisions (NaN where none is known), and `end`: `success`, or how it failed.
+        table: its numbers by condition, seed and episode: see `tables`.
+        latency_ms: of every decision.
         answers: role and verdict of each answer, by request id.
     """
 
@@ -49,6 +40,7 @@ class Side:
     seeds: tuple[int, ...]
     settings: Mapping[str, str]
     table: "pd.DataFrame"
+    latency_ms: "pd.Series[float]"
     answers: Mapping[str, tuple[str, str]]
 
     @property
@@ -119,7 +111,8 @@ def _side(path: Path) -> Side:
             scenes = config["dataset"]["sha256"]
             on = f"{config['dataset']['name']} {config['dataset']['sha256'][:12]}"
         seeds = tuple(sorted(int(seed) for seed in config["seeds"]))
-        return Side(run, scenes, on, seeds, _settings(run), _table(run), dict(_answers(run)))
+        table, latency_ms = tables(run)
+        return Side(run, scenes, on, seeds, _settings(run), table, latency_ms, dict(_answers(run)))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{printable(path)} is no finished run ({printable(error)}); make the run again"
@@ -133,51 +126,6 @@ def _settings(run: Run) -> dict[str, str]:
     points = [asdict(OperatingPoint.from_dict(c)) for c in config["conditions"]]
     told["condition"] = {point["name"]: point for point in points}
     return {name: str(value) for name, value in facts(told) if value is not None}
-
-
-def _table(run: Run) -> "pd.DataFrame":
-    import pandas as pd
-
-    columns = {
-        "condition": str, "seed": int, "episode": int, "success": bool, "failure": str, "messages": float,
-    }  # fmt: skip
-    ended = pd.read_csv(
-        run.path / "episodes.csv", usecols=list(columns), dtype=columns, keep_default_na=False
-    ).set_index(KEY)
-    episodes = ended.index.get_level_values("episode").unique()
-    wanted = pd.MultiIndex.from_product([run.conditions, run.config["seeds"], episodes])
-    if len(ended) != len(wanted) or not wanted.isin(ended.index).all():
-        raise ValueError("episodes.csv has not every episode in every condition and seed")
-    table = pd.DataFrame({
-        "success_rate": ended.success,
-        "unsafe_rate": ~ended.success & (ended.failure != "late"),
-        "late_rate": ~ended.success & (ended.failure == "late"),
-        "messages_per_episode": ended.messages,
-    }).astype(float)  # fmt: skip
-    decided = pd.DataFrame.from_records(list(_decisions(run)), columns=[*KEY, *PER_DECISION])
-    means = decided.astype(dict.fromkeys(PER_DECISION, float)).groupby(KEY).mean()
-    if np.isinf(table.join(means)).any(axis=None):
-        raise ValueError("a number of its decisions or episodes is infinite")
-    return table.join(means).assign(end=ended.failure.where(~ended.success, "success"))
-
-
-def _decisions(run: Run) -> Iterator[tuple[Any, ...]]:
-    """`KEY` and `PER_DECISION` of every decision; None where unknown."""
-    for row in run.rows:
-        made = row["decisions"]
-        scores: Any = [(None, None)] * len(made)
-        if "safe" in row and made:  # nobody knows what every action would have led to in a live moment
-            safe, fused = np.array(row["safe"], dtype=bool), np.array([d["fused"] for d in made], dtype=float)
-            target = np.broadcast_to(safe_target(safe), fused.shape)
-            scores = zip(
-                brier(fused, target), negative_log_likelihood(fused, np.broadcast_to(safe, fused.shape)),
-                strict=True,
-            )  # fmt: skip
-        for d, (squared, logarithmic) in zip(made, scores, strict=True):
-            yield (
-                d["condition"], d["seed"], row["episode"], d["latency_ms"], d["deadline_missed"],
-                d["triggered"], d["entropy_nats"], squared, logarithmic, d["own_failed"],
-            )  # fmt: skip
 
 
 def _answers(run: Run) -> Iterator[tuple[str, tuple[str, str]]]:

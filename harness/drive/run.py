@@ -65,8 +65,9 @@ def run(
         sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
         todo = partial(_driven, spec, latency, work, cache)
         spread(todo, chunks, min(workers, len(chunks)), lambda done: progress(next(sizes)))
-        created = json.loads((work / CONFIG).read_text())["created"]
-        done = _written(spec, out, work, {"created": created, "identity": identity, "latency": latency})
+        begun = json.loads((work / CONFIG).read_text())
+        told = {"created": begun["created"], "identity": identity, "latency": latency}
+        done = _written(spec.tagged(begun), out, work, told)
     tidy(out)
     return done
 
@@ -102,6 +103,7 @@ def _written(spec: Drive, out: Path, work: Path, begun: Mapping[str, Any]) -> Ev
         "name": out.name,
         "created": begun["created"],
         "command": spec.command(out),
+        "tags": list(spec.tags),
         **spec.settings(),
         "identity": begun["identity"],
         "latency": begun["latency"],

@@ -54,7 +54,7 @@ class Drive(Spec):
             ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
-            ("--latency", self.latency), ("--out", out),
+            ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         return shlex.join(["harness", "drive", *parts, *(["--thinking"] if self.thinking else [])])

@@ -96,7 +96,7 @@ def evaluate(
         answers = [by_id[request.id] for request in again]
         second = merging.merged(spec, codes, answers, merge_s(latency, answers))
         begun = json.loads((work / CONFIG).read_text())
-        done = _scored(spec, out, told, second, {
+        done = _scored(spec.tagged(begun), out, told, second, {
             "created": begun["created"], "identity": identity, "latency": latency,
             "cached_answers": sum(answer["cached"] for answer in by_id.values()),
             "engine_errors": sum(answer["error"] is not None for answer in by_id.values()),
@@ -125,6 +125,7 @@ def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[st
         "name": out.name,
         "created": begun["created"],
         "command": spec.command(out),
+        "tags": list(spec.tags),
         **spec.settings(),
         **{key: begun[key] for key in ("identity", "latency", "cached_answers", "engine_errors")},
         "delay_allowance_s": laid.allowance_s,
@@ -220,7 +221,8 @@ def working(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
             if new:
                 (work / "answers.jsonl").unlink(missing_ok=True)
                 begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"),
-                         "settings": spec.settings(), "identity": digest(identity)}  # fmt: skip
+                         "settings": spec.settings(), "identity": digest(identity),
+                         "tags": spec.tags}  # fmt: skip
                 write_whole(work / CONFIG, canonical_json(begun))
             yield work
     except BlockingIOError:

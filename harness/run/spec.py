@@ -2,11 +2,11 @@
 
 import platform
 import shlex
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 from harness import __version__
 from harness.backends.base import AnswerMode
@@ -18,6 +18,7 @@ from harness.prompts import Prompt
 
 FORMAT = "swarmdrive-run/1"
 Latency = Literal["card", "measured", "paper"]
+TAG_CHARACTERS = 40
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Spec:
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
         latency: where inference times come from, or None for the card's choice.
+        tags: words to find the run by, which change nothing in it.
     """
 
     card: Card
@@ -51,12 +53,19 @@ class Spec:
     device: str | None = None
     dtype: str | None = None
     latency: Latency | None = None
+    tags: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise UserError(
                 f"--seeds {list(self.seeds)}: give one or more different whole numbers, such as 0:5"
             )
+        for tag in self.tags:
+            if not (0 < len(tag) <= TAG_CHARACTERS and tag.isprintable() and tag == tag.strip()):
+                raise UserError(
+                    f"--tag {printable(tag)!r}: give 1 to {TAG_CHARACTERS} printable characters, "
+                    "with no space at either end"
+                )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
         served = self.card.engine == "openai" and self.card.thinking != "none"
@@ -107,6 +116,10 @@ class Spec:
                 "use measured or paper, or add inference_s to the card"
             )
 
+    def tagged(self, begun: Mapping[str, Any]) -> Self:
+        """This, with the tags that a run was begun with before its own."""
+        return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
+
     def settings(self) -> dict[str, Any]:
         """What a resumed run must have in common with the one it continues."""
         return {
@@ -135,7 +148,7 @@ class Spec:
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size),
             ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype),
-            ("--latency", self.latency), ("--out", out),
+            ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])

@@ -84,8 +84,8 @@ def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) 
     told = {one["name"]: one for one in json.loads(out, parse_constant=pytest.fail)}
     assert code == 0
     assert list(told["live"]) == [
-        "name", "kind", "state", "date", "why", "model", "prompt", "answer", "condition", "success", "low",
-        "high",
+        "name", "kind", "state", "date", "why", "model", "prompt", "answer", "tags", "condition", "success",
+        "low", "high",
     ]  # fmt: skip
     assert told["live"]["date"] == json.loads((folder / "live/run.json").read_text())["created"]
 

@@ -12,7 +12,8 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 
 from harness.compare.difference import Comparison, Difference, Turned, compare
-from harness.compare.pair import METRICS, pair
+from harness.compare.pair import pair
+from harness.compare.table import LIVE_ENDS, LIVE_PER_EPISODE, METRICS
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.errors import UserError
@@ -35,8 +36,10 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
     c = found(runs)
     assert (c.settings, c.answers) == ((), ())
     assert c.answers_in_both == {"ego": 24, "helper": 72}
+    live = {*LIVE_ENDS, *LIVE_PER_EPISODE, "fusion_ms", "merge_failed_rate"}
     for of in c.conditions:
-        assert {d.metric for d in of.differences} == set(METRICS)
+        silent = {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
+        assert {d.metric for d in of.differences} == set(METRICS) - live - silent
         for d in of.differences:
             assert (d.change.value, d.change.low, d.change.high) == (0, 0, 0)
             assert (d.a, d.change.n, d.change.n_excluded) == (d.b, 4, 0)
@@ -48,7 +51,8 @@ def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) ->
     with (runs[0] / "summary.csv").open() as file:
         own = {
             (row["condition"], row["metric"]): float(row["value"])
-            for row in csv.DictReader(file) if row["interval"] == "episodes" and row["value"]
+            for row in csv.DictReader(file)
+            if row["value"] and (row["interval"] == "episodes" or row["metric"].startswith("latency_p"))
         }  # fmt: skip
     c = found(runs)
     for of in c.conditions:
@@ -109,6 +113,88 @@ def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> 
     assert d.change.value == pytest.approx(5 / 3)
     assert d.change.low == pytest.approx(5 / 3 - 4.3027 * 5 / 3, abs=1e-3), "t(2), standard error 5/3"
     assert (d.change.n, d.change.n_excluded) == (3, 1)
+
+
+def test_lost_replies_by_hand(runs: tuple[Path, Path]) -> None:
+    """Episodes 0 and 1 ask two helpers at every decision. In B one of the replies is lost in episode 0."""
+
+    def heard(delivered: bool) -> Callable[[dict[str, Any]], None]:
+        def change(row: dict[str, Any]) -> None:
+            for d in row["decisions"]:
+                d["triggered"] = d["condition"] == "6g" and row["episode"] < 2
+                d["messages"] = [
+                    {"from": "v2", "delivered": True},
+                    {"from": "v3", "delivered": delivered or row["episode"] != 0},
+                ] if d["triggered"] else []  # fmt: skip
+
+        return change
+
+    rewrite(runs[0], heard(True))
+    rewrite(runs[1], heard(False))
+    told = differences(found(runs), "6g")
+    lost = told["observed_reply_loss"]
+    assert (lost.a, lost.b, lost.change.value) == (0, 0.25, 0.25), "of episodes 0 and 1, half and nothing"
+    assert (lost.change.n, lost.change.n_excluded) == (2, 2)
+    assert told["effective_loss"].b == pytest.approx(0.012), "the profile's"
+    config = json.loads((runs[1] / "run.json").read_text())
+    config["conditions"][1] |= {"loss": 0.112}
+    configure(runs[1], conditions=config["conditions"])
+    assert differences(found(runs), "6g")["effective_loss"].change.value == pytest.approx(0.1)
+    config["conditions"][1] |= {"loss": None, "density_coupled": True}
+    configure(runs[1], conditions=config["conditions"])
+    assert "effective_loss" not in differences(found(runs), "6g"), "no frozen row says how many there were"
+
+
+def test_latency_percentiles_are_of_all_decisions_and_resampled_by_episode(runs: tuple[Path, Path]) -> None:
+    """A takes 100 ms. In B episode 3 takes 200 ms in seed 0: a quarter of that seed's decisions."""
+
+    def steady(row: dict[str, Any]) -> None:
+        for d in row["decisions"]:
+            d["latency_ms"] = 100.0
+
+    def slow(row: dict[str, Any]) -> None:
+        for d in row["decisions"]:
+            d["latency_ms"] = 200.0 if row["episode"] == 3 and d["seed"] == 0 else 100.0
+
+    rewrite(runs[0], steady)
+    rewrite(runs[1], slow)
+    told = differences(found(runs), "6g")
+    half, most = told["latency_p50_ms"], told["latency_p95_ms"]
+    assert (half.a, half.b, half.change.value) == (100, 100, 0)
+    assert (most.a, most.b, most.change.value) == (100, 150, 50), "a mean over two seeds"
+    assert (most.change.low, most.change.high) == (0, 50), "a third of resamples have no episode 3"
+    assert (most.change.n, most.change.n_excluded) == (4, 0)
+    assert half.change.high == 50, "twice and more often in a quarter of resamples"
+
+
+def test_what_only_driving_shows_by_hand(harness: Callable[..., Said]) -> None:
+    """Two episodes and one seed, ended by hand."""
+    drive = ("drive", "--model", "cruise", "--episodes", "2", "--seeds", "0", "--workers", "1")
+    for run in ("a", "b"):
+        assert harness(*drive, "--condition", "single-local", "--out", run, "--quiet")[0] == 0
+    columns = ("success", "failure", "time_s", "fault", "least_gap_m", "hard_brakings", "skipped")
+    for run, ended in (
+        ("a", [("True", "", 4.0, "", 9.0, 0, 1), ("False", "collision", 2.0, "ego", 0.0, 1, 0)]),
+        ("b", [("False", "late", 7.0, "", 5.0, 2, 1), ("False", "time_out", 10.0, "", 3.0, 3, 2)]),
+    ):
+        with Path(run, "episodes.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for row, end in zip(rows, ended, strict=True):
+            row |= dict(zip(columns, map(str, end), strict=True))
+        with Path(run, "episodes.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    told = differences(found((Path("a"), Path("b"))), "single-local")
+    assert {name: (told[name].a, told[name].b) for name in (*LIVE_ENDS, *LIVE_PER_EPISODE)} == {
+        "collision_rate": (0.5, 0), "at_fault_rate": (0.5, 0), "time_out_rate": (0, 0.5),
+        "off_road_rate": (0, 0), "time_to_clear_s": (4, 7), "least_gap_m": (4.5, 4),
+        "hard_brakings_per_episode": (0.5, 2.5), "other_crashes_per_episode": (0, 0),
+        "decisions_per_episode": (5.5, 5.5), "skipped_per_episode": (0.5, 1.5),
+        "never_acted_per_episode": (0, 0),
+    }  # fmt: skip
+    assert told["time_to_clear_s"].change.n_excluded == 1, "the one that cleared in neither run"
+    assert told["least_gap_m"].change.value == -0.5
 
 
 def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path], small: Dataset) -> None:
@@ -179,12 +265,14 @@ def test_live_runs_are_compared_with_live_runs(harness: Callable[..., Said], run
     with Path("local-view/summary.csv").open() as file:
         own = {
             r["metric"]: r["value"] for r in csv.DictReader(file)
-            if (r["condition"], r["interval"]) == ("6g", "episodes")
+            if r["condition"] == "6g" and r["interval"] in ("episodes", "seed means")
         }  # fmt: skip
     told = differences(c, "6g")
-    assert set(METRICS) - set(told) == {"brier", "negative_log_likelihood"}
+    unheard = {"effective_loss", "observed_reply_loss", "merge_failed_rate"}
+    assert set(METRICS) - set(told) == {"brier", "negative_log_likelihood"} | unheard
     for name, d in told.items():
-        assert d.b == pytest.approx(float(own[name]), abs=1e-3)
+        if not d.change.n_excluded:  # a summary leaves nothing out for another run's sake
+            assert d.b == pytest.approx(float(own[name]), abs=1e-3)
     assert not any(d.change.value for d in differences(found((Path("cruise"),) * 2), "6g").values())
     for other, said in ((runs[0], "one was made by"), (Path("other"), "not of the same scenes")):
         with pytest.raises(UserError, match=said):

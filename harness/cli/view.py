@@ -1,0 +1,31 @@
+"""`harness view`: the runs in a folder, in a browser."""
+
+from pathlib import Path
+from threading import Thread
+
+import typer
+
+
+def view(
+    folder: Path = typer.Argument(Path("reports"), metavar="DIR", help="Folder that holds them."),
+    port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 takes a free one."),
+    open_browser: bool = typer.Option(False, "--open", help="Open it in the browser."),
+) -> None:
+    """Show runs, sweeps and studies in a browser on this machine: list, open, compare. Ctrl-C ends it."""
+    from harness.cli.estimates import in_range
+    from harness.listing import runs
+    from harness.view.serve import serve
+
+    def listening(url: str) -> None:
+        typer.echo(f"{url} shows them until Ctrl-C")
+        if open_browser:
+            import webbrowser
+
+            Thread(target=webbrowser.open, args=[url], daemon=True).start()
+
+    in_range("--port", port, 0, 65535)
+    runs(folder)  # says what is wrong with the folder
+    try:
+        serve(folder, port, listening)
+    except KeyboardInterrupt:
+        return

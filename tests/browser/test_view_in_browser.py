@@ -1,0 +1,93 @@
+"""`harness view` in a real browser: what is picked is compared, and a run's page works in its sandbox."""
+
+import subprocess
+import sys
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from evaluating import run as evaluate
+from evaluating import spec_of
+from opening import NARROW, WIDE, picture, wait
+
+from harness.operating_point import POINTS
+from harness.report.page import write_report
+from harness.report.runs import gather
+
+SPY = """<title>not told</title><script>
+fetch("/").then(() => { document.title = "read" }, () => { document.title = "refused at " + self.origin })
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def address(small, tmp_path_factory):
+    """Where the real command serves two runs and a page that spies."""
+    folder = tmp_path_factory.mktemp("viewed") / "reports"
+    for name, model in (("first", "proxy"), ("second", "cruise"), ("spy", "brake")):
+        evaluate(spec_of(small, model, points=(POINTS["6g"],), tags=(name,)), folder / name)
+    write_report(gather([folder / "first"]), folder / "first/report.html")
+    (folder / "spy/report.html").write_text(SPY)
+    command = [sys.executable, "-m", "harness", "view", str(folder), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process.stdout.readline().split()[0]
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def page(browser):
+    context = browser.new_context(viewport=WIDE, accept_downloads=True)
+    heard = []
+    page = context.new_page()
+    page.on("console", lambda message: heard.append(message.text))
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    yield page
+    context.close()
+    assert heard == []
+
+
+def test_two_runs_are_picked_and_compared_by_keyboard_alone(page, address):
+    page.goto(address)
+    page.get_by_label("Pick first").focus()
+    page.keyboard.press("Space")
+    page.get_by_label("Pick second").focus()
+    page.keyboard.press("Space")
+    page.get_by_role("button", name="Compare two").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/compare?path=*")
+    assert page.locator("h1").inner_text() == "Two runs compared"
+    page.go_back()
+    page.get_by_role("searchbox").fill("second")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/?q=second*")
+    assert page.locator("tbody th").all_inner_texts() == ["second second"]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_list_fits_a_telephone_and_is_read_aloud(page, address, scheme):
+    page.set_viewport_size(NARROW)
+    page.emulate_media(color_scheme=scheme)
+    page.goto(address)
+    assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    assert Axe().run(page).response["violations"] == []
+    page.set_viewport_size(WIDE)
+    assert Axe().run(page).response["violations"] == []
+    page.set_viewport_size(NARROW)
+    picture(page, f"view-{scheme}")
+
+
+def test_a_report_works_in_its_sandbox(page, address):
+    page.goto(f"{address}run?path=first")
+    wait(page)
+    assert page.evaluate("self.origin") == "null"
+    with page.expect_download() as saved:
+        page.get_by_text("Save as SVG").first.click()
+    assert saved.value.path().read_text().startswith("<svg")
+
+
+def test_a_page_that_spies_reads_nothing_else(browser, address):
+    page = browser.new_page()
+    page.goto(f"{address}run?path=spy")
+    page.wait_for_function("document.title != 'not told'")
+    assert page.title() == "refused at null"
+    page.close()

@@ -1,0 +1,51 @@
+"""Percentiles of resampled episodes: each is what it would be of the decisions written out."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.compare.percentiles import Decided, differences
+from harness.metrics import known_mean
+from harness.run.summary import PERCENTILES
+
+DECISIONS = st.lists(
+    st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])), max_size=12
+)
+SEEDS = st.integers(1, 3)
+
+
+def laid(made: list[tuple[int, float]]) -> Decided:
+    return np.array([place for place, _ in made], dtype=np.int64), np.array([v for _, v in made], dtype=float)
+
+
+@given(st.data(), SEEDS)
+def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
+    data: st.DataObject, n: int
+) -> None:
+    sides = [[laid(data.draw(DECISIONS)) for _ in range(n)] for _ in "ab"]
+    found = list(differences(*sides, 4))
+    by_seed, met = [], set()
+    for one, other in zip(*sides, strict=True):
+        known = [{int(p) for p, v in zip(*side, strict=True) if v == v} for side in (one, other)]
+        met |= (both := known[0] & known[1])
+        kept = [[v for p, v in zip(*side, strict=True) if p in both and v == v] for side in (one, other)]
+        by_seed.append([np.percentile(v, PERCENTILES) if v else np.full(3, np.nan) for v in kept])
+    if not met:
+        assert found == []
+        return
+    expected = known_mean(np.array(by_seed), 0)
+    for i, (percent, a, b, change) in enumerate(found):
+        assert percent == PERCENTILES[i]
+        np.testing.assert_allclose([a, b, change.value], [*expected[:, i], expected[1, i] - expected[0, i]])
+        assert (change.n, change.n_excluded) == (len(met), 4 - len(met))
+        assert (change.low <= change.high) is (len(met) > 1)
+
+
+def test_the_interval_has_the_width_that_theory_gives_a_median() -> None:
+    """The median of n normal values has a standard error of 1.2533 sigma / sqrt(n); mean of 30 widths."""
+    rng, place, widths = np.random.default_rng(7), np.arange(400), []
+    for _ in range(30):
+        b = (place, rng.normal(100, 10, 400))
+        [(_, _, _, median), *_] = differences([(place, np.zeros(400))], [b], 400)
+        widths.append(median.high - median.low)
+    assert abs(np.mean(widths) / (2 * 1.96 * 1.2533 * 10 / 20) - 1) < 0.1

@@ -1,0 +1,127 @@
+"""`harness view` as typed."""
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+
+Said = tuple[int, str, str]
+LISTENS = "0A"  # of /proc/net/tcp
+
+
+def raw(port: int, head: str) -> bytes:
+    """The answer to a request that no client would tidy up."""
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as sent:
+        sent.sendall(f"{head}Connection: close\r\n\r\n".encode())
+        return b"".join(iter(lambda: sent.recv(1 << 16), b""))
+
+
+@pytest.fixture
+def served(reports: Path) -> Iterator[tuple["subprocess.Popen[str]", str]]:
+    """The real command, and what it says first."""
+    command = [sys.executable, "-m", "harness", "view", str(reports), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        try:
+            yield process, process.stdout.readline()
+        finally:
+            process.kill()
+
+
+def test_the_command_serves_on_loopback_alone_until_it_is_interrupted(
+    served: tuple["subprocess.Popen[str]", str],
+) -> None:
+    process, line = served
+    found = re.fullmatch(r"(http://127\.0\.0\.1:(\d+)/) shows them until Ctrl-C\n", line)
+    assert found, line
+    port = int(found[2])
+    page = httpx.get(found[1], timeout=60)
+    assert page.status_code == 200
+    assert "tag of first" in page.text
+    assert "server" not in page.headers
+    for path in (
+        "/../secret/secret.txt",
+        "/%2e%2e/secret/secret.txt",
+        "/run?path=../secret",
+        "/run?path=%00",
+    ):
+        answer = raw(port, f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        assert answer.startswith(b"HTTP/1.1 404")
+    assert raw(port, "GET / HTTP/1.1\r\nHost: evil.example\r\n").startswith(b"HTTP/1.1 400")
+    # 4 MiB of path, a request cut short and no HTTP at all end no server.
+    for sent in (b"GET /" + b"x" * (1 << 22), b"GET / HTT", b"\x16\x03\x01\x00"):
+        with socket.create_connection(("127.0.0.1", port)) as cut, suppress(ConnectionError):
+            cut.sendall(sent)
+    assert httpx.get(found[1], timeout=60).status_code == 200
+    if Path("/proc/net/tcp").is_file():
+        assert listeners(port) == [f"0100007F:{port:04X}"]
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+def listeners(port: int) -> list[str]:
+    """Addresses that are listened on at a port, as the kernel writes them."""
+    return [
+        local for table in ("tcp", "tcp6") if (file := Path("/proc/net", table)).is_file()
+        for _, local, _, state, *_ in map(str.split, file.read_text().splitlines()[1:])
+        if state == LISTENS and local.endswith(f":{port:04X}")
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--port", "-1"], "--port -1 is out of range; give 0 to 65535"),
+        (["--port", "65536"], "--port 65536 is out of range; give 0 to 65535"),
+        (["nowhere"], "nowhere is no folder; give one that holds runs, or make a run with `harness eval`"),
+        (["--host", "0.0.0.0"], "No such option: --host"),
+    ],
+)
+def test_bad_input_is_one_line(args: list[str], said: str, harness: Callable[..., Said]) -> None:
+    Path("reports").mkdir()
+    code, out, err = harness("view", *args)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+
+
+def test_a_port_in_use_is_one_line(harness: Callable[..., Said]) -> None:
+    Path("reports").mkdir()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        said = f"harness: --port {port} is in use; give another, or 0 for a free one\n"
+        assert harness("view", "--port", str(port)) == (2, "", said)
+
+
+def test_it_opens_the_browser_when_asked_to(
+    harness: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("reports").mkdir()
+    opened: list[str] = []
+    shown = threading.Event()
+
+    def interrupted(self: uvicorn.Server, sockets: list[socket.socket]) -> None:
+        [listener] = sockets
+        assert listener.getsockname()[0] == "127.0.0.1"
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(uvicorn.Server, "run", interrupted)
+    monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), shown.set()))
+    code, out, err = harness("view", "--port", "0")
+    assert (code, err, opened) == (0, "", [])
+    code, out, err = harness("view", "--port", "0", "--open")
+    assert shown.wait(10)
+    assert (code, err) == (0, "")
+    assert out.startswith(opened[0])

@@ -1,0 +1,221 @@
+"""`harness view`: the list of runs, and what it opens."""
+
+import json
+import os
+import re
+import shutil
+import threading
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+from starlette.testclient import TestClient
+from viewing import configure, names, said
+
+from harness.dataset.build import build
+from harness.dataset.load import load
+from harness.view import pages
+
+
+def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
+    manifest = json.loads((reports / "second/run.json").read_text())
+    (reports / "killed/.work").mkdir(parents=True)
+    begun = {"created": manifest["created"], "settings": manifest, "tags": ["half"]}
+    (reports / "killed/.work/config.json").write_text(json.dumps(begun))
+    shutil.copytree(reports / "second", reports / "spoilt")
+    (reports / "spoilt/summary.csv").write_text("")
+    page = browser.get("/").text
+    picked = set(re.findall(r'<input type="checkbox" name="path" value="([^"]+)"', page))
+    opened = set(re.findall(r'<a href="/run\?path=([^"]+)"', page))
+    assert picked == {"first", "second"}
+    assert opened == {"first", "second", "first%2Fsweep-tau"}
+    rows = {name: row for row in re.findall("<tr class.*?</tr>", page, re.S) for name in names(row)}
+    assert all(word in rows["first"] for word in ("tag of first", "proxy", "v2", "json", "2026-01-01", " %"))
+    assert "unfinished</strong> <small>--resume" in rows["killed"]
+    assert "half" in rows["killed"]
+    assert 'class="bad">broken</strong> <small>summary.csv' in rows["spoilt"]
+
+
+@pytest.mark.parametrize(
+    ("query", "order"),
+    [
+        ("", ["second", "first"]),
+        ("sort=date", ["first", "second"]),
+        ("sort=name", ["first", "second"]),
+        ("sort=-name", ["second", "first"]),
+        ("sort=-success", ["first", "second"]),
+        ("sort=nothing+known", ["second", "first"]),
+        ("q=PROXY", ["first"]),
+        ("q=tag+second", ["second"]),
+        ("q=tag+of", ["second", "first"]),
+        ("q=v2+nowhere", []),
+    ],
+)
+def test_the_list_is_sorted_and_filtered_by_its_address(
+    query: str, order: list[str], browser: TestClient, reports: Path
+) -> None:
+    shutil.rmtree(reports / "first/sweep-tau")
+    assert list(names(browser.get(f"/?{query}").text)) == order
+
+
+def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: TestClient) -> None:
+    page = browser.get("/?q=v2+json&sort=name").text
+    links = dict(re.findall(r'<a href="/\?(sort=-?(\w+)[^"]*)"', page))
+    assert {of: link for link, of in links.items()} == {
+        of: f"sort={order}&amp;q=v2+json" for of, order in (
+            ("name", "-name"), ("kind", "kind"), ("model", "model"), ("prompt", "prompt"),
+            ("success", "-success"), ("date", "-date"),
+        )
+    }  # fmt: skip
+    assert page.count('aria-sort="ascending"') == 1
+
+
+def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, reports: Path) -> None:
+    report = reports / "first/report.html"
+    assert browser.get("/run?path=first").content == report.read_bytes()
+    report.write_text("an old one")
+    os.utime(report, (1, 1))
+    made = browser.get("/run?path=first").text
+    assert "Conditions side by side" in made
+    assert "<h1>cruise · v2</h1>" in browser.get("/run?path=second").text
+    assert report.read_text() == "an old one", "nothing is written"
+
+
+def test_a_study_opens_with_its_page_or_its_pictures(browser: TestClient, reports: Path) -> None:
+    page = browser.get("/run?path=first/sweep-tau").text
+    pictures = re.findall(r'<img src="(/picture[^"]+)"', page)
+    assert [link.rpartition("=")[2] for link in pictures] == ["more.png", "sweep.svg"], "one of each figure"
+    found = browser.get(pictures[1].replace("&amp;", "&"))
+    assert (found.text, found.headers["content-type"]) == ("<svg>sweep.svg</svg>", "image/svg+xml")
+    (reports / "paper").mkdir()
+    (reports / "paper/study.json").write_text("{}")
+    (reports / "paper/index.html").write_text("<p>the paper's numbers")
+    assert browser.get("/run?path=paper").text == "<p>the paper's numbers"
+
+
+def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
+    for query in ("path=first&path=second", "path=second&path=first"):
+        page = browser.get(f"/compare?{query}").text
+        assert "A: proxy · prompt v2 · json<br>B: cruise · prompt v2 · json" in page
+        assert "latency_p95_ms" in page
+
+
+def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
+    assert "<h1>cruise · v2</h1>" in browser.get("/report?path=second").text
+    assert "<h1>2 runs</h1>" in browser.get("/report?path=second&path=first").text
+
+
+@pytest.mark.parametrize(
+    ("address", "line"),
+    [
+        ("/compare", "0 runs are picked; pick two to compare them"),
+        ("/compare?path=first", "1 runs are picked; pick two to compare them"),
+        ("/compare?path=first&path=first", "1 runs are picked"),
+        ("/compare?path=first&path=first/sweep-tau", "first/sweep-tau is no finished run of a model"),
+        ("/compare?path=first&path=killed", "killed is no finished run of a model; pick others"),
+        ("/compare?path=first&path=other", "first and "),
+        ("/report", "no run is picked"),
+        ("/report?path=first&path=other", "first and "),
+        ("/run?path=killed", "killed is unfinished (--resume); it has no page yet"),
+        ("/run?path=cut", "cut has no rows.jsonl of its own; make the run again"),
+        ("/run?path=garbled", "rows.jsonl line 1 is broken"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_readable_line(
+    address: str, line: str, browser: TestClient, reports: Path, tmp_path: Path
+) -> None:
+    manifest = json.loads((reports / "second/run.json").read_text())
+    (reports / "killed/.work").mkdir(parents=True)
+    begun = {"created": manifest["created"], "settings": manifest}
+    (reports / "killed/.work/config.json").write_text(json.dumps(begun))
+    for name in ("cut", "garbled"):
+        shutil.copytree(reports / "second", reports / name)
+    (reports / "cut/rows.jsonl").unlink()
+    (reports / "garbled/rows.jsonl").write_text("{")
+    if "other" in address:
+        build(tmp_path / "data", 1, 7, 1, lambda done: None)
+        evaluate(spec_of(load(tmp_path / "data")), reports / "other")
+    answer = browser.get(address)
+    assert answer.status_code == 400
+    assert line in said(answer)
+    assert "other" not in address or "are not of the same scenes (" in said(answer)
+    assert "\n" not in said(answer)
+
+
+def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
+    browser: TestClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pages, "report", lambda folders: 1 / 0)
+    answer = browser.get("/report?path=second")
+    assert (answer.status_code, said(answer)) == (500, "this page cannot be made; the terminal says why")
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
+    name = '<img src=x onerror="a()"> & ?#%2e'
+    (reports / "second").rename(reports / name)
+    configure(reports / name, tags=["<script>tag</script>", "\u202egat"], model={"name": "</table><script>"})
+    page = browser.get('/?q="><script>').text + (listed := browser.get("/").text)
+    tags: list[tuple[str, dict[str, str | None]]] = []
+
+    class Parser(HTMLParser):
+        def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+            tags.append((tag, dict(attributes)))
+
+    Parser().feed(page)
+    assert not {"script", "img"} & {tag for tag, _ in tags}
+    assert "\u202e" not in page
+    assert "⟨U+202E⟩gat" in page
+    [link] = re.findall(r'href="(/run\?path=%3Cimg[^"]+)"', listed)
+    assert browser.get(link).status_code == 200
+    [value] = [a["value"] for tag, a in tags if a.get("type") == "checkbox" and a["value"] != "first"]
+    assert value == name
+    assert browser.get("/report", params={"path": value}).status_code == 200
+
+
+@pytest.mark.parametrize("name", [b"not \xff UTF-8", b"two\nlines", b"\x1b[31m"])
+def test_a_name_that_cannot_be_sent_is_listed_and_not_opened(
+    name: bytes, browser: TestClient, reports: Path
+) -> None:
+    os.rename(reports / "second", os.path.join(os.fsencode(reports), name))
+    page = browser.get("/")
+    assert page.status_code == 200
+    assert page.text.count('type="checkbox"') == 1
+    assert "cruise" in page.text
+
+
+def test_a_long_report_does_not_keep_the_list_waiting(
+    browser: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(folders: list[Path]) -> str:
+        begun.set()
+        assert go_on.wait(60)
+        return "slow"
+
+    monkeypatch.setattr(pages, "report", slow)
+    answers: list[str] = []
+    with browser:
+        drawing = threading.Thread(target=lambda: answers.append(browser.get("/report?path=second").text))
+        drawing.start()
+        assert begun.wait(60)
+        assert "tag of first" in browser.get("/").text
+        assert answers == []
+        go_on.set()
+        drawing.join(60)
+    assert answers == ["slow"]
+
+
+def test_it_works_without_scripts_and_from_the_keyboard(browser: TestClient) -> None:
+    for address in ("/", "/run?path=first/sweep-tau", "/run?path=nowhere"):
+        page = browser.get(address).text
+        assert "<script" not in page
+        assert not re.search(r"\son\w+=|style=|tabindex", page)
+        assert not re.findall(r'(?:href|src|action)="(?!/|data:,)', page), "nothing is fetched from elsewhere"
+    page = browser.get("/").text
+    labelled = re.findall(r'<label for="(\w+)"', page)
+    assert labelled == ["q"]
+    assert page.count('type="checkbox"') == page.count('aria-label="Pick ')
