@@ -1,5 +1,6 @@
 """`harness view` in a real browser: what is picked is compared, and a run's page works in its sandbox."""
 
+import re
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of
 from opening import NARROW, WIDE, picture, wait
+from playwright.sync_api import expect
 
 from harness.operating_point import POINTS
 from harness.report.page import write_report
@@ -83,6 +85,12 @@ def test_a_report_works_in_its_sandbox(page, address):
     with page.expect_download() as saved:
         page.get_by_text("Save as SVG").first.click()
     assert saved.value.path().read_text().startswith("<svg")
+    said, search = page.locator("#list > p[aria-live]"), page.locator("input[name=q]")
+    search.fill("no such scene")
+    expect(said).to_have_text(re.compile("^0 of "))
+    search.fill("action_distribution")
+    search.press("Enter")
+    expect(said).to_have_text(re.compile(r"^[1-9]\d* of "))
 
 
 def test_a_page_that_spies_reads_nothing_else(browser, address):

@@ -36,8 +36,8 @@ class List {
     const met = this.index.runs.reduce((all, run) => run.statuses.reduce((a, b) => a | b, all), 0);
     const statuses = this.index.statuses.filter((_, n) => met & (1 << n));
     const several = this.index.runs.length > 1, change = () => this.changed();
-    return this.controls = h("form", { class: "filters", onsubmit: (event) => { event.preventDefault(); this.changed(); this.search(); } },
-      h("label", {}, "search ", h("input", { type: "search", name: "q", placeholder: "scene; Enter: also in answers", oninput: change })),
+    return this.controls = h("form", { class: "filters" },
+      h("label", {}, "search ", h("input", { type: "search", name: "q", placeholder: "scene; Enter: also in answers", oninput: change, onkeydown: (event) => this.pressed(event) })),
       several ? choice("run", "run", this.about.names.map((name, n) => [String(n), name]), "0", change) : null,
       choice("seed", "seed", this.index.runs[0].seeds.map((s) => [String(s), s]), null, change),
       choice("condition", "condition", [any, ...[...new Set(this.index.runs.flatMap((run) => run.conditions))].map((c) => [c, c])], "", change),
@@ -56,6 +56,13 @@ class List {
     if (values.q !== this.hitsFor) this.hits = null;
     history.replaceState(null, "", `#${new URLSearchParams({ decisions: "", ...values })}`);
     this.show();
+  }
+
+  // No submission: a page in a sandbox, as `harness view` shows it, has none.
+  pressed(event) {
+    if (event.key !== "Enter") return;
+    event.preventDefault();
+    this.search();
   }
 
   async search() {

@@ -39,7 +39,7 @@ async function decision(params) {
     h("h1", { tabindex: "-1" }, `${index.live ? "Moment" : "Decision"} ${id}`),
     h("p", {}, `Episode ${episode}, step ${step}; ${danger ? `danger from ${danger}` : "no danger"}. `,
       made.map((d) => [h("span", { class: `verdict ${ENDS[d.end][0]}` }, `${d.condition}: ${d.action} ${ENDS[d.end][1]} ${endWords(index.live)[d.end]}`), " "])),
-    h("form", { class: "filters", onsubmit: (event) => event.preventDefault() },
+    h("form", { class: "filters" },
       about.names.length > 1 ? pick("run", "run", about.names.map((name, k) => [String(k), name]), String(state.run)) : null,
       pick("condition", "condition", made.map((d) => [d.condition, d.condition]), chosen?.condition),
       pick("seed", "seed", list.run.seeds.map((s) => [String(s), s]), String(state.seed)),
