@@ -6,12 +6,12 @@ from typing import Any
 from harness import prompts as versions
 from harness import readout
 from harness.dataset.load import Scene
-from harness.drawing.scene import conflict_points
 from harness.drive.folder import Driven
 from harness.drive.replay import scene_of
 from harness.errors import UserError, printable
 from harness.files import digest
 from harness.parse import Status, spans
+from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.runs import Runs, answers_of
 from harness.run.folder import Row, Run
@@ -76,15 +76,15 @@ class Decisions:
 
     def _frozen(self) -> dict[str, Scene]:
         assert self._runs.dataset is not None
-        scenes = {scene.id: scene for scene in self._runs.dataset.scenes}
+        found = {scene.id: scene for scene in self._runs.dataset.scenes}
         for run in self._runs.runs:
             for row in run.rows:
-                if row["scene"] not in scenes:
+                if row["scene"] not in found:
                     raise UserError(
                         f"{printable(run.path / 'rows.jsonl')} has scene {printable(row['scene'])!r}, "
                         "which its dataset has not; make the run again"
                     )
-        return scenes
+        return found
 
     def _played(self) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
@@ -129,8 +129,8 @@ class Decisions:
         told = [self._told(n, row, scene, sent) if row else None for n, row in enumerate(rows)]
         row = next(row for row in rows if row)
         return {
-            "world": scene and _world(scene),
-            "outcomes": _outcomes(scene, self._runs.actions, row) if scene and "safe" in row else None,
+            "world": scene and scenes.world(scene),
+            "outcomes": scenes.outcomes(scene, self._runs.actions, row) if scene and "safe" in row else None,
             "prompts": list(sent.values()),
             "runs": told,
         }
@@ -139,7 +139,9 @@ class Decisions:
         run, prompts = self._runs.runs[n], self._prompts[n]
         answers = []
         for viewer, answer in answers_of(row).items():
-            shown = {key: answer[key] for key in KEPT if answer.get(key) not in (None, [], 0, False)}
+            shown = {
+                key: v for key in KEPT if (v := answer.get(key)) is not None and v is not False and v != []
+            }
             found = _read_in(answer, run) if answer["repairs"] else []
             asked = None
             if scene and prompts:
@@ -180,48 +182,6 @@ def _end(run: Run, row: Row, d: Row) -> str:
     if not d["safe"]:
         return BAD
     return SLOW if d["delay_s"] else GOOD
-
-
-def _world(scene: Scene) -> dict[str, Any]:
-    """What is where, in m to the east and to the north, and what each viewer sees of it."""
-    state, danger = scene.state, scene.record["danger"]["vehicle"]
-    return {
-        "time_s": round(state.time_s, 3),
-        "vehicles": [
-            {
-                "id": v.id, "kind": v.kind, "part": "danger" if v.id == danger else v.part,
-                "x": round(v.x_m, 2), "y": round(-v.y_m, 2), "heading": round(-v.heading_rad, 4),
-                "length": v.length_m, "width": v.width_m, "speed": round(v.speed_mps, 2),
-                "crashed": v.crashed,
-            }
-            for v in state.vehicles
-        ],
-        "buildings": [
-            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()} for b in state.buildings
-        ],
-        "viewers": {
-            viewer: {
-                "role": graph["role"],
-                "seen": [node["id"] for node in graph["nodes"]],
-                "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
-                "conflicts": [
-                    {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
-                    for c, (x, y) in zip(
-                        graph["conflicts"], conflict_points(scene, viewer).round(1).tolist(), strict=True
-                    )
-                ],
-            }
-            for viewer, graph in scene.record["graphs"].items()
-        },
-    }  # fmt: skip
-
-
-def _outcomes(scene: Scene, actions: Sequence[str], row: Row) -> list[dict[str, Any]]:
-    """What each action leads to, in a frozen scene."""
-    return [
-        {**scene.record["outcomes"][action], "action": action, "safe": safe, "delay_s": delay_s}
-        for action, safe, delay_s in zip(actions, row["safe"], row["delay_s"], strict=True)
-    ]
 
 
 def _heard(row: Row, viewer: str) -> Messages:

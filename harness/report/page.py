@@ -20,6 +20,7 @@ from harness.errors import UserError, printable
 from harness.files import write_whole
 from harness.parse import Repair, Status
 from harness.report import library, matrix, words
+from harness.report.decision_charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
@@ -96,8 +97,6 @@ def render(
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     """What the page's script has to know of the runs, besides the decisions."""
-    from harness.report.charts import policies, timeline
-
     outline, marks, stops = roads(VIEW_M + 5.0)
     return {
         "names": runs.names,

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from harness.drivers import DRIVERS
 from harness.frozen import driver_choices, judge_choices, table
-from harness.report import charts, statistics
+from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
 from harness.run.folder import Run
 
@@ -38,7 +38,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
     def joined(of: Callable[[Run], statistics.Table]) -> statistics.Table:
         return [
-            charts.named({"run": name, **row})
+            layers.named({"run": name, **row})
             for name, run in zip(runs.names, runs.runs, strict=True)
             for row in of(run)
         ]

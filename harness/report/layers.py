@@ -1,0 +1,101 @@
+"""What Vega-Lite specifications are made of: scales, marks and layers that the report's charts share.
+
+Colours are those of Okabe and Ito, which the colour-blind tell apart, and shape or place says the same again.
+What is drawn in `currentColor` is light on dark and dark on light.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from harness.drawing.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+
+Spec = dict[str, Any]
+Rows = Sequence[Mapping[str, Any]]
+
+SERIES = [BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY]
+# Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
+TAKEN = {
+    "__proto__", "constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable", "toLocaleString",
+    "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
+}  # fmt: skip
+RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
+INTERVAL: Spec = {"type": "rule", "strokeWidth": 1.4}
+RUN = "run"  # name of the parameter that chooses one of several runs
+NUMBER: Spec = {"type": "quantitative"}
+BASE: Spec = {
+    "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+    "width": "container",
+}
+
+
+def named(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row in which no text is one that Vega stumbles over; what is added is not to be seen."""
+    return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
+
+
+def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
+    """Layers over one table, one run of which is chosen where there are several."""
+    runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
+    chart: Spec = {
+        **BASE,
+        "height": height,
+        "data": {"name": "values", "values": list(rows)},
+        "layer": [*layers],
+    }
+    if choose and len(runs) > 1:
+        chart["params"] = [
+            {"name": RUN, "value": runs[0], "bind": {"input": "select", "options": runs, "name": "run "}}
+        ]
+        chart["transform"] = [{"filter": f"!isValid(datum.run) || datum.run === {RUN}"}]
+    return chart
+
+
+def x_axis(field: str, title: str) -> Spec:
+    """A field along x, where its values are."""
+    return {"field": field, **NUMBER, "title": title, "scale": {"zero": False, "nice": True}}
+
+
+def share_axis(field: str, title: str) -> Spec:
+    """A share along y, from 0 to 100 %."""
+    return {"field": field, **NUMBER, "title": title, "axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
+
+
+def colours_of(rows: Rows, field: str) -> Spec:
+    """A colour for each value of a field, in the order in which they come."""
+    domain = list(dict.fromkeys(str(row[field]) for row in rows))
+    return {
+        "field": field, "type": "nominal", "scale": {"domain": domain, "range": SERIES},
+        "legend": {"orient": "top"},
+    }  # fmt: skip
+
+
+def shapes_of(rows: Rows, field: str) -> Spec:
+    """A shape where `colours_of` has a colour; of one field, both have one legend."""
+    domain = list(dict.fromkeys(str(row[field]) for row in rows))
+    return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
+
+
+def tooltip(rows: Rows) -> list[Spec]:
+    """Every field of a table in its tooltip."""
+    return [
+        {"field": name, "format": ".3~f"} if isinstance(value, float) else {"field": name}
+        for name, value in (rows[0] if rows else {}).items()
+    ]
+
+
+def band(start: float, end: float, what: str) -> Spec:
+    """A shaded range of x."""
+    return {
+        "data": {"values": [{"from": start, "to": end, "what": what}]},
+        "mark": {"type": "rect", "color": GREY, "opacity": 0.18},
+        "encoding": {
+            "x": {"field": "from", **NUMBER}, "x2": {"field": "to"}, "tooltip": {"field": "what"},
+        },
+    }  # fmt: skip
+
+
+def rules_at(field: str, at: Sequence[float]) -> list[Spec]:
+    """Vertical lines."""
+    values = [{field: value} for value in at]
+    line = {"mark": RULE, "encoding": {"x": {"field": field, **NUMBER}}}
+    return [{"data": {"values": values}, **line}] if values else []

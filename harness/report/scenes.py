@@ -1,0 +1,50 @@
+"""What a page knows of a scene itself: who is where, what each viewer sees, what each action leads to."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from harness.dataset.load import Scene
+from harness.drawing.scene import conflict_points
+from harness.run.folder import Row
+
+
+def world(scene: Scene) -> dict[str, Any]:
+    """What is where, in m to the east and to the north, and what each viewer sees of it."""
+    state, danger = scene.state, scene.record["danger"]["vehicle"]
+    return {
+        "time_s": round(state.time_s, 3),
+        "vehicles": [
+            {
+                "id": v.id, "kind": v.kind, "part": "danger" if v.id == danger else v.part,
+                "x": round(v.x_m, 2), "y": round(-v.y_m, 2), "heading": round(-v.heading_rad, 4),
+                "length": v.length_m, "width": v.width_m, "speed": round(v.speed_mps, 2),
+                "crashed": v.crashed,
+            }
+            for v in state.vehicles
+        ],
+        "buildings": [
+            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()} for b in state.buildings
+        ],
+        "viewers": {
+            viewer: {
+                "role": graph["role"],
+                "seen": [node["id"] for node in graph["nodes"]],
+                "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
+                "conflicts": [
+                    {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
+                    for c, (x, y) in zip(
+                        graph["conflicts"], conflict_points(scene, viewer).round(1).tolist(), strict=True
+                    )
+                ],
+            }
+            for viewer, graph in scene.record["graphs"].items()
+        },
+    }  # fmt: skip
+
+
+def outcomes(scene: Scene, actions: Sequence[str], row: Row) -> list[dict[str, Any]]:
+    """What each action leads to, in a frozen scene."""
+    return [
+        {**scene.record["outcomes"][action], "action": action, "safe": safe, "delay_s": delay_s}
+        for action, safe, delay_s in zip(actions, row["safe"], row["delay_s"], strict=True)
+    ]
