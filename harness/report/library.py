@@ -15,7 +15,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-SCRIPTS = ("dom", "tables", "charts", "scene", "decision", "list", "main")  # each needs those before it
+SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")  # each needs those before it
 FOLDER = Path(__file__).parent / "scripts"
 
 

@@ -20,8 +20,10 @@ const LOOK = {
     labelColor: "currentColor", titleColor: "currentColor", domainColor: "currentColor", tickColor: "currentColor",
     gridColor: "currentColor", gridOpacity: 0.14, titleFontWeight: "normal", labelFontSize: 11, titleFontSize: 11.5,
   },
-  legend: { labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220, symbolLimit: 0,
-    symbolBaseFillColor: "currentColor", symbolBaseStrokeColor: "currentColor" },
+  legend: {
+    labelColor: "currentColor", titleColor: "currentColor", titleFontWeight: "normal", labelLimit: 220,
+    symbolLimit: 0, symbolBaseFillColor: "currentColor", symbolBaseStrokeColor: "currentColor",
+  },
 };
 
 async function chart(place, name, spec, values = {}) {
@@ -57,8 +59,7 @@ async function drawAll(specs) {
     } catch (error) {
       place.replaceChildren(h("p", { class: "bad" }, `This chart cannot be drawn: ${error.message}`));
     }
-    const button = h("button", { type: "button", class: "small", onclick: () => copy(button, csvOf(tableOf(spec))) }, "Copy as CSV");
-    (place.querySelector(".vega-actions") ?? place).append(button);
+    (place.querySelector(".vega-actions") ?? place).append(copyButton(() => tableOf(spec)));
     await new Promise((done) => setTimeout(done)); // the page answers between two charts
   }
   document.body.dataset.drawn = "true";

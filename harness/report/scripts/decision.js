@@ -1,111 +1,234 @@
 // One decision: the scene, who answered what to which prompt, what was fused from it, and what came of it.
 
-const ENDS = { s: ["good", "✓"], d: ["slow", "◷"], u: ["bad", "✗"], n: ["", "○"], "-": ["quiet", ""] };
-const endWords = (live) => (live
-  ? { s: "success", d: "cleared too late", u: "failed", n: "", "-": "not in this moment" }
-  : { s: "safe", d: "safe, slower than the best", u: "unsafe", n: "no action was safe", "-": "not decided" });
+const outcome = ({ result, partner, fault }) =>
+  result.replaceAll("_", " ") + (partner ? ` with ${partner}` : "") + (fault ? `, fault: ${fault}` : "");
 
-const mark = (end, live) => h("span", { class: ENDS[end][0], title: endWords(live)[end] }, ENDS[end][1]);
-
-const table = (name, heads, rows) => {
-  const made = h("table", { "data-csv": name },
-    h("thead", {}, h("tr", {}, heads.map((head) => h("th", { scope: "col" }, head)))),
-    h("tbody", {}, rows.map((row) => h("tr", {}, row.map((cell, n) =>
-      n === 0 ? h("th", { scope: "row" }, cell) : h("td", {}, cell))))));
-  const box = h("div", {}, h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": name }, made));
-  copied(made);
-  return box;
-};
-
-// Characters as the parser counts them, not as UTF-16 does.
-function highlighted(raw, spans) {
-  const characters = Array.from(raw), pieces = [];
-  let at = 0;
-  for (const [from, to] of spans) {
-    pieces.push(characters.slice(at, from).join(""), h("mark", {}, characters.slice(from, to).join("")));
-    at = to;
-  }
-  return h("pre", {}, pieces, characters.slice(at).join(""));
+function outcomes(actions) {
+  const rows = actions.map((o) => [
+    o.action,
+    [h("span", { class: o.safe ? "good" : "bad" }, o.safe ? "✓ safe" : "✗ unsafe"), h("small", {}, outcome(o))],
+    o.delay_s == null ? "–" : `${o.delay_s.toFixed(2)} s`,
+    `${number(o.least_gap_m, 1)} m`,
+  ]);
+  return [
+    h("h3", {}, "What each action leads to"),
+    table("outcomes", ["action", "outcome", "delay", "least gap"], rows),
+    h("p", { class: "quiet" }, "Each action once, then the full-view driver. Delay is against the best safe action."),
+  ];
 }
 
-const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${p[n].toFixed(2)}`).join(", ") : "none");
-
-function answerSection(answer, detail, actions, meanings) {
-  const facts = [
-    answer.detail,
-    answer.finish_reason && answer.finish_reason !== "stop" ? `finish reason ${answer.finish_reason}` : null,
-    answer.error ? `engine: ${answer.error}` : null,
-    answer.prompt_tokens ? `${answer.prompt_tokens} tokens in` : null,
-    answer.completion_tokens ? `${answer.completion_tokens} out` : null,
-    answer.seconds ? `${answer.seconds.toFixed(3)} s` : null,
-    answer.label_mass != null ? `${(100 * answer.label_mass).toFixed(2)} % of the probability on the letters` : null,
-    answer.retries ? `${answer.retries} failed attempts before` : null,
-    answer.cached ? "from the cache" : null,
-  ].filter(Boolean).join("; ");
-  const sent = answer.prompt == null ? null : detail.prompts[answer.prompt];
-  const message = Object.entries(answer.message ?? {});
-  return h("section", { class: "answer" },
-    h("h4", {}, `${answer.viewer}, ${answer.role} `, h("span", { class: "tag", title: meanings[answer.status] }, answer.status),
-      (answer.repairs ?? []).map((repair) => [" ", h("span", { class: "tag", title: meanings[repair] }, repair)])),
-    h("p", { class: "quiet" }, facts),
-    h("div", { class: "pair" },
-      h("div", {}, h("small", {}, answer.spans.length ? "raw answer; marked: what was read" : "raw answer"), highlighted(answer.raw, answer.spans)),
-      h("div", {},
-        h("small", {}, "as read"), h("p", {}, distribution(actions, answer.intent)),
-        answer.mass != null && Math.abs(answer.mass - 1) > 1e-3 ? h("p", { class: "quiet" }, `the model's numbers sum to ${answer.mass.toFixed(3)}`) : null,
-        message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null)),
-    sent
-      ? h("details", {}, h("summary", {}, `prompt, ${sent.length} messages`), sent.map((m) => [h("small", {}, m.role), h("pre", {}, m.content)]))
-      : h("p", { class: "quiet" }, "prompt: not here as it was sent"));
+function endings(ends) {
+  const late = (e) => (e.delay_s == null ? "" : `; ${e.delay_s.toFixed(2)} s after the full-view driver`);
+  const rows = ends.map((e) => [
+    e.condition,
+    [
+      h("span", { class: e.result === "cleared" ? "good" : "bad" }, outcome(e)),
+      h("small", {}, `hard brakings: ${number(e.hard_brakings, 0)}${late(e)}`),
+    ],
+    `${number(e.time_s, 2)} s`,
+    `${number(e.least_gap_m, 1)} m`,
+  ]);
+  return [
+    h("h3", {}, "What became of the episode"),
+    table("ends", ["condition", "result", "at", "least gap"], rows),
+  ];
 }
 
-const outcome = (o) => [o.result.replaceAll("_", " "), o.partner ? ` with ${o.partner}` : "", o.fault ? `, fault: ${o.fault}` : ""].join("");
-
-function outcomes(detail, live, told, seed) {
-  if (detail.outcomes) {
-    return [h("h3", {}, "What each action leads to"),
-      table("outcomes", ["action", "outcome", "delay", "least gap"], detail.outcomes.map((o) => [
-        o.action, [h("span", { class: o.safe ? "good" : "bad" }, o.safe ? "✓ safe" : "✗ unsafe"), h("small", {}, outcome(o))],
-        o.delay_s == null ? "–" : `${o.delay_s.toFixed(2)} s`, `${number(o.least_gap_m, 1)} m`])),
-      h("p", { class: "quiet" }, "Each action once, then the full-view driver. Delay is against the best safe action.")];
-  }
-  const ends = (told.ends ?? []).filter((e) => e.seed === seed);
-  return [h("h3", {}, "What became of the episode"),
-    table("ends", ["condition", "result", "at", "least gap"], ends.map((e) => [
-      e.condition, [h("span", { class: e.result === "cleared" ? "good" : "bad" }, outcome(e)),
-        h("small", {}, `hard brakings: ${number(e.hard_brakings, 0)}${e.delay_s == null ? "" : `; ${e.delay_s.toFixed(2)} s after the full-view driver`}`)],
-      `${number(e.time_s, 2)} s`, `${number(e.least_gap_m, 1)} m`]))];
+function reply(m) {
+  if (!m.delivered) return `${m.from}: lost`;
+  return `${m.from}: ${m.arrival_ms.toFixed(1)} ms, ${m.on_time ? `weight ${m.weight.toFixed(3)}` : "too late"}`;
 }
+
+const acted = (d) => d.acts_at_s != null
+  && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time");
+
+// Second answers of the ego are in the fused policy.
+const first = (answers) => answers.filter((a) => !a.viewer.includes("+"));
 
 function policyRows(told, chosen, actions) {
-  const rows = [], add = (who, what, p) => p && actions.forEach((action, n) => rows.push({ who, what, action, p: p[n], order: rows.length }));
-  for (const a of told.answers.filter((a) => !a.viewer.includes("+"))) {
-    const weight = a.role === "ego" ? chosen?.own_weight : chosen?.messages.find((m) => m.from === a.viewer)?.weight;
-    add(`${a.viewer}, ${a.role}`, weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`, a.intent);
+  const rows = [];
+  const add = (who, what, p) => actions.forEach((action, n) => rows.push({ who, what, action, p: p[n] }));
+  for (const a of first(told.answers)) {
+    const weight = a.role === "ego" ? chosen.own_weight : chosen.messages.find((m) => m.from === a.viewer)?.weight;
+    const what = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
+    if (a.intent) add(`${a.viewer}, ${a.role}`, what, a.intent);
   }
-  if (chosen) add(`fused, ${chosen.condition}`, "after fusion", chosen.fused);
+  add(`fused, ${chosen.condition}`, "after fusion", chosen.fused);
   return rows;
 }
 
-const acted = (d) => (d.acts_at_s == null ? null : h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time"));
+// Inference as the run took it: one time for all, one a role, or each answer's own.
+function inferenceMs(answer, seconds) {
+  if (seconds == null) return 1000 * (answer.seconds ?? 0);
+  return 1000 * (typeof seconds === "object" ? seconds[answer.role] ?? seconds.ego ?? 0 : seconds);
+}
 
-function timelineRows(told, chosen, about) {
-  const seconds = about.inference_s, by = (a) =>
-    1000 * (a.seconds && seconds == null ? a.seconds : typeof seconds === "object" && seconds ? seconds[a.role] ?? seconds.ego ?? 0 : seconds ?? 0);
-  const rows = [];
-  for (const a of told.answers.filter((a) => !a.viewer.includes("+"))) {
-    const m = chosen.messages.find((m) => m.from === a.viewer);
+function timelineRows(told, chosen, run) {
+  const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
+  for (const a of first(told.answers)) {
+    const m = chosen.messages.find((m) => m.from === a.viewer), who = `${a.viewer}, ${a.role}`;
     if (a.role !== "ego" && !m) continue;
-    const who = `${a.viewer}, ${a.role}`, ready = by(a);
+    const ready = inferenceMs(a, run.inference_s);
     if (ready) rows.push({ who, what: "inference", from: 0, to: ready });
-    if (m) {
-      const to = m.delivered ? m.arrival_ms : Math.min(chosen.latency_ms, 1000 * (about.points[chosen.condition].window_s ?? 0));
-      rows.push({ who, what: m.on_time ? "reply on time" : m.delivered ? "reply late" : "reply lost", from: Math.min(ready, to), to });
-    }
+    if (!m) continue;
+    const to = m.delivered ? m.arrival_ms : Math.min(latency_ms, 1000 * (point.window_s ?? 0));
+    const what = m.on_time ? "reply on time" : m.delivered ? "reply late" : "reply lost";
+    rows.push({ who, what, from: Math.min(ready, to), to });
   }
   // ego-prompt infers once more when the exchange is over; a rule takes no time.
-  const point = about.points[chosen.condition], fusion = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time) ? 1000 * (about.merge_s ?? 0) : 0;
-  if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: chosen.latency_ms - fusion, to: chosen.latency_ms });
-  if (chosen.latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: chosen.latency_ms });
+  const again = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time);
+  const fusion = again ? 1000 * (run.merge_s ?? 0) : 0;
+  if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: latency_ms - fusion, to: latency_ms });
+  if (latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: latency_ms });
   return rows;
+}
+
+class DecisionPage {
+  constructor(place, list, index, about) {
+    Object.assign(this, { place, list, index, about });
+  }
+
+  show(...content) {
+    this.place.replaceChildren();
+    fill(this.place, {}, content);
+  }
+
+  // What the address asks for; false where there is no such decision, or another was asked for meanwhile.
+  async find(params) {
+    const { list, index, about } = this, name = params.get("scene"), state = list.state;
+    const n = index.scenes.findIndex(([id]) => id === name);
+    if (n < 0) {
+      this.show(
+        h("p", { class: "bad" }, `This report has no decision ${name}.`),
+        h("p", {}, h("a", { href: "#decisions" }, "All decisions")),
+      );
+      return false;
+    }
+    const detail = (await block(Math.floor(n / index.block)))[n % index.block];
+    const told = detail.runs[state.run], made = (told?.decisions ?? []).filter((d) => d.seeds.includes(state.seed));
+    const viewers = Object.keys(detail.world?.viewers ?? {}), viewer = params.get("viewer");
+    Object.assign(this, { n, params, state, detail, told, made, viewers });
+    this.chosen = made.find((d) => d.condition === state.condition) ?? made.at(-1);
+    this.viewer = viewers.includes(viewer) ? viewer : viewers[0];
+    this.run = about.runs[state.run];
+    this.conditions = [...new Set(index.runs.flatMap((run) => run.conditions))];
+    return name === new URLSearchParams(location.hash.slice(1)).get("scene");
+  }
+
+  async draw(params) {
+    if (await this.find(params)) {
+      const policies = h("div", { class: "chart" }), timeline = h("div", { class: "chart" });
+      this.show(
+        this.steps(), this.title(), this.controls(),
+        this.told ? null : h("p", { class: "bad" }, "This run did not come to this scene."),
+        h("div", { class: "pair" },
+          this.picture(),
+          h("div", {}, this.came())),
+        h("h2", {}, "What was decided"),
+        this.told ? this.decided() : null,
+        this.about.names.length > 1 ? this.inEveryRun() : null,
+        h("div", { class: "figures" },
+          h("figure", {}, h("h3", {}, "Distributions before and after fusion"), policies),
+          h("figure", {}, h("h3", {}, "Latency, from seeing to acting"), timeline)),
+        h("h2", {}, "Prompts and answers"),
+        (this.told?.answers ?? []).map((answer) =>
+          answerSection(answer, this.detail, this.index.actions, this.about.meanings)),
+      );
+      if (this.chosen) await this.charts(policies, timeline);
+    }
+    this.place.dataset.drawn = location.hash;
+  }
+
+  steps() {
+    const { list, index, n, state, params } = this;
+    const order = list.found.includes(n) ? list.found : index.scenes.map((_, k) => k), at = order.indexOf(n);
+    const kept = { ...Object.fromEntries(params), run: state.run, seed: state.seed };
+    const to = (k, text, key) => order[k] != null && h("a", { href: list.link(order[k], kept), "data-key": key }, text);
+    const back = `#${new URLSearchParams({ ...list.kept(state), decisions: "" })}`;
+    return h("p", { class: "steps" },
+      h("a", { href: back, "data-key": "Escape" }, "← all decisions"), " ",
+      to(at - 1, "← previous", "ArrowLeft"), " ",
+      to(at + 1, "next →", "ArrowRight"));
+  }
+
+  title() {
+    const [id, episode, step, danger] = this.index.scenes[this.n], words = endWords(this.index.live);
+    return [
+      h("h1", { tabindex: "-1" }, `${this.index.live ? "Moment" : "Decision"} ${id}`),
+      h("p", {}, `Episode ${episode}, step ${step}; ${danger ? `danger from ${danger}` : "no danger"}. `,
+        this.made.map((d) => {
+          const [look, sign] = ENDS[d.end];
+          return [h("span", { class: `verdict ${look}` }, `${d.condition}: ${d.action} ${sign} ${words[d.end]}`), " "];
+        })),
+    ];
+  }
+
+  controls() {
+    const go = (change) => { location.hash = new URLSearchParams({ ...Object.fromEntries(this.params), ...change }); };
+    const pick = (label, name, options, selected) =>
+      choice(label, name, options, selected, (event) => go({ [name]: event.target.value }));
+    const same = (names) => names.map((name) => [String(name), name]), { names } = this.about;
+    return h("form", { class: "filters" },
+      names.length > 1 ? pick("run", "run", names.map((name, k) => [String(k), name]), String(this.state.run)) : null,
+      pick("condition", "condition", same(this.made.map((d) => d.condition)), this.chosen?.condition),
+      pick("seed", "seed", same(this.list.run.seeds), String(this.state.seed)),
+      this.viewer ? pick("seen by", "viewer", same(this.viewers), this.viewer) : null,
+      this.viewer ? pick("view", "zoom", [["far", "160 m"], ["near", "80 m"]], this.params.get("zoom") ?? "far") : null,
+      h("button", { type: "button", onclick: (event) => copy(event.target, location.href) }, "Copy link"));
+  }
+
+  picture() {
+    const { world } = this.detail, { ground } = this.about, [id] = this.index.scenes[this.n];
+    if (!world) {
+      return h("p", { class: "picture" }, "No picture: this moment was not played again, or playing it again here does "
+        + "not come to it. `harness video` draws the whole episode.");
+    }
+    const half = this.params.get("zoom") === "near" ? ground.view_m / 2 : ground.view_m;
+    const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], half);
+    const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
+    return h("div", { class: "picture" },
+      drawing, h("p", { class: "quiet" }, `${said}. `, KEY), save("svg"), " ", save("png"));
+  }
+
+  came() {
+    if (this.detail.outcomes) return outcomes(this.detail.outcomes);
+    return endings((this.told?.ends ?? []).filter((e) => e.seed === this.state.seed));
+  }
+
+  decided() {
+    const heads = ["condition", "own entropy", "own weight", "replies", "fused", "action", "latency"];
+    return table("decided", heads, this.made.map((d) => [
+      d.condition,
+      `${number(d.entropy_nats, 3)}${d.triggered ? "; asked" : ""}${d.own_failed ? "; own answer failed" : ""}`,
+      number(d.own_weight, 3),
+      d.messages.length ? d.messages.map((m) => h("div", {}, reply(m))) : "none",
+      distribution(this.index.actions, d.fused),
+      [d.action, " ", mark(d.end, this.index.live), acted(d)],
+      `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", outlasts the window" : ""}`,
+    ]));
+  }
+
+  inEveryRun() {
+    const { list, index, n, state } = this;
+    const cell = (run, condition) => [
+      list.action(n, run, condition, state.seed) ?? "–", " ",
+      mark(list.letter("ended", n, run, condition, state.seed), index.live),
+    ];
+    return [
+      h("h3", {}, "The same decision in every run"),
+      table("runs", ["run", ...this.conditions], this.about.names.map((name, run) =>
+        [name, ...this.conditions.map((condition) => cell(run, condition))])),
+    ];
+  }
+
+  async charts(policies, timeline) {
+    const { told, chosen, run } = this, [id] = this.index.scenes[this.n];
+    const shares = policyRows(told, chosen, this.index.actions), times = timelineRows(told, chosen, run);
+    const window_s = run.points[chosen.condition].window_s, lines = new Set(times.map((row) => row.who)).size;
+    await chart(policies, `policies-${id}`, { ...this.about.policies, height: 15 * shares.length }, { values: shares });
+    await chart(timeline, `timeline-${id}`, { ...this.about.timeline, height: 22 * lines }, {
+      values: times,
+      window: window_s ? [{ window_ms: 1000 * window_s, what: "the decision window closes" }] : [],
+    });
+  }
 }

@@ -24,7 +24,9 @@ const svg = (tag, attributes = {}, ...children) =>
 
 const option = (value, text, selected) => h("option", { value, selected: value === selected }, text);
 const choice = (label, name, options, selected, onchange) =>
-  h("label", {}, label, " ", h("select", { name, onchange }, options.map(([value, text]) => option(value, text, selected))));
+  h("label", {}, label, " ",
+    h("select", { name, onchange }, options.map(([value, text]) => option(value, text, selected))));
+const small = (text, onclick) => h("button", { type: "button", class: "small", onclick }, text);
 
 async function unpacked(id) {
   const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));

@@ -9,7 +9,11 @@ class List {
     this.live = index.live;
     this.found = [];
     this.hits = null; // scenes whose answers or prompts have the text
-    place.append(this.form(), this.count = h("p", { "aria-live": "polite", class: "quiet" }), this.rows = h("div"), this.pages = h("p", { class: "pages" }));
+    this.controls = this.form();
+    this.count = h("p", { "aria-live": "polite", class: "quiet" });
+    this.rows = h("div");
+    this.pages = h("p", { class: "pages" });
+    place.append(this.controls, this.count, this.rows, this.pages);
   }
 
   // The letter of one scene, run, condition and seed.
@@ -26,26 +30,31 @@ class List {
   get run() { return this.index.runs[this.state.run]; }
   get state() {
     const of = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
-    const run = Math.min(Math.max(parseInt(of.run) || 0, 0), this.index.runs.length - 1), seeds = this.index.runs[run].seeds;
-    return { ...of, run, seed: seeds.find((s) => String(s) === of.seed) ?? seeds[0], page: Math.max(parseInt(of.page) || 0, 0) };
+    const run = Math.min(Math.max(parseInt(of.run) || 0, 0), this.index.runs.length - 1);
+    const { seeds } = this.index.runs[run], seed = seeds.find((s) => String(s) === of.seed) ?? seeds[0];
+    return { ...of, run, seed, page: Math.max(parseInt(of.page) || 0, 0) };
   }
 
   form() {
-    const words = endWords(this.live), any = ["", "any"];
-    const dangers = [...new Set(this.index.scenes.map((scene) => scene[3]))];
-    const met = this.index.runs.reduce((all, run) => run.statuses.reduce((a, b) => a | b, all), 0);
-    const statuses = this.index.statuses.filter((_, n) => met & (1 << n));
-    const several = this.index.runs.length > 1, change = () => this.changed();
-    return this.controls = h("form", { class: "filters" },
-      h("label", {}, "search ", h("input", { type: "search", name: "q", placeholder: "scene; Enter: also in answers", oninput: change, onkeydown: (event) => this.pressed(event) })),
-      several ? choice("run", "run", this.about.names.map((name, n) => [String(n), name]), "0", change) : null,
-      choice("seed", "seed", this.index.runs[0].seeds.map((s) => [String(s), s]), null, change),
-      choice("condition", "condition", [any, ...[...new Set(this.index.runs.flatMap((run) => run.conditions))].map((c) => [c, c])], "", change),
-      choice("outcome", "outcome", [any, ["s", words.s], ["d", words.d], ["u", words.u], ...(this.live ? [] : [["n", words.n]]), ["first", "where an episode begins to fail"]], "", change),
-      choice("danger", "danger", [any, ...dangers.map((d) => [d ?? "none", d ?? "none"])], "", change),
-      choice("answers", "status", [any, ...statuses.map((s) => [s, s])], "", change),
-      choice("differ", "differ", [any, ["conditions", "conditions disagree"], ...(several ? [["runs", "runs disagree"]] : [])], "", change),
-      choice("help", "asked", [any, ["1", "asked for"], ["0", "not asked for"]], "", change),
+    const { index, about, live } = this, words = endWords(live), several = index.runs.length > 1;
+    const change = () => this.changed(), same = (names) => [...new Set(names)].map((name) => [String(name), name]);
+    const filter = (label, name, options) => choice(label, name, [["", "any"], ...options], "", change);
+    const met = index.runs.flatMap((run) => run.statuses).reduce((all, mask) => all | mask, 0);
+    const outcomes = ["s", "d", "u", "n"].filter((end) => words[end]).map((end) => [end, words[end]]);
+    const search = { type: "search", name: "q", placeholder: "scene; Enter: also in answers" };
+    return h("form", { class: "filters" },
+      h("label", {}, "search ",
+        h("input", { ...search, oninput: change, onkeydown: (event) => this.pressed(event) })),
+      several && choice("run", "run", about.names.map((name, n) => [String(n), name]), "0", change),
+      choice("seed", "seed", same(index.runs.flatMap((run) => run.seeds)), null, change),
+      filter("condition", "condition", same(index.runs.flatMap((run) => run.conditions))),
+      filter("outcome", "outcome", [...outcomes, ["first", "where an episode begins to fail"]]),
+      filter("danger", "danger", same(index.scenes.map(([, , , danger]) => danger ?? "none"))),
+      filter("answers", "status", same(index.statuses.filter((_, n) => met & (1 << n)))),
+      filter("differ", "differ", [
+        ["conditions", "conditions disagree"], ...(several ? [["runs", "runs disagree"]] : []),
+      ]),
+      filter("help", "asked", [["1", "asked for"], ["0", "not asked for"]]),
       h("button", { type: "reset", onclick: () => setTimeout(change) }, "Clear"));
   }
 
@@ -68,32 +77,35 @@ class List {
   async search() {
     const text = (this.controls.elements.q.value ?? "").toLowerCase();
     if (!text) return;
-    const hits = new Set(), size = this.index.block;
-    for (let n = 0; n * size < this.index.scenes.length; n += 1) {
+    const hits = new Set(), { scenes, block: size } = this.index;
+    for (let n = 0; n * size < scenes.length; n += 1) {
       (await block(n)).forEach((detail, k) => {
-        const said = [detail.prompts, detail.runs.map((run) => run?.answers.map((a) => [a.raw, a.status, a.repairs, a.error]))];
-        if (JSON.stringify(said).toLowerCase().includes(JSON.stringify(text).slice(1, -1))) hits.add(n * size + k);
+        const said = detail.runs.flatMap((run) => run?.answers ?? []).map((a) => [a.raw, a.status, a.repairs, a.error]);
+        const all = JSON.stringify([detail.prompts, said]).toLowerCase();
+        if (all.includes(JSON.stringify(text).slice(1, -1))) hits.add(n * size + k);
       });
-      this.count.textContent = `searching, ${Math.min((n + 1) * size, this.index.scenes.length)} of ${this.index.scenes.length} …`;
+      this.count.textContent = `searching, ${Math.min((n + 1) * size, scenes.length)} of ${scenes.length} …`;
     }
     [this.hits, this.hitsFor] = [hits, this.controls.elements.q.value];
     this.show();
   }
 
   wanted(n, state) {
-    const [id, , , danger] = this.index.scenes[n], { run, seed } = state;
-    const conditions = state.condition ? [state.condition] : this.run.conditions;
-    const here = conditions.filter((c) => this.action(n, run, c, seed) != null);
-    if (!here.length) return false;
-    if (state.q && !id.toLowerCase().includes(state.q.toLowerCase()) && !this.hits?.has(n)) return false;
-    if (state.danger && (danger ?? "none") !== state.danger) return false;
-    if (state.status && !(this.run.statuses[n] & (1 << this.index.statuses.indexOf(state.status)))) return false;
-    if (state.asked && !here.some((c) => this.letter("asked", n, run, c, seed) === state.asked)) return false;
-    if (state.outcome === "first" && !this.first.has(n)) return false;
-    if (state.outcome && state.outcome !== "first" && !here.some((c) => this.letter("ended", n, run, c, seed) === state.outcome)) return false;
-    if (state.differ === "conditions" && new Set(here.map((c) => this.action(n, run, c, seed))).size < 2) return false;
-    return state.differ !== "runs" || conditions.some((c) =>
-      new Set(this.index.runs.map((_, r) => this.action(n, r, c, seed)).filter(Boolean)).size > 1);
+    const [id, , , danger] = this.index.scenes[n], { run, seed } = state, { conditions, statuses } = this.run;
+    const here = (state.condition ? [state.condition] : conditions).filter((c) => this.action(n, run, c, seed) != null);
+    const any = (kind, letter) => here.some((c) => this.letter(kind, n, run, c, seed) === letter);
+    const actions = (of) => new Set(of.filter(Boolean)).size;
+    const tests = {
+      q: () => id.toLowerCase().includes(state.q.toLowerCase()) || this.hits?.has(n),
+      danger: () => (danger ?? "none") === state.danger,
+      status: () => statuses[n] & (1 << this.index.statuses.indexOf(state.status)),
+      asked: () => any("asked", state.asked),
+      outcome: () => (state.outcome === "first" ? this.first.has(n) : any("ended", state.outcome)),
+      differ: () => (state.differ === "conditions"
+        ? actions(here.map((c) => this.action(n, run, c, seed))) > 1
+        : here.some((c) => actions(this.index.runs.map((_, r) => this.action(n, r, c, seed))) > 1)),
+    };
+    return here.length > 0 && Object.entries(tests).every(([name, passes]) => !state[name] || passes());
   }
 
   // Takes the state from the address: the same address shows the same list.
@@ -107,18 +119,27 @@ class List {
     this.found = this.index.scenes.map((_, n) => n).filter((n) => this.wanted(n, state));
     const last = Math.max(Math.ceil(this.found.length / PAGE) - 1, 0), page = Math.min(state.page, last);
     const shown = this.found.slice(page * PAGE, (page + 1) * PAGE);
-    this.count.textContent = `${this.found.length} of ${this.index.scenes.length} ${this.live ? "moments" : "decisions"}`
-      + `${this.found.length > PAGE ? `, ${page * PAGE + 1} to ${page * PAGE + shown.length} here` : ""}; seed ${state.seed}`;
-    const to = (n) => `#${new URLSearchParams({ ...this.kept(state), decisions: "", page: n })}`;
-    this.rows.replaceChildren(table("decisions", ["scene", "danger", ...this.run.conditions, "not strict"], shown.map((n) => {
-      const [id, , , danger] = this.index.scenes[n];
-      const odd = this.index.statuses.filter((s, k) => s !== "strict" && this.run.statuses[n] & (1 << k));
-      return [h("a", { href: this.link(n, state), "data-n": n }, id), danger ?? "none", ...this.run.conditions.map((c) => {
-        const action = this.action(n, state.run, c, state.seed);
-        return action ? [action, " ", mark(this.letter("ended", n, state.run, c, state.seed), this.live), this.letter("asked", n, state.run, c, state.seed) === "1" ? h("span", { class: "quiet" }, " asked") : null] : "–";
-      }), odd.join(", ")];
-    })));
-    this.pages.replaceChildren(...(page > 0 ? [h("a", { href: to(page - 1) }, "← before"), " "] : []), ...(page < last ? [h("a", { href: to(page + 1) }, "next →")] : []));
+    const here = this.found.length > PAGE ? `, ${page * PAGE + 1} to ${page * PAGE + shown.length} here` : "";
+    const what = this.live ? "moments" : "decisions";
+    this.count.textContent = `${this.found.length} of ${this.index.scenes.length} ${what}${here}; seed ${state.seed}`;
+    const heads = ["scene", "danger", ...this.run.conditions, "not strict"];
+    this.rows.replaceChildren(table("decisions", heads, shown.map((n) => this.row(n, state))));
+    const to = (n, text) => h("a", { href: `#${new URLSearchParams({ ...this.kept(state), decisions: "", page: n })}` }, text);
+    this.pages.replaceChildren();
+    fill(this.pages, {}, [page > 0 && to(page - 1, "← before"), " ", page < last && to(page + 1, "next →")]);
+  }
+
+  row(n, state) {
+    const [id, , , danger] = this.index.scenes[n], { run, seed } = state;
+    const odd = this.index.statuses.filter((s, k) => s !== "strict" && this.run.statuses[n] & (1 << k));
+    const cell = (c) => {
+      const action = this.action(n, run, c, seed), asked = this.letter("asked", n, run, c, seed) === "1";
+      if (!action) return "–";
+      const end = mark(this.letter("ended", n, run, c, seed), this.live);
+      return [action, " ", end, asked && h("span", { class: "quiet" }, " asked")];
+    };
+    const link = h("a", { href: this.link(n, state), "data-n": n }, id);
+    return [link, danger ?? "none", ...this.run.conditions.map(cell), odd.join(", ")];
   }
 
   kept(state) {

@@ -9,6 +9,9 @@ function corners(v) {
 
 const line = (a, b, cls) => svg("line", { x1: a[0], y1: -a[1], x2: b[0], y2: -b[1], class: cls });
 
+const overlap = (a, b) =>
+  Math.max(0, Math.min(a[2], b[2]) - Math.max(a[0], b[0])) * Math.max(0, Math.min(a[3], b[3]) - Math.max(a[1], b[1]));
+
 // The first of some places around a vehicle where its label covers nothing that was placed before.
 function placed(taken, half, x, y, width, height, away) {
   const around = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]];
@@ -17,9 +20,8 @@ function placed(taken, half, x, y, width, height, away) {
     for (const [dx, dy] of around) {
       const cx = x + dx * (away * reach + width / 2), cy = y + dy * (away * reach + height / 2);
       const box = [cx - width / 2, cy - height / 2, cx + width / 2, cy + height / 2];
-      const covered = taken.reduce((sum, o) =>
-        sum + Math.max(0, Math.min(box[2], o[2]) - Math.max(box[0], o[0])) * Math.max(0, Math.min(box[3], o[3]) - Math.max(box[1], o[1])), 0);
-      const outside = Math.max(0, Math.abs(cx) + width / 2 - half) * height + Math.max(0, Math.abs(cy) + height / 2 - half) * width;
+      const covered = taken.reduce((sum, other) => sum + overlap(box, other), 0);
+      const outside = width * height - overlap(box, [-half, -half, half, half]);
       const cost = covered + 4 * outside + (reach > 1 ? 1 : 0);
       if (cost < least) [least, best] = [cost, [cx, cy, box]];
     }
@@ -34,9 +36,11 @@ function birdsEye(world, ground, viewer, messages, half) {
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
   const size = half / 23, within = (v) => Math.abs(v.x) < half - 1 && Math.abs(v.y) < half - 1;
   const hidden = world.vehicles.filter((v) => !seen.has(v.id)).map((v) => v.id);
-  const told = `${viewer} (${sees.role}) sees ${sees.seen.join(", ") || "nobody"}; hidden: ${hidden.join(", ") || "nobody"}; `
-    + `occluded sectors: ${sees.occluded.join(", ") || "none"}`;
-  const picture = svg("svg", { viewBox: `${-half} ${-half} ${2 * half} ${2 * half}`, class: "scene", role: "img", "aria-label": told });
+  const listed = (names) => names.join(", ") || "none";
+  const told = `${viewer} (${sees.role}) sees ${listed(sees.seen)}; hidden: ${listed(hidden)}; `
+    + `occluded sectors: ${listed(sees.occluded)}`;
+  const viewBox = `${-half} ${-half} ${2 * half} ${2 * half}`;
+  const picture = svg("svg", { viewBox, class: "scene", role: "img", "aria-label": told });
   picture.append(
     ...world.buildings.map((b) => svg("polygon", { points: points(b.corners), class: "building" })),
     svg("polygon", { points: points(ground.outline), class: "road" }),
@@ -50,7 +54,7 @@ function birdsEye(world, ground, viewer, messages, half) {
   });
   for (const v of world.vehicles) {
     if (!within(v)) continue;
-    const marks = [v.part === "other" ? null : v.part === "danger" ? "danger" : v.part, seen.has(v.id) ? null : "hidden", v.crashed ? "crashed" : null];
+    const marks = [v.part !== "other" && v.part, !seen.has(v.id) && "hidden", v.crashed && "crashed"];
     const shape = corners(v);
     const nose = [v.x + (Math.cos(v.heading) * v.length) / 2, v.y + (Math.sin(v.heading) * v.length) / 2];
     const tip = [nose[0] + Math.cos(v.heading) * v.speed, nose[1] + Math.sin(v.heading) * v.speed];
@@ -59,7 +63,7 @@ function birdsEye(world, ground, viewer, messages, half) {
       svg("polygon", { points: points(shape) }),
       svg("polyline", { points: points([shape[1], nose, shape[0]]), class: "nose" }),
       v.speed > 0.5 ? line(nose, tip, "speed") : null,
-      v.part === "danger" ? svg("path", { d: `M${v.x} ${-v.y - 4.6}l4.6 4.6l-4.6 4.6l-4.6 -4.6z`, class: "ring" }) : null));
+      v.part === "danger" && svg("path", { d: `M${v.x} ${-v.y - 4.6}l4.6 4.6l-4.6 4.6l-4.6 -4.6z`, class: "ring" })));
     const text = [v.id, ...marks.filter(Boolean)].join(" ");
     const [x, y] = placed(taken, half, v.x, -v.y, text.length * size * 0.58, size * 1.1, v.length / 2 + 0.5);
     picture.append(svg("text", { x, y, "font-size": size, class: `label ${v.part}` }, text));
@@ -67,7 +71,8 @@ function birdsEye(world, ground, viewer, messages, half) {
   for (const c of sees.conflicts) {
     const when = (s) => (s == null ? "stands" : s < 0 ? "is past it" : `in ${s.toFixed(1)} s`);
     const told = `${ego.id} ${when(c.ego)}, ${c.with} ${when(c.other)}`;
-    picture.append(svg("path", { d: `M${c.x - 1.3} ${-c.y - 1.3}l2.6 2.6m0 -2.6l-2.6 2.6`, class: "conflict" }, svg("title", {}, `paths cross: ${told}`)));
+    const cross = `M${c.x - 1.3} ${-c.y - 1.3}l2.6 2.6m0 -2.6l-2.6 2.6`;
+    picture.append(svg("path", { d: cross, class: "conflict" }, svg("title", {}, `paths cross: ${told}`)));
     const [x, y] = placed(taken, half, c.x, -c.y, told.length * size * 0.5, size, 1.8);
     picture.append(svg("text", { x, y, "font-size": size * 0.85, class: "label crossing" }, told));
   }
@@ -83,4 +88,32 @@ function birdsEye(world, ground, viewer, messages, half) {
     picture.append(svg("text", { x: lx, y: ly, "font-size": size * 0.9, class: `label ${kind}` }, told));
   }
   return [picture, told];
+}
+
+const KEY = "Blue: ego; green: helper; red with a ring: the dangerous vehicle; dashed: hidden from the viewer. "
+  + "Thin lines: sight. Ahead of a vehicle its way in 1 s, × where paths cross. Thick lines to the ego: replies.";
+const LOOKS = [
+  "fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linejoin", "vector-effect", "opacity", "font-family",
+  "font-weight", "text-anchor", "dominant-baseline", "paint-order",
+];
+
+// The picture with its look inside, as it has to stand alone.
+async function saved(picture, id, kind) {
+  const copy = picture.cloneNode(true), to = copy.querySelectorAll("*");
+  picture.querySelectorAll("*").forEach((element, n) => {
+    const look = getComputedStyle(element);
+    to[n].setAttribute("style", LOOKS.map((name) => `${name}:${look.getPropertyValue(name)}`).join(";"));
+  });
+  copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+  const side = 1200, paper = getComputedStyle(picture).backgroundColor;
+  copy.setAttribute("style", `background:${paper}`);
+  copy.setAttribute("width", side);
+  copy.setAttribute("height", side);
+  const text = new XMLSerializer().serializeToString(copy);
+  if (kind === "svg") return download(`scene-${id}.svg`, new Blob([text], { type: "image/svg+xml" }));
+  const image = new Image(), canvas = h("canvas", { width: side, height: side });
+  image.src = `data:image/svg+xml,${encodeURIComponent(text)}`;
+  await image.decode();
+  canvas.getContext("2d").drawImage(image, 0, 0);
+  canvas.toBlob((content) => download(`scene-${id}.png`, content));
 }

@@ -3,7 +3,8 @@
 // A cell that begins as a formula would is no formula in whoever's spreadsheet it lands.
 const quoted = (text) => `"${text.replace(/^(?=[=+\-@\t\r])(?![-+]?[\d.]+$)/, "'").replaceAll('"', '""')}"`;
 
-const csvOf = (rows) => rows.map((row) => row.map((cell) => quoted(String(cell ?? ""))).join(",")).join("\r\n") + "\r\n";
+const csvOf = (rows) =>
+  rows.map((row) => `${row.map((cell) => quoted(String(cell ?? ""))).join(",")}\r\n`).join("");
 
 const rowsOf = (table) =>
   [...table.rows].map((row) => [...row.cells].map((cell) => cell.innerText.trim().replace(/\s*\n\s*/g, "; ")));
@@ -24,9 +25,10 @@ async function copy(button, text) {
   setTimeout(() => { button.textContent = said; }, 1500);
 }
 
+const copyButton = (rows) => small("Copy as CSV", (event) => copy(event.target, csvOf(rows())));
+
 function copied(table) {
-  const button = h("button", { type: "button", class: "small", onclick: () => copy(button, csvOf(rowsOf(table))) }, "Copy as CSV");
-  (table.closest(".scroll") ?? table).after(button);
+  (table.closest(".scroll") ?? table).after(copyButton(() => rowsOf(table)));
 }
 
 const valueOf = (row, column) => {
@@ -61,3 +63,14 @@ function sortable(table) {
     head.setAttribute("aria-sort", "none");
   });
 }
+
+// A table of elements or text with a head, the first cell of a row its name.
+const table = (name, heads, rows) => {
+  const made = h("table", { "data-csv": name },
+    h("thead", {}, h("tr", {}, heads.map((head) => h("th", { scope: "col" }, head)))),
+    h("tbody", {}, rows.map((row) => h("tr", {}, row.map((cell, n) =>
+      n === 0 ? h("th", { scope: "row" }, cell) : h("td", {}, cell))))));
+  const box = h("div", {}, h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": name }, made));
+  copied(made);
+  return box;
+};

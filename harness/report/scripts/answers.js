@@ -1,0 +1,48 @@
+// What one vehicle answered: raw, as it was read, and to which prompt.
+
+// Characters as the parser counts them, not as UTF-16 does.
+function highlighted(raw, spans) {
+  const characters = Array.from(raw), pieces = [];
+  let at = 0;
+  for (const [from, to] of spans) {
+    pieces.push(characters.slice(at, from).join(""), h("mark", {}, characters.slice(from, to).join("")));
+    at = to;
+  }
+  return h("pre", {}, pieces, characters.slice(at).join(""));
+}
+
+const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${p[n].toFixed(2)}`).join(", ") : "none");
+
+function answerSection(answer, detail, actions, meanings) {
+  const facts = [
+    answer.detail,
+    answer.finish_reason && answer.finish_reason !== "stop" ? `finish reason ${answer.finish_reason}` : null,
+    answer.error ? `engine: ${answer.error}` : null,
+    answer.prompt_tokens ? `${answer.prompt_tokens} tokens in` : null,
+    answer.completion_tokens ? `${answer.completion_tokens} out` : null,
+    answer.seconds ? `${answer.seconds.toFixed(3)} s` : null,
+    answer.label_mass != null ? `${(100 * answer.label_mass).toFixed(2)} % of the probability on the letters` : null,
+    answer.retries ? `${answer.retries} failed attempts before` : null,
+    answer.cached ? "from the cache" : null,
+  ].filter(Boolean).join("; ");
+  const sent = answer.prompt == null ? null : detail.prompts[answer.prompt];
+  const message = Object.entries(answer.message ?? {});
+  return h("section", { class: "answer" },
+    h("h4", {}, `${answer.viewer}, ${answer.role}`, [answer.status, ...(answer.repairs ?? [])].map((word) =>
+      [" ", h("span", { class: "tag", title: meanings[word] }, word)])),
+    h("p", { class: "quiet" }, facts),
+    h("div", { class: "pair" },
+      h("div", {},
+        h("small", {}, answer.spans.length ? "raw answer; marked: what was read" : "raw answer"),
+        highlighted(answer.raw, answer.spans)),
+      h("div", {},
+        h("small", {}, "as read"), h("p", {}, distribution(actions, answer.intent)),
+        answer.mass != null && Math.abs(answer.mass - 1) > 1e-3
+          ? h("p", { class: "quiet" }, `the model's numbers sum to ${answer.mass.toFixed(3)}`) : null,
+        message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null)),
+    sent
+      ? h("details", {},
+        h("summary", {}, `prompt, ${sent.length} messages`),
+        sent.map((m) => [h("small", {}, m.role), h("pre", {}, m.content)]))
+      : h("p", { class: "quiet" }, "prompt: not here as it was sent"));
+}
