@@ -162,7 +162,7 @@ def test_a_check_as_json_has_every_token_and_asks_for_a_thought_in_json_only(
         monkeypatch, capsys, "model", "check", str(short), "--device", "cpu", "--thinking", "--json"
     )
     seen = json.loads(out)
-    assert code == 0
+    assert code == 1  # its context is too short for a thought, and that is the only way it is asked
     assert (seen["thinking_asked"], seen["thinking"]) == (True, "switch")
     assert seen["prompt"].endswith("<|im_start|>assistant\n")
     assert "".join(piece for _, piece in seen["tokens"]) == seen["prompt"]
@@ -184,3 +184,12 @@ def test_what_a_model_has_not_is_one_line(
     code, out, err = harness(monkeypatch, capsys, "model", *arguments)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
+
+
+def test_the_list_fits_eighty_columns_and_says_what_each_model_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = harness(monkeypatch, capsys, "model", "list")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    assert "\n  Deterministic rule on what its viewer sees\n" in out

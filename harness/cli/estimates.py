@@ -24,8 +24,10 @@ def shown(estimate: "Estimate", scale: float = 100.0) -> str:
 
 
 def interval(value: float, low: float, high: float, scale: float) -> str:
-    """`value [low, high]`, one decimal."""
-    return f"{scale * value:.1f} [{scale * low:.1f}, {scale * high:.1f}]"
+    """`value [low, high]`, one decimal; a dash for what is not known."""
+    value, low, high = (scale * number for number in (value, low, high))
+    told = ("–" if math.isnan(number) else f"{number:.1f}" for number in (value, low, high))
+    return "{} [{}, {}]".format(*told)
 
 
 def in_range(option: str, value: int, least: int, most: int) -> None:

@@ -30,21 +30,17 @@ def list_models(as_json: bool = typer.Option(False, "--json", help="Print the ca
     if as_json:
         typer.echo(json.dumps([{**asdict(card), "missing": lack} for card, lack in rows], indent=2))
         return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, width=80, pad_edge=False)
-    for heading in ("name", "engine", "thinking", "latency", "runs here"):
-        table.add_column(heading, no_wrap=True)
-    table.add_column("description")
+    line = "{:<22}{:<14}{:<10}{:<13}{}"
+    typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
     for card, lack in rows:
         seconds = card.latency.inference_s
         latency = "measured" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
         name, _, other = card.name.partition(":")
-        shown = ("", "") if other else (name, card.description)
-        table.add_row(shown[0], card.engine, card.thinking, latency, here, shown[1])
-    Console(width=80, markup=False, highlight=False).print(table)
+        # A card's other engines stand below it.
+        typer.echo(line.format("" if other else printable(name), card.engine, card.thinking, latency, here))
+        if not other:
+            typer.echo(f"  {printable(card.description, 78)}")
 
 
 @app.command()
@@ -90,8 +86,14 @@ def check(
                 {**head, "model_free": False, "thinking_asked": spec.thinking, **asdict(seen)}, indent=2
             )
         )
-        return
+        raise typer.Exit(_failed(seen))
     _show(spec, seen)
+    raise typer.Exit(_failed(seen))
+
+
+def _failed(seen: "Checkup") -> int:
+    """Exit code: 1 if the model answered in no way at all."""
+    return int(all(answer.error is not None for answer in seen.answers.values()))
 
 
 def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -> "tuple[Spec, Checkup]":

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import typer
@@ -48,7 +49,8 @@ def parity(
         found = compare(reference, gguf, asked, letters, progress)
     holds = all(finding.holds for finding in found)
     if as_json:
-        typer.echo(json.dumps({"holds": holds, "findings": [asdict(f) for f in found]}, indent=1))
+        findings = [asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in found]
+        typer.echo(json.dumps({"holds": holds, "findings": findings}, indent=1, allow_nan=False))
     else:
         _print(found, holds, len(asked))
     raise typer.Exit(0 if holds else 1)

@@ -52,7 +52,8 @@ def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) 
 
 def x_axis(field: str, title: str) -> Spec:
     """A field along x, where its values are."""
-    return {"field": field, **NUMBER, "title": title, "scale": {"zero": False, "nice": True}}
+    axis = {"labelOverlap": True, "tickCount": 8}
+    return {"field": field, **NUMBER, "title": title, "axis": axis, "scale": {"zero": False, "nice": True}}
 
 
 def share_axis(field: str, title: str) -> Spec:

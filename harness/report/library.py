@@ -15,7 +15,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")  # each needs those before it
+# In the order in which they need each other.
+SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")
 FOLDER = Path(__file__).parent / "scripts"
 
 

@@ -187,7 +187,6 @@ def over_episodes(name: str, values: Floats) -> Estimate:
 
 
 def _in_range(name: str, e: Estimate) -> Estimate:
-    """A share ends at 0 and at 1, which Student's t does not know."""
-    if not name.endswith(("_rate", "_loss", "_mass")):
-        return e
-    return replace(e, low=float(np.maximum(e.low, 0.0)), high=float(np.minimum(e.high, 1.0)))
+    """Nothing here is below 0 and no share above 1, which Student's t does not know."""
+    most = 1.0 if name.endswith(("_rate", "_loss", "_mass")) else np.inf
+    return replace(e, low=float(np.maximum(e.low, 0.0)), high=float(np.minimum(e.high, most)))

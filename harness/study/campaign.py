@@ -14,7 +14,7 @@ from harness.study.page import page
 from harness.study.paper import SEEDS, Panel
 from harness.study.play import play
 from harness.study.setting import described
-from harness.study.tables import joined, write_table
+from harness.study.episode_tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,7 +20,7 @@ from harness.study import figures
 from harness.study.axes import AXES, grid
 from harness.study.play import METRICS
 from harness.study.setting import CORE, Setting, described
-from harness.study.tables import write_table
+from harness.study.episode_tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd

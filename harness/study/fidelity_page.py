@@ -11,7 +11,7 @@ from harness.files import write_whole
 from harness.study.fidelity import WHO, Fidelity, disagreements
 from harness.study.figures import save_all
 from harness.study.html import render
-from harness.study.tables import write_table
+from harness.study.episode_tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd

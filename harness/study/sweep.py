@@ -15,7 +15,7 @@ from harness.study.axes import AXES, Axis, Value, grid
 from harness.study.play import Source, play
 from harness.study.setting import CORE, Setting, described
 from harness.study.stored import Stored
-from harness.study.tables import joined, write_table
+from harness.study.episode_tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
