@@ -9,12 +9,12 @@ from harness.files import write_whole
 from harness.run.spec import versions
 from harness.study import figures
 from harness.study.calibrated import Calibrated
+from harness.study.episode_tables import joined, write_table
 from harness.study.ledger import ledger
 from harness.study.page import page
 from harness.study.paper import SEEDS, Panel
 from harness.study.play import play
 from harness.study.setting import described
-from harness.study.episode_tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd

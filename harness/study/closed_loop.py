@@ -18,9 +18,9 @@ from harness.files import write_whole
 from harness.operating_point import POINTS, named_point
 from harness.study import figures
 from harness.study.axes import AXES, grid
+from harness.study.episode_tables import write_table
 from harness.study.play import METRICS
 from harness.study.setting import CORE, Setting, described
-from harness.study.episode_tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd

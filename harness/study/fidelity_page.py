@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from harness.drawing.pictures import COLOURS, GREY, MARKERS, PALE, styled, uri
 from harness.files import write_whole
+from harness.study.episode_tables import write_table
 from harness.study.fidelity import WHO, Fidelity, disagreements
 from harness.study.figures import save_all
 from harness.study.html import render
-from harness.study.episode_tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,8 +12,8 @@ from harness.metrics import Estimate
 from harness.operating_point import OperatingPoint
 from harness.run.scoring import Scored
 from harness.run.summary import by_episode, latency_percentiles, over_episodes, over_seeds
-from harness.study.setting import Setting
 from harness.study.episode_tables import EPISODE_METRICS, PLACE, of_episodes
+from harness.study.setting import Setting
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,10 +12,10 @@ from harness.operating_point import OperatingPoint, named_point
 from harness.run.spec import versions
 from harness.study import figures
 from harness.study.axes import AXES, Axis, Value, grid
+from harness.study.episode_tables import joined, write_table
 from harness.study.play import Source, play
 from harness.study.setting import CORE, Setting, described
 from harness.study.stored import Stored
-from harness.study.episode_tables import joined, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
