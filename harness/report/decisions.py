@@ -88,13 +88,18 @@ class Decisions:
 
     def _played(self) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
+        telling = [
+            str(c.row["scene"]) for run in self._runs.runs for c in pick(run.rows, failures(run), REPLAYED)
+        ]
         found: dict[str, Scene] = {}
-        for run in self._runs.runs:
-            for chosen in pick(run.rows, failures(run), REPLAYED):
-                if chosen.row["scene"] not in found:
-                    scene = scene_of(run, chosen.row)
-                    if scene.id == chosen.row["scene"]:
-                        found[scene.id] = scene
+        for name in dict.fromkeys(telling):
+            here = [
+                (run, of[name]) for run, of in zip(self._runs.runs, self._rows, strict=True) if name in of
+            ]
+            # Who asks nobody, such as a driver, sees a moment with fewer eyes.
+            scene = scene_of(*max(here, key=lambda one: len(one[1]["answers"])))
+            if scene.id == name:
+                found[name] = scene
         return found
 
     def _indexed(self, run: Run, rows: Mapping[str, Row], first_failures: Iterable[str]) -> dict[str, Any]:

@@ -6,16 +6,36 @@ from statistics import median
 
 import numpy as np
 
-from harness.arrays import Floats
 from harness.errors import UserError, printable
-from harness.metrics import Estimate, paired_difference
-from harness.paired import success_test
+from harness.paired import SuccessTest, success_test
 from harness.report.runs import Runs, answers_of
 from harness.report.words import LATENCY, SUCCESS, success_of
 from harness.run.folder import Run, Score, table
 
 P_VALUE = 0.05
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
+
+
+@dataclass(frozen=True)
+class Behind:
+    """A run against the best one, over the episodes that both have.
+
+    Attributes:
+        difference: its success minus the best one's.
+        episodes: how many both have.
+        test: what says whether that is chance.
+    """
+
+    difference: float
+    episodes: int
+    test: SuccessTest
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the two cannot be told apart."""
+        if self.test.p_value is not None:
+            return self.test.p_value > P_VALUE
+        return self.test.low is None or self.test.high is None or self.test.low <= 0.0 <= self.test.high
 
 
 @dataclass(frozen=True)
@@ -31,7 +51,7 @@ class Line:
         scores: metrics by name; None where the run has none.
         tokens: median tokens of a prompt and of an answer; None where the engine counts none.
         mark: `BEST` success under its condition, `CLOSE` or `WORSE`; empty where runs cannot be paired.
-        behind: its success minus the best one's over the episodes of both; None for the best.
+        behind: how it stands to the best; None for the best.
     """
 
     name: str
@@ -42,7 +62,7 @@ class Line:
     scores: Mapping[str, Score | None]
     tokens: tuple[float | None, float | None]
     mark: str
-    behind: Estimate | None
+    behind: Behind | None
 
 
 @dataclass(frozen=True)
@@ -129,39 +149,28 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
     return found
 
 
-def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Estimate | None]]:
+def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Behind | None]]:
     """What each run is against the best, paired by episode; nothing where there is only one."""
     known = [n for n, of in enumerate(ended) if of]
     if len(known) < 2:
         return [("", None)] * len(ended)
     best = max(known, key=lambda n: np.mean(list((ended[n] or {}).values())))
-    found: list[tuple[str, Estimate | None]] = []
+    found: list[tuple[str, Behind | None]] = []
     for n, of in enumerate(ended):
-        if n == best:
-            found.append((BEST, None))
-        else:
-            found.append(_against(of or {}, ended[best] or {}))
+        behind = None if n == best else _behind(of or {}, ended[best] or {})
+        mark = "" if behind is None else CLOSE if behind.undecided else WORSE
+        found.append((BEST if n == best else mark, behind))
     return found
 
 
-def _against(
-    one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]
-) -> tuple[str, Estimate | None]:
+def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]) -> Behind | None:
     both = sorted(one.keys() & best.keys())
     episodes, seeds = ({key[place] for key in both} for place in (0, 1))
-    if len(episodes) < 2 or len(both) != len(episodes) * len(seeds):
-        return "", None
+    if len(both) != len(episodes) * len(seeds) or not both:
+        return None
     a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) for of in (one, best))
-    return (CLOSE if _undecided(a, b) else WORSE), paired_difference(a, b)
-
-
-def _undecided(a: Floats, b: Floats) -> bool:
     test = success_test(b, a)
-    if test is None:
-        return True
-    if test.p_value is not None:
-        return test.p_value > P_VALUE
-    return test.low is None or test.high is None or test.low <= 0.0 <= test.high
+    return None if test is None else Behind(float((a - b).mean()), len(episodes), test)
 
 
 def headline(found: Sequence[Line]) -> str:

@@ -123,6 +123,14 @@ def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path
     assert all("MESSAGES" in found[key][-1]["content"] for key in heard)
 
 
+def test_a_driver_beside_a_model_takes_no_helper_out_of_the_picture(driven, tmp_path):
+    run(spec("cruise", episodes=3, first_seed=FROM_LEFT), tmp_path / "cruise", False, 1, lambda done: None)
+    every = details(render(gather([tmp_path / "cruise", driven])))
+    both = [d for d in every.values() if all(d["runs"])]
+    assert both
+    assert all(len(d["world"]["viewers"]) == 4 for d in both)
+
+
 def changed(driven, tmp_path, name, edit):
     copy = tmp_path / "copy"
     shutil.copytree(driven, copy)

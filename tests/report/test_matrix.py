@@ -28,8 +28,9 @@ def test_where_seeds_differ_the_test_is_a_bootstrap_over_episodes():
     other = {(e, s): float(luck.random() < 0.5) for e in range(60) for s in range(3)}
     (first, _), (second, behind) = matrix._marks([one, other])
     assert (first, second) == (matrix.BEST, matrix.WORSE)
-    assert behind.high < 0
-    assert behind.n == 60
+    assert behind.test.method == "bootstrap"
+    assert behind.difference < behind.test.high < 0
+    assert behind.episodes == 60
 
 
 def test_runs_without_episodes_in_common_are_not_marked():
