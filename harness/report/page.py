@@ -13,21 +13,17 @@ from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.drawing.ground import roads
-from harness.drawing.pictures import uri
 from harness.drawing.scene import VIEW_M
-from harness.drive.folder import Driven
 from harness.errors import UserError, printable
 from harness.files import write_whole
 from harness.parse import Repair, Status
-from harness.report import library, matrix, words
+from harness.report import contents, library, matrix, words
 from harness.report.decision_charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
-from harness.run.folder import Run
 
 TEMPLATES = Path(__file__).parent / "templates"
-EXAMPLES = 3  # of each status of answers
 
 
 def write_report(
@@ -81,11 +77,11 @@ def render(
         headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
         lines=lines,
         grids=matrix.grids(lines),
-        summaries=[_summary(run) for run in runs.runs],
-        answers=_answers(runs),
+        summaries=[contents.summary(run) for run in runs.runs],
+        answers=contents.answers(runs),
         charts=charts,
-        examples=_examples(decisions, runs),
-        sweeps=[panel for run in runs.runs for panel in _sweeps(run)],
+        examples=contents.examples(runs),
+        sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),
         vega=library.packed(library.vega()),
         script=library.script(),
@@ -154,46 +150,3 @@ def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
     """Head and body of a table with a column for every key."""
     head = list(dict.fromkeys(key for row in rows for key in row))
     return head, [[row.get(key) for key in head] for row in rows]
-
-
-def _summary(run: Run) -> list[dict[str, Any]]:
-    """A run's summary: a metric a line, with its value in each condition."""
-    meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
-    return [
-        {
-            "name": words.metric_name(metric),
-            "meaning": meanings.get(metric, ""),
-            "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
-        }
-        for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
-    ]
-
-
-def _answers(runs: Runs) -> list[tuple[str, list[Any]]]:
-    """What does not depend on the condition: a metric a line, with its value in each run."""
-    metrics = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
-    return [
-        (words.metric_name(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
-        for m in metrics
-    ]
-
-
-def _examples(decisions: Decisions, runs: Runs) -> list[dict[str, Any]]:
-    """The first answers of each status but strict, and where each stands."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for n, run in enumerate(runs.runs):
-        for row in run.rows:
-            for viewer, answer in {**row["answers"], **row.get("merged", {})}.items():
-                of = found.setdefault(answer["status"], [])
-                if answer["status"] != "strict" and len(of) < EXAMPLES:
-                    of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
-    return [{"status": status, "answers": of} for status, of in found.items() if of]
-
-
-def _sweeps(run: Run) -> list[dict[str, str]]:
-    """Pictures of the sweeps that lie in the run's folder."""
-    return [
-        {"name": f"{manifest.parent.name}: {picture.stem}", "src": uri(picture.read_bytes())}
-        for manifest in sorted(run.path.glob("*/sweep.json"))
-        for picture in sorted(manifest.parent.glob("*.svg"))
-    ]

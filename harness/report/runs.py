@@ -11,6 +11,11 @@ from harness.drive.folder import LIVE, Driven, driven
 from harness.errors import UserError, printable
 from harness.run.folder import FROZEN, Row, Run, dataset_of, read
 
+# What a page reads of each decision, of each of its messages, and of each answer.
+DECISION = ("entropy_nats", "triggered", "own_weight", "own_failed", "latency_ms", "deadline_missed")
+MESSAGE = ("from", "delivered", "on_time", "arrival_ms", "weight")
+ANSWER = ("role", "raw", "status", "verdict", "repairs", "detail", "intent")
+
 
 @dataclass(frozen=True)
 class Runs:
@@ -51,6 +56,7 @@ def gather(paths: Sequence[Path]) -> Runs:
     found = []
     for path in dict.fromkeys(paths):
         run = read(path, FROZEN, LIVE)
+        _check(run)
         found.append(driven(run) if run.config["format"] == LIVE.format else run)
     first, *others = found
     for other in others:
@@ -67,6 +73,29 @@ def gather(paths: Sequence[Path]) -> Runs:
 def answers_of(row: Row) -> dict[str, Row]:
     """All answers of a row: by viewer, and the ego's second ones by whose messages they had."""
     return {**row["answers"], **row.get("merged", {})}
+
+
+def _check(run: Run) -> None:
+    """Raises UserError for a row that says less, or something else, than its run's manifest lets it."""
+    actions, conditions, seeds = run.config["actions"], run.conditions, run.config["seeds"]
+    for n, row in enumerate(run.rows, 1):
+        try:
+            for d in row["decisions"]:
+                known = d["action"] in actions and d["condition"] in conditions and d["seed"] in seeds
+                if not known or len(d["fused"]) != len(actions):
+                    raise ValueError(f"a decision of {d['condition']!r} with seed {d['seed']!r}")
+                missing = {key for key in DECISION if key not in d}
+                missing |= {key for m in d["messages"] for key in MESSAGE if key not in m}
+                _need(missing)
+            _need({key for a in answers_of(row).values() for key in ANSWER if key not in a})
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            where = f"{printable(run.path / 'rows.jsonl')} line {n}"
+            raise UserError(f"{where} is broken ({printable(error)}); make the run again") from None
+
+
+def _need(missing: set[str]) -> None:
+    if missing:
+        raise ValueError(f"{', '.join(sorted(missing))} missing")
 
 
 def _scenes(run: Run) -> Any:

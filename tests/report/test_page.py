@@ -184,6 +184,18 @@ def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_pat
     assert all(len([r for r in d["runs"] if r]) == 2 for d in every.values())
 
 
+def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tmp_path):
+    swept = changed(run, tmp_path, "run.json", lambda t: t)
+    (tmp_path / "secret.svg").write_text("<svg>secret</svg>")
+    for name in ("sweep-tau", "sweep-out"):
+        (swept / name).mkdir()
+        (swept / name / "sweep.json").write_text("{}")
+    (swept / "sweep-tau" / "sweep.svg").write_text("<svg>along tau</svg>")
+    (swept / "sweep-out" / "sweep.svg").symlink_to(tmp_path / "secret.svg")
+    [source] = Page(written(swept)).values("src")
+    assert base64.b64decode(source.partition(",")[2]) == b"<svg>along tau</svg>"
+
+
 def test_runs_on_other_scenes_are_not_reported_together(run, dataset, tmp_path):
     other = changed(run, tmp_path, "run.json", lambda t: t.replace(dataset.sha256, "f" * 64))
     with pytest.raises(UserError, match="are not of the same scenes") as error:
@@ -280,6 +292,14 @@ def changed(run, tmp_path, name, edit):
         ("rows.jsonl", lambda t: "", "holds no decisions"),
         ("rows.jsonl", lambda t: t.replace('"scene": "00000-0"', '"scene": "x"'), "has scene 'x'"),
         ("summary.csv", lambda t: t.replace("ci_low", "low"), "summary.csv is broken"),
+        (
+            "rows.jsonl",
+            lambda t: t.replace('"v2x"', '"v3x"'),
+            "line 1 is broken .a decision of 'v3x' with seed 0",
+        ),
+        ("rows.jsonl", lambda t: t.replace('"action": "', '"action": "X'), "line 1 is broken .a decision of"),
+        ("rows.jsonl", lambda t: t.replace('"verdict"', '"said"'), "line 1 is broken .verdict missing"),
+        ("rows.jsonl", lambda t: t.replace('"on_time"', '"when"'), "is broken .on_time missing"),
     ],
 )
 def test_a_broken_run_is_one_line_that_names_the_file(run, tmp_path, name, edit, message):

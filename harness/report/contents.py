@@ -1,0 +1,56 @@
+"""Tables, examples and pictures of the page, besides its charts, matrix and decisions."""
+
+from typing import Any
+
+from harness.drawing.pictures import uri
+from harness.drive.folder import Driven
+from harness.report import words
+from harness.report.runs import Runs, answers_of
+from harness.run.folder import Run
+
+EXAMPLES = 3  # of each status of answers
+
+
+def summary(run: Run) -> list[dict[str, Any]]:
+    """A run's summary: a metric a line, with its value in each condition."""
+    meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
+    return [
+        {
+            "name": words.metric_name(metric),
+            "meaning": meanings.get(metric, ""),
+            "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
+        }
+        for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
+    ]
+
+
+def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
+    """What does not depend on the condition: a metric a line, with its value in each run."""
+    metrics = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
+    return [
+        (words.metric_name(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
+        for m in metrics
+    ]
+
+
+def examples(runs: Runs) -> list[dict[str, Any]]:
+    """The first answers of each status but strict, and where each stands."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for n, run in enumerate(runs.runs):
+        for row in run.rows:
+            for viewer, answer in answers_of(row).items():
+                of = found.setdefault(answer["status"], [])
+                if answer["status"] != "strict" and len(of) < EXAMPLES:
+                    of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
+    return [{"status": status, "answers": of} for status, of in found.items() if of]
+
+
+def sweeps(run: Run) -> list[dict[str, str]]:
+    """Pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
+    here = run.path.resolve()
+    return [
+        {"name": f"{manifest.parent.name}: {picture.stem}", "src": uri(picture.read_bytes())}
+        for manifest in sorted(run.path.glob("*/sweep.json"))
+        for picture in sorted(manifest.parent.glob("*.svg"))
+        if picture.is_file() and picture.resolve().is_relative_to(here)
+    ]
