@@ -6,9 +6,7 @@ from pathlib import Path
 from harness.compare import words
 from harness.compare.difference import Comparison
 from harness.compare.gate import Verdict
-from harness.errors import UserError, printable
-from harness.files import write_whole
-from harness.report.page import environment
+from harness.report.page import environment, save
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -25,10 +23,4 @@ def write(found: Comparison, verdicts: Sequence[Verdict], most: int, out: Path) 
     Raises:
         UserError: the file cannot be written.
     """
-    page = render(found, verdicts, most)
-    try:
-        write_whole(out, page)
-    except OSError as error:
-        raise UserError(
-            f"--html {printable(out)} cannot be written ({error.strerror}); name another file"
-        ) from None
+    save(render(found, verdicts, most), out, "--html")

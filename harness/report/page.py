@@ -49,14 +49,18 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    page = render(runs, prompts, progress)
+    save(render(runs, prompts, progress), out, "--out")
+    return out
+
+
+def save(page: str, out: Path, option: str) -> None:
+    """Write a page where an option says. Raises UserError if it cannot be written."""
     try:
         write_whole(out, page)
     except OSError as error:
         raise UserError(
-            f"--out {printable(out)} cannot be written ({error.strerror}); name another file"
+            f"{option} {printable(out)} cannot be written ({error.strerror}); name another file"
         ) from None
-    return out
 
 
 def render(
