@@ -79,7 +79,8 @@ class List {
     if (!text) return;
     const hits = new Set(), { scenes, block: size } = this.index;
     for (let n = 0; n * size < scenes.length; n += 1) {
-      (await block(n)).forEach((detail, k) => {
+      // Not kept, as an opened block is: all of them together may be more than a telephone has room for.
+      JSON.parse(await unpacked(`block-${n}`)).forEach((detail, k) => {
         const said = detail.runs.flatMap((run) => run?.answers ?? []).map((a) => [a.raw, a.status, a.repairs, a.error]);
         const all = JSON.stringify([detail.prompts, said]).toLowerCase();
         if (all.includes(JSON.stringify(text).slice(1, -1))) hits.add(n * size + k);

@@ -37,8 +37,9 @@ function birdsEye(world, ground, viewer, messages, half) {
   const size = half / 23, within = (v) => Math.abs(v.x) < half - 1 && Math.abs(v.y) < half - 1;
   const hidden = world.vehicles.filter((v) => !seen.has(v.id)).map((v) => v.id);
   const listed = (names) => names.join(", ") || "none";
+  const beyond = world.vehicles.filter((v) => !within(v)).map((v) => v.id);
   const told = `${viewer} (${sees.role}) sees ${listed(sees.seen)}; hidden: ${listed(hidden)}; `
-    + `occluded sectors: ${listed(sees.occluded)}`;
+    + `occluded sectors: ${listed(sees.occluded)}${beyond.length ? `; beyond the picture: ${listed(beyond)}` : ""}`;
   const viewBox = `${-half} ${-half} ${2 * half} ${2 * half}`;
   const picture = svg("svg", { viewBox, class: "scene", role: "img", "aria-label": told });
   picture.append(
