@@ -35,20 +35,8 @@ def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
     colour = colours_of(rows, "condition")
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
-    lines = [{"driver": name, "success": value} for name, value in references.items()]
-    at_edge = {"x": {"value": "width"}}
-    return layered(
-        band(*REACTION_MS, "reaction window, 150 to 250 ms"),
-        {
-            "data": {"values": lines},
-            "layer": [
-                {"mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y}},
-                {
-                    "mark": {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"},
-                    "encoding": {"y": y, "text": {"field": "driver"}, **at_edge},
-                },
-            ],
-        },
+    known = {key for row in rows for key, value in row.items() if value is not None}
+    intervals = [
         {
             "mark": INTERVAL,
             "encoding": {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}, "color": colour},
@@ -59,13 +47,34 @@ def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
                 "x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y, "color": colour,
             },
         },
+    ]  # fmt: skip
+    return layered(
+        band(*REACTION_MS, "reaction window, 150 to 250 ms"),
+        _references(references, y),
+        *(one for one, end in zip(intervals, ("low", "latency_low"), strict=True) if end in known),
         {
             "mark": {"type": "point", "filled": True, "size": 90, "opacity": 1},
             "encoding": {"x": x, "y": y, "color": colour, "shape": shape, "tooltip": tooltip(rows)},
         },
         rows=rows,
         height=320,
-    )  # fmt: skip
+    )
+
+
+def _references(success: Mapping[str, float], y: Spec) -> Spec:
+    """A dashed line for each value, named after all that have it."""
+    named: dict[float, list[str]] = {}
+    for name, value in success.items():
+        named.setdefault(value, []).append(name)
+    text = {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"}
+    at_edge = {"x": {"value": "width"}, "text": {"field": "drivers"}}
+    return {
+        "data": {"values": [{"drivers": ", ".join(of), "success": value} for value, of in named.items()]},
+        "layer": [
+            {"mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y}},
+            {"mark": text, "encoding": {"y": y, **at_edge}},
+        ],
+    }
 
 
 def statuses(rows: Rows) -> Spec:

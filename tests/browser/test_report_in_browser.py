@@ -238,3 +238,14 @@ def test_it_can_be_read_by_who_does_not_see_it(opened, report, index, where):
     page = opened(report, where and f"#scene={index['scenes'][0][0]}")
     found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa"]}).response["violations"]
     assert [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in found] == []
+
+
+def test_one_episode_under_one_condition_has_a_page_without_intervals(opened, small_path, tmp_path):
+    run = tmp_path / "one"
+    typed(
+        "eval", "--model", "proxy", "--dataset", small_path, "--out", run, "--limit", "1", "--seeds", "0",
+        "--condition", "single-local", "--quiet",
+    )  # fmt: skip
+    page = opened(run / "report.html")
+    assert page.get_by_text("No reply was scheduled").count() == 1
+    assert page.locator("#chart-success-latency svg").count() == 1
