@@ -4,7 +4,6 @@ import csv
 import json
 from dataclasses import asdict
 
-from harness.dataset.load import load
 from harness.operating_point import POINTS
 
 WAYS_IN = (
@@ -61,9 +60,9 @@ class Attacker:
         return PAYLOADS[self.turn % len(PAYLOADS)]
 
 
-def hostile(folder, dataset_path, n, conditions=PAYLOADS[:1]):
+def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     """Make a run: its manifest says nothing but payload n, its answers and decisions say all in turn."""
-    dataset, mine, said = load(dataset_path), PAYLOADS[n], Attacker(n)
+    mine, said = PAYLOADS[n], Attacker(n)
     scenes = dataset.scenes[::8]
     rows = [
         {
@@ -86,7 +85,7 @@ def hostile(folder, dataset_path, n, conditions=PAYLOADS[:1]):
         "model": {"name": mine, "engine": mine, mine: mine},
         "identity": {mine: mine},
         "prompt": {"version": mine, "sha256": mine},
-        "dataset": {"name": mine, "path": str(dataset_path), "sha256": dataset.sha256},
+        "dataset": {"name": mine, "path": str(dataset.path), "sha256": dataset.sha256},
         "actions": dataset.actions,
         "answer": mine,
         "conditions": [asdict(POINTS["6g"]) | {"name": name} for name in conditions],

@@ -57,13 +57,13 @@ def test_there_are_a_hundred_payloads_and_each_is_another():
 
 
 @pytest.fixture(scope="module", params=["many runs", "many conditions"])
-def attacked(request, small_path, tmp_path_factory):
+def attacked(request, small, tmp_path_factory):
     """The report and its text."""
     base = tmp_path_factory.mktemp("hostile")
     if request.param == "many runs":
-        folders = [hostile(base / str(n), small_path, n) for n in range(len(PAYLOADS))]
+        folders = [hostile(base / str(n), small, n) for n in range(len(PAYLOADS))]
     else:
-        folders = [hostile(base / "0", small_path, 0, PAYLOADS)]
+        folders = [hostile(base / "0", small, 0, PAYLOADS)]
 
     def prompts(run):
         turn = itertools.cycle(PAYLOADS)
