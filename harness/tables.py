@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from harness.drive.spec import FORMAT as DRIVE
 from harness.errors import UserError, printable
 from harness.memory import uncollected
+from harness.run.folder import answers_of
 from harness.run.spec import FORMAT as EVAL
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class Tables:
                     for action, value in zip(actions, row[name], strict=True)
                 }  # fmt: skip
                 decisions += ({**place, **_decision(d, actions), **known} for d in row["decisions"])
-                for viewers, answer in (*row["answers"].items(), *row.get("merged", {}).items()):
+                for viewers, answer in answers_of(row).items():
                     viewer, _, heard = viewers.partition("+")
                     answers.append({**place, "viewer": viewer, "heard": heard, **_answer(answer, actions)})
         return _table(decisions), _table(answers)

@@ -11,7 +11,7 @@ from harness.drive.spec import FORMAT as DRIVEN
 from harness.errors import UserError, printable
 from harness.operating_point import OperatingPoint
 from harness.report.words import facts
-from harness.run.folder import FROZEN, Run, read
+from harness.run.folder import FROZEN, Run, answers_of, read
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -130,5 +130,5 @@ def _settings(run: Run) -> dict[str, str]:
 
 def _answers(run: Run) -> Iterator[tuple[str, tuple[str, str]]]:
     for row in run.rows:
-        for viewer, answer in (*row["answers"].items(), *row.get("merged", {}).items()):
+        for viewer, answer in answers_of(row).items():
             yield f"{row['scene']}/{viewer}", (answer["role"], answer["verdict"])

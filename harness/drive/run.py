@@ -17,6 +17,7 @@ from harness.drive.summary import summary
 from harness.files import canonical_json, write_whole
 from harness.memory import uncollected
 from harness.run.evaluate import CONFIG, Evaluated, finished, refuse, tidy, working
+from harness.run.folder import answers_of
 from harness.run.spec import versions
 from harness.workers import spread
 
@@ -97,7 +98,7 @@ def _written(spec: Drive, out: Path, work: Path, begun: Mapping[str, Any]) -> Ev
     moments: list[Row] = [row for part in parts for row in part["moments"]]
     episodes: list[Row] = [row for part in parts for row in part["episodes"]]
     result = summary(spec, moments, episodes)
-    answers = [a for row in moments for a in (*row["answers"].values(), *row.get("merged", {}).values())]
+    answers = [a for row in moments for a in answers_of(row).values()]
     manifest = {
         "format": FORMAT,
         "name": out.name,

@@ -14,6 +14,7 @@ from harness.arrays import Floats
 from harness.drive.record import MEANS, Row
 from harness.drive.spec import Drive
 from harness.metrics import Estimate, seed_interval
+from harness.run.folder import answers_of
 from harness.run.summary import PERCENTILES, gains, long_table, of_answers, over_episodes, over_seeds
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def _estimates(
             yield point.name, f"latency_p{percent}_ms", over_seeds("latency", each), "seed means"
         yield point.name, "message_count", seed_interval(metrics["messages_per_episode"].sum(1)), "seed means"
     yield from gains(by_condition)
-    answers = [a for row in moments for a in (*row["answers"].values(), *row.get("merged", {}).values())]
+    answers = [a for row in moments for a in answers_of(row).values()]
     by_role = {role: [a for a in answers if a["role"] == role] for role in ("ego", "helper", "merge")}
     yield from of_answers({role: [a["verdict"] for a in given] for role, given in by_role.items()}, by_role)
 

@@ -1,18 +1,17 @@
 """The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from harness.drawing.pictures import BLUE, ORANGE, PURPLE, SKY, VERMILLION
 from harness.report.layers import (
     BASE,
-    INTERVAL,
     NUMBER,
     RULE,
     Rows,
     Spec,
     band,
     colours_of,
+    interval,
     layered,
     rules_at,
     shapes_of,
@@ -36,22 +35,16 @@ def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
     known = {key for row in rows for key, value in row.items() if value is not None}
-    intervals = [
-        {
-            "mark": INTERVAL,
-            "encoding": {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}, "color": colour},
-        },
-        {
-            "mark": INTERVAL,
-            "encoding": {
-                "x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y, "color": colour,
-            },
-        },
-    ]  # fmt: skip
+    intervals = {
+        "low": interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=colour),
+        "latency_low": interval(
+            x={**x, "field": "latency_low"}, x2={"field": "latency_high"}, y=y, color=colour
+        ),
+    }
     return layered(
         band(*REACTION_MS, "reaction window, 150 to 250 ms"),
         _references(references, y),
-        *(one for one, end in zip(intervals, ("low", "latency_low"), strict=True) if end in known),
+        *(one for end, one in intervals.items() if end in known),
         {
             "mark": {"type": "point", "filled": True, "size": 90, "opacity": 1},
             "encoding": {"x": x, "y": y, "color": colour, "shape": shape, "tooltip": tooltip(rows)},
@@ -88,18 +81,12 @@ def statuses(rows: Rows) -> Spec:
     for verdict, _ in met:
         colours.append(VERDICTS[verdict][taken[verdict] % len(VERDICTS[verdict])])
         taken[verdict] += 1
-    domain = [status for _, status in met]
-    bars = [{**row, "bar": _named(row, rows, "role"), "order": domain.index(row["status"])} for row in rows]
-    return _stacked(bars, "status", domain, colours, "answers")
+    return _stacked(rows, "role", "status", [status for _, status in met], colours, "answers")
 
 
 def replies(rows: Rows) -> Spec:
     """On time, late and lost replies, a stacked bar a run and condition."""
-    order = list(REPLIES)
-    bars = [
-        {**row, "bar": _named(row, rows, "condition"), "order": order.index(row["reply"])} for row in rows
-    ]
-    return _stacked(bars, "reply", order, list(REPLIES.values()), "replies")
+    return _stacked(rows, "condition", "reply", list(REPLIES), list(REPLIES.values()), "replies")
 
 
 def reliability(rows: Rows) -> Spec:
@@ -132,17 +119,24 @@ def arrivals(rows: Rows, window_ms: Sequence[float], width: float) -> Spec:
     return _bars(rows, "arrival_ms", title, "replies", width, series="condition", rules=window_ms)
 
 
-def _named(row: Mapping[str, Any], rows: Rows, field: str) -> str:
-    several = len({one["run"] for one in rows}) > 1
-    return f"{row['run']}: {row[field]}" if several else str(row[field])
-
-
-def _stacked(rows: Rows, field: str, domain: Sequence[str], colours: Sequence[str], what: str) -> Spec:
+def _stacked(
+    rows: Rows, by: str, field: str, domain: Sequence[str], colours: Sequence[str], what: str
+) -> Spec:
+    """A bar a run and `by`, in parts of the values of a field, in their order in `domain`."""
+    several = len({row["run"] for row in rows}) > 1
+    bars = [
+        {
+            **row,
+            "bar": f"{row['run']}: {row[by]}" if several else str(row[by]),
+            "order": domain.index(row[field]),
+        }
+        for row in rows
+    ]
     x = {"field": "share", **NUMBER, "stack": "zero", "title": what, "axis": {"format": "%"}}
     return {
         **BASE,
-        "height": 26 * len({row["bar"] for row in rows}),
-        "data": {"name": "values", "values": list(rows)},
+        "height": 26 * len({bar["bar"] for bar in bars}),
+        "data": {"name": "values", "values": bars},
         "mark": {"type": "bar", "stroke": "white", "strokeWidth": 0.6},
         "encoding": {
             "y": {
@@ -154,7 +148,7 @@ def _stacked(rows: Rows, field: str, domain: Sequence[str], colours: Sequence[st
                 "legend": {"orient": "top", "title": None},
             },
             "order": {"field": "order"},
-            "tooltip": tooltip(rows),
+            "tooltip": tooltip(bars),
         },
     }  # fmt: skip
 
@@ -166,10 +160,7 @@ def _shares(
     if not diagonal:
         y["scale"] = {"zero": True, "nice": True}
     layers: list[Spec] = [
-        {
-            "mark": INTERVAL,
-            "encoding": {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}, "color": colour},
-        },
+        interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=colour),
         {"mark": {"type": "line", "strokeWidth": 1.5}, "encoding": {"x": x, "y": y, "color": colour}},
         {
             "mark": {"type": "point", "filled": True, "size": 55, "opacity": 1},

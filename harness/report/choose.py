@@ -1,10 +1,10 @@
-"""Which decisions a report shows: the telling ones first, and then an even sample of the rest."""
+"""Which rows of a run tell most: where episodes begin to fail, others of note, and then an even sample."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from harness.drive.folder import Driven
-from harness.run.folder import Row, Run
+from harness.run.folder import Row, Run, answers_of
 
 FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
     "first failure",
@@ -15,7 +15,7 @@ FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
 
 
 class Pick(NamedTuple):
-    """A decision to show, the seed of the channel under which it is shown, and why."""
+    """A row, the seed of the channel under which it tells, and why it was chosen."""
 
     row: Row
     seed: int
@@ -86,7 +86,7 @@ def pick(rows: Sequence[Row], failed: Mapping[int, int], n: int) -> list[Pick]:
     for i, row in enumerate(rows):
         if len({d["action"] for d in decisions_of(row, seeds[i])}) > 1:
             kinds[DISAGREEMENT].append(i)
-        if any(a["verdict"] != "strict" for a in (*row["answers"].values(), *row.get("merged", {}).values())):
+        if any(a["verdict"] != "strict" for a in answers_of(row).values()):
             kinds[ANSWER].append(i)
     why: dict[int, str] = {}
     for kind, candidates in kinds.items():

@@ -5,8 +5,8 @@ from typing import Any
 from harness.drawing.pictures import uri
 from harness.drive.folder import Driven
 from harness.report import words
-from harness.report.runs import Runs, answers_of
-from harness.run.folder import Run
+from harness.report.runs import Runs
+from harness.run.folder import Run, answers_of
 
 EXAMPLES = 3  # of each status of answers
 
@@ -39,10 +39,11 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
     for n, run in enumerate(runs.runs):
         for row in run.rows:
             for viewer, answer in answers_of(row).items():
-                of = found.setdefault(answer["status"], [])
-                if answer["status"] != "strict" and len(of) < EXAMPLES:
-                    of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
-    return [{"status": status, "answers": of} for status, of in found.items() if of]
+                if answer["status"] != "strict":
+                    of = found.setdefault(answer["status"], [])
+                    if len(of) < EXAMPLES:
+                        of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
+    return [{"status": status, "answers": of} for status, of in found.items()]
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:

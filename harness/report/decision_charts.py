@@ -10,7 +10,7 @@ TIMES = {
 
 
 def policies() -> Spec:
-    """Distributions before and after fusion; the page fills in `values`: who, what, action, p, order."""
+    """Distributions before and after fusion; the page fills in `values`: who, what, action, p."""
     return {
         **BASE,
         "data": {"name": "values", "values": []},

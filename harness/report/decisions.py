@@ -13,14 +13,15 @@ from harness.files import digest
 from harness.parse import Status, spans
 from harness.report import scenes
 from harness.report.choose import failures, pick
-from harness.report.runs import Runs, answers_of
-from harness.run.folder import Row, Run
+from harness.report.runs import Runs
+from harness.run.folder import Row, Run, answers_of
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
 
 Messages = Sequence[Mapping[str, Any]]
-Prompts = Callable[[Run], Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]] | None]
+Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
+Prompts = Callable[[Run], Sent | None]
 GOOD, SLOW, BAD, BLAMELESS, ABSENT = "s", "d", "u", "n", "-"
 KEPT = (
     "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
@@ -29,7 +30,7 @@ KEPT = (
 LEFT_OUT = ("seed", "safe", "delay_s", "fusion_ms", "effective_loss", "observed_loss", "normalised_entropy")
 
 
-def prompts_of(run: Run) -> Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]] | None:
+def prompts_of(run: Run) -> Sent | None:
     """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
     version, actions = str(run.config["prompt"]["version"]), tuple(run.config["actions"])
     if version not in versions.names():
@@ -60,8 +61,8 @@ class Decisions:
         first = {scene: row for rows in reversed(self._rows) for scene, row in rows.items()}
         order = sorted(first.items(), key=lambda one: (one[1]["episode"], one[1]["step"], one[0]))
         self.ids = [scene for scene, _ in order]
-        self._scenes = self._frozen() if runs.dataset else self._played()
         failed = [failures(run) for run in runs.runs]
+        self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self.index = {
             "actions": runs.actions,
             "scenes": [[scene, row["episode"], row["step"], row["danger"]] for scene, row in order],
@@ -86,10 +87,12 @@ class Decisions:
                     )
         return found
 
-    def _played(self) -> dict[str, Scene]:
+    def _played(self, failed: Sequence[Mapping[int, int]]) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
         telling = [
-            str(c.row["scene"]) for run in self._runs.runs for c in pick(run.rows, failures(run), REPLAYED)
+            str(chosen.row["scene"])
+            for run, of in zip(self._runs.runs, failed, strict=True)
+            for chosen in pick(run.rows, of, REPLAYED)
         ]
         found: dict[str, Scene] = {}
         for name in dict.fromkeys(telling):

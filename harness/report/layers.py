@@ -19,7 +19,6 @@ TAKEN = {
     "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
 }  # fmt: skip
 RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
-INTERVAL: Spec = {"type": "rule", "strokeWidth": 1.4}
 RUN = "run"  # name of the parameter that chooses one of several runs
 NUMBER: Spec = {"type": "quantitative"}
 BASE: Spec = {
@@ -82,6 +81,11 @@ def tooltip(rows: Rows) -> list[Spec]:
         {"field": name, "format": ".3~f"} if isinstance(value, float) else {"field": name}
         for name, value in (rows[0] if rows else {}).items()
     ]
+
+
+def interval(**encoding: Spec) -> Spec:
+    """A line from one end of an interval, along x or y, to the other, which is the channel x2 or y2."""
+    return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
 
 def band(start: float, end: float, what: str) -> Spec:

@@ -8,9 +8,9 @@ import numpy as np
 
 from harness.errors import UserError, printable
 from harness.paired import SuccessTest, success_test
-from harness.report.runs import Runs, answers_of
+from harness.report.runs import Runs
 from harness.report.words import LATENCY, SUCCESS, success_of
-from harness.run.folder import Run, Score, table
+from harness.run.folder import Run, Score, answers_of, table
 
 P_VALUE = 0.05
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
@@ -82,7 +82,6 @@ class Grid:
 
 METRICS = (
     SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", "brier",
-    "deadline_miss_rate", "trigger_rate",
 )  # fmt: skip
 
 

@@ -102,7 +102,6 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "model": run.config["model"].get("name"),
                 "inference_s": run.config["latency"]["inference_s"],
                 "merge_s": run.config["latency"].get("merge_s"),
                 "points": {

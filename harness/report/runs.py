@@ -9,7 +9,7 @@ from typing import Any
 from harness.dataset.load import Dataset
 from harness.drive.folder import LIVE, Driven, driven
 from harness.errors import UserError, printable
-from harness.run.folder import FROZEN, Row, Run, dataset_of, read
+from harness.run.folder import FROZEN, Run, answers_of, dataset_of, read
 
 # What a page reads of each decision, of each of its messages, and of each answer.
 DECISION = ("entropy_nats", "triggered", "own_weight", "own_failed", "latency_ms", "deadline_missed")
@@ -70,11 +70,6 @@ def gather(paths: Sequence[Path]) -> Runs:
     return Runs(tuple(found), _names(found), dataset)
 
 
-def answers_of(row: Row) -> dict[str, Row]:
-    """All answers of a row: by viewer, and the ego's second ones by whose messages they had."""
-    return {**row["answers"], **row.get("merged", {})}
-
-
 def _check(run: Run) -> None:
     """Raises UserError for a row that says less, or something else, than its run's manifest lets it."""
     actions, conditions, seeds = run.config["actions"], run.conditions, run.config["seeds"]
@@ -125,8 +120,8 @@ def _names(runs: Sequence[Run]) -> tuple[str, ...]:
         names = [" · ".join(part[:many]) for part in parts]
         if len(set(names)) == len(names):
             return tuple(names)
-    count: Counter[str] = Counter()
+    total, turn = Counter(names), Counter[str]()
     for n, name in enumerate(names):
-        count[name] += 1
-        names[n] += f" ({count[name]})" if names.count(name) > 1 or count[name] > 1 else ""
+        turn[name] += 1
+        names[n] += f" ({turn[name]})" if total[name] > 1 else ""
     return tuple(names)

@@ -101,6 +101,11 @@ class Run:
         return min(found, key=lambda s: s.interval != "episodes", default=None)
 
 
+def answers_of(row: Row) -> dict[str, Row]:
+    """All answers of a row: by viewer, and the ego's second ones by whose messages they had."""
+    return {**row["answers"], **row.get("merged", {})}
+
+
 def read(path: Path, *forms: Form) -> Run:
     """Read a run folder of one of these forms; of a frozen run, where none is given.
 

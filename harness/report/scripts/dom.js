@@ -41,7 +41,6 @@ function block(n) {
 }
 
 const number = (value, digits) => (value == null ? "–" : value.toFixed(digits));
-const percent = (value, digits = 0) => (value == null ? "–" : `${(100 * value).toFixed(digits)} %`);
 
 function download(name, content) {
   const url = URL.createObjectURL(content);
