@@ -22,14 +22,15 @@ from typing import Any
 
 import shapes
 
-from harness import cards, prompts
+from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
+from harness.coordination.operating_point import POINTS
+from harness.core.resources import DATASET
 from harness.dataset import load
-from harness.operating_point import POINTS
-from harness.resources import DATASET
-from harness.run.asking import requests
-from harness.run.spec import Spec
+from harness.evaluate.asking import requests
+from harness.evaluate.spec import Spec
+from harness.prompts import versions as prompts
 
 JSON_TOKENS = 43  # of a compact answer with three actions, in Qwen's vocabulary
 AIMS = {"constrained": 4.0, "readout": 12.0}

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination import coordinate
-from harness.exchange import Luck
-from harness.operating_point import POINTS
+from harness.coordination.coordinate import coordinate
+from harness.coordination.exchange import Luck
+from harness.coordination.operating_point import POINTS
 
 AIM_S = 1.0
 HELPERS, ACTIONS = 3, 3

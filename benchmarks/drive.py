@@ -21,14 +21,17 @@ from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from harness import cards, live, prompts, simulator
+from harness.backends import cards
 from harness.backends.proxy import Proxy
+from harness.coordination.operating_point import POINTS
 from harness.dataset import freeze
-from harness.drive.engine import drive
-from harness.drive.run import run
-from harness.drive.spec import Drive, spec_of
-from harness.operating_point import POINTS
-from harness.world import World
+from harness.evaluate.drive import run
+from harness.evaluate.live import drive
+from harness.evaluate.live_spec import Drive, spec_of
+from harness.prompts import versions as prompts
+from harness.world import reference as live
+from harness.world import simulator
+from harness.world.world import World
 
 LATENCY = {"source": "card", "inference_s": {"ego": 0.145, "helper": 0.145}, "basis": "the proxy's card"}
 # Functions whose time makes up a part: frames, what is seen, and who drives. The rest is the harness's own.

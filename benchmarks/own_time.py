@@ -22,15 +22,17 @@ from time import process_time
 from typing import Any
 from unittest.mock import patch
 
-from harness import cards, prompts
+from harness.backends import cards
 from harness.backends.proxy import Proxy
+from harness.coordination.operating_point import POINTS
+from harness.core.files import canonical_json
+from harness.core.resources import DATASET
 from harness.dataset import load
-from harness.files import canonical_json
-from harness.operating_point import POINTS
-from harness.prompts import Prompt
-from harness.resources import DATASET
-from harness.run import asking, evaluate, intents, record
-from harness.run.spec import Spec
+from harness.evaluate import asking, evaluate, intents
+from harness.evaluate.spec import Spec
+from harness.prompts import versions as prompts
+from harness.prompts.versions import Prompt
+from harness.runs import record
 
 AIM_MS = 0.3
 # Functions whose time makes up a part; `complete` is the backend's own and no part of the harness.

@@ -19,15 +19,16 @@ from typing import Any
 
 from playwright.sync_api import Browser, sync_playwright
 
-from harness import cards, prompts
+from harness.backends import cards
+from harness.coordination.operating_point import POINTS
+from harness.core.resources import DATASET
 from harness.dataset.load import Scene, find, load
-from harness.operating_point import POINTS
+from harness.evaluate.evaluate import evaluate
+from harness.evaluate.spec import Spec
+from harness.prompts import versions as prompts
 from harness.report.page import render
 from harness.report.runs import Runs, gather
-from harness.resources import DATASET
-from harness.run.evaluate import evaluate
-from harness.run.folder import Row
-from harness.run.spec import Spec
+from harness.runs.folder import Row
 
 READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from harness import tokens
+from harness.backends import tokens
 
 # Hidden, feed-forward, layers, heads, tied: config.json of Qwen3-0.6B and -4B; 8 key-value heads of 128.
 SHAPES = {"0.6b": (1024, 3072, 28, 16, True), "4b": (2560, 9728, 36, 32, True)}

@@ -18,8 +18,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from harness.core.resources import DATASET
 from harness.dataset import load
-from harness.resources import DATASET
 
 AIMS_S = {"help": 0.15, "first_call": 0.7, "first_decision_wall": 2.0}
 
@@ -49,7 +49,7 @@ main()
 # The first answers are those that latency is measured by: one to warm up, then a scene's ego and its helpers.
 FIRST_DECISION = """
 import os, sys
-from harness.backends.child import Child
+from harness.backends.llama_cpp.child import Child
 from harness.cli import main
 
 answered, complete = [], Child.complete

@@ -16,11 +16,11 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from harness.operating_point import POINTS
-from harness.study.calibrated import STEPS, Calibrated
-from harness.study.paper import SEEDS, panels
-from harness.study.play import play
-from harness.study.setting import Setting
+from harness.coordination.operating_point import POINTS
+from harness.studies.calibrated import STEPS, Calibrated
+from harness.studies.paper import SEEDS, panels
+from harness.studies.play import play
+from harness.studies.setting import Setting
 
 HARNESS = [sys.executable, "-m", "harness"]
 

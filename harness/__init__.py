@@ -2,12 +2,12 @@
 
 from typing import TYPE_CHECKING
 
-from harness.errors import UserError
+from harness.core.errors import UserError
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from harness.tables import Tables
+    from harness.runs.tables import Tables
 
 __all__ = ["UserError", "load"]
 __version__ = "0.1.0"
@@ -24,6 +24,6 @@ def load(run: "str | PathLike[str]") -> "Tables":
     """
     from pathlib import Path
 
-    from harness.tables import load as read
+    from harness.runs.tables import load as read
 
     return read(Path(run))

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from harness import cards, prompts
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
+from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.dataset.load import Dataset
-from harness.frozen import Table, table
-from harness.operating_point import POINTS, OperatingPoint
-from harness.run.asking import ask_all, requests
-from harness.run.evaluate import Evaluated, evaluate
-from harness.run.intents import Intents, intents
-from harness.run.scoring import Scored, draw, score
-from harness.run.spec import Spec
+from harness.evaluate.asking import ask_all, requests
+from harness.evaluate.evaluate import Evaluated, evaluate
+from harness.evaluate.intents import Intents, intents
+from harness.evaluate.scoring import Scored, draw, score
+from harness.evaluate.spec import Spec
+from harness.evaluate.success import Table, table
+from harness.prompts import versions as prompts
 
 FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
 

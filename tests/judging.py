@@ -9,8 +9,8 @@ from corpus import ACTIONS
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from harness.answer_schema import answer_schema
-from harness.parse import Parsed, parse
+from harness.parsing.parse import Parsed, parse
+from harness.prompts.answer_schema import answer_schema
 
 # Whether a shared machine is slow today is no property of the parser.
 unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

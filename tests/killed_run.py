@@ -16,7 +16,7 @@ from pathlib import Path
 from evaluating import run, spec_of
 
 from harness.dataset.load import load
-from harness.run.spec import Spec
+from harness.evaluate.spec import Spec
 
 CHANGES = ("fsync", "mkdir", "replace", "rmdir", "unlink")
 

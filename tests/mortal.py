@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends.base import Completion, Request
-from harness.errors import UserError
+from harness.core.errors import UserError
 
 
 def open(graves: Path, deaths: int = 0, complaint: str = "") -> "Mortal":

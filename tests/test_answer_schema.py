@@ -5,8 +5,8 @@ from typing import Any
 import jsonschema
 import pytest
 
-from harness.answer_schema import answer_schema
-from harness.errors import UserError
+from harness.core.errors import UserError
+from harness.prompts.answer_schema import answer_schema
 
 ACTIONS = ("LANE_LEFT", "IDLE")
 HALVES = {"LANE_LEFT": 0.5, "IDLE": 0.5}

@@ -15,17 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
 
-from harness import cards, prompts
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Rendering, Request
 from harness.backends.cache import NOT_IN_KEY, Cached, default_file, key
+from harness.backends.cards import Latency
 from harness.backends.completion_file import CompletionFile
 from harness.backends.registry import open_backend
-from harness.cards import Latency
+from harness.coordination.operating_point import POINTS
+from harness.core.files import digest
 from harness.dataset.load import Dataset, load
-from harness.files import digest
-from harness.operating_point import POINTS
-from harness.run.evaluate import Evaluated, evaluate
-from harness.run.spec import Spec
+from harness.evaluate.evaluate import Evaluated, evaluate
+from harness.evaluate.spec import Spec
+from harness.prompts import versions as prompts
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)
@@ -348,7 +349,7 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    from harness import gguf_export
+    from harness.training import gguf_export
 
     folder = tiny_qwen3.build(tmp_path / "tiny", context_tokens=2048)
     gguf_export.export(folder, tmp_path / "tiny.gguf", "F32")

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from harness import cards, resources
-from harness.errors import UserError
-from harness.failures import Failures
-from harness.servers import Server
+from harness.backends import cards
+from harness.backends.failures import Failures
+from harness.backends.servers import Server
+from harness.core import resources
+from harness.core.errors import UserError
 
 SERVED = """\
 engine = "openai"

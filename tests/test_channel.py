@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.channel import NO_CHANNEL, PROFILES, density_coupled_loss, link_up, reply_delay_s
-from harness.luck import uniforms
+from harness.coordination.channel import NO_CHANNEL, PROFILES, density_coupled_loss, link_up, reply_delay_s
+from harness.core.noise import uniforms
 
 V2X, SIXG = PROFILES["v2x"], PROFILES["6g"]
 RANGE_M = np.array([10.0, 20.0, 30.0])

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from harness.backends.base import Request
-from harness.backends.child import LOADS, Child
-from harness.errors import UserError
+from harness.backends.llama_cpp.child import LOADS, Child
+from harness.core.errors import UserError
 
 TESTS = Path(__file__).parent
 

@@ -15,8 +15,8 @@ from tokenizers import Tokenizer, models
 
 from harness import cli
 from harness.cli.evaluate import default_out, parse_seeds
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.errors import UserError
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from harness.consensus import (
+from harness.coordination.consensus import (
     RULES,
     inverse_distance_weights,
     linear_pool,

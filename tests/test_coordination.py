@@ -10,9 +10,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from harness.coordination import Coordination, coordinate
-from harness.exchange import Luck
-from harness.operating_point import POINTS, OperatingPoint
+from harness.coordination.coordinate import Coordination, coordinate
+from harness.coordination.exchange import Luck
+from harness.coordination.operating_point import POINTS, OperatingPoint
 
 DOUBT = (0.3, 0.4, 0.3)
 ALONE, V2X, SIXG = POINTS["single-local"], POINTS["v2x"], POINTS["6g"]

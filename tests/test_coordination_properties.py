@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.consensus import RULES
-from harness.coordination import Coordination, coordinate
-from harness.exchange import Luck
-from harness.operating_point import POINTS, OperatingPoint
+from harness.coordination.consensus import RULES
+from harness.coordination.coordinate import Coordination, coordinate
+from harness.coordination.exchange import Luck
+from harness.coordination.operating_point import POINTS, OperatingPoint
 
 COOPERATIVE = [POINTS["v2x"], POINTS["6g"], replace(POINTS["6g"], density_coupled=True)]
 Case = dict[str, Any]

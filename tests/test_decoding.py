@@ -17,16 +17,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness import readout
 from harness.backends.base import AnswerMode, Completion, Request
+from harness.backends.cards import resolve
 from harness.backends.decoding import Decoding
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
-from harness.backends.transformers_engine import TransformersEngine
-from harness.cards import resolve
-from harness.errors import UserError
-from harness.parse import parse
-from harness.rounding import rounded
+from harness.backends.transformers.engine import TransformersEngine
+from harness.core.errors import UserError
+from harness.core.rounding import rounded
+from harness.parsing.parse import parse
+from harness.prompts import readout
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 LANES = ("LANE_LEFT", "IDLE", "LANE_RIGHT")

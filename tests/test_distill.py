@@ -16,18 +16,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from harness import prompts, readout
 from harness.cli import app
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load, shared
-from harness.distill import teacher
-from harness.distill.answers import answer, message
-from harness.distill.distill import distill
-from harness.distill.examples import alone, excerpts, kl_nats, split, with_messages
-from harness.distill.muon import Muon, orthogonal
-from harness.distill.text import chat
-from harness.distill.train import STAGES, Plan
-from harness.errors import UserError
-from harness.parse import parse
+from harness.parsing.parse import parse
+from harness.prompts import readout
+from harness.prompts import versions as prompts
+from harness.training import teacher
+from harness.training.answers import answer, message
+from harness.training.distill import distill
+from harness.training.examples import alone, excerpts, kl_nats, split, with_messages
+from harness.training.muon import Muon, orthogonal
+from harness.training.text import chat
+from harness.training.train import STAGES, Plan
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 PLAN = Plan({"excerpts": 64, "alone": 128, "messages": 64, "answers": 96}, batch=8)
@@ -47,7 +48,7 @@ def few(small_path: Path) -> Dataset:
 def student(few: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "student"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.distill.train.LOG_STEPS", 4)
+        patch.setattr("harness.training.train.LOG_STEPS", 4)
         distill(few, VERSIONS, PLAN, out, lambda stage, seen, loss: None, "cpu")
     return out
 
@@ -197,8 +198,8 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, fe
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, few: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.distill.train.KEEP_S", 0.0)
-    monkeypatch.setattr("harness.distill.train.LOG_STEPS", 4)
+    monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
+    monkeypatch.setattr("harness.training.train.LOG_STEPS", 4)
     out = tmp_path / "student"
     for kill in (("alone", 96), ("answers", 64)):
 

@@ -7,11 +7,11 @@ from typing import get_args
 import pytest
 
 from harness.backends.base import AnswerMode
-from harness.compare.table import METRICS
-from harness.consensus import NAMES
-from harness.failures import Failures
-from harness.operating_point import POINTS, SETTINGS
-from harness.parse import Repair, Status
+from harness.backends.failures import Failures
+from harness.coordination.consensus import NAMES
+from harness.coordination.operating_point import POINTS, SETTINGS
+from harness.parsing.parse import Repair, Status
+from harness.report.compare.table import METRICS
 
 ROOT = Path(__file__).parent.parent
 

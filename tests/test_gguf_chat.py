@@ -13,8 +13,8 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import tiny_qwen3
 
 from harness.backends.chat import Chat
-from harness.backends.gguf_chat import GgufChat
-from harness.errors import UserError
+from harness.backends.llama_cpp.chat import GgufChat
+from harness.core.errors import UserError
 
 MESSAGES = (
     {"role": "system", "content": "You drive.\n <b>é</b> & 'don't' 日本"},

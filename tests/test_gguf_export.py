@@ -15,9 +15,9 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import tiny_qwen3
 from gguf import GGUFReader, TokenType
 
-from harness.errors import UserError
-from harness.gguf_export import export
-from harness.tokens import tokenizer
+from harness.backends.tokens import tokenizer
+from harness.core.errors import UserError
+from harness.training.gguf_export import export
 
 
 @pytest.fixture(scope="module")

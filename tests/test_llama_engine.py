@@ -21,19 +21,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 
-from harness import readout, resources
-from harness.arrays import Floats
-from harness.backends import llama_backend
 from harness.backends.base import Request
-from harness.backends.llama_backend import LlamaBackend
-from harness.backends.llama_engine import LlamaEngine, LlamaSession
-from harness.backends.llama_model import LlamaModel
+from harness.backends.cards import Card, Latency
+from harness.backends.llama_cpp import backend as llama_backend
+from harness.backends.llama_cpp.backend import LlamaBackend
+from harness.backends.llama_cpp.engine import LlamaEngine, LlamaSession
+from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.registry import missing, open_backend
-from harness.cards import Card, Latency
+from harness.core import resources
+from harness.core.arrays import Floats
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.gguf_export import export
-from harness.run.asking import requests
+from harness.evaluate.asking import requests
+from harness.prompts import readout
+from harness.training.gguf_export import export
 
 VOCABULARY = 375
 
@@ -412,7 +413,7 @@ def test_a_file_in_the_hubs_cache_is_known_by_its_commit(
 def test_a_file_of_ones_own_is_known_by_its_content_and_by_what_reads_it(
     tiny: Path, backend: LlamaBackend
 ) -> None:
-    from harness.files import sha256_file
+    from harness.core.files import sha256_file
 
     identity = backend.identity()
     assert json.loads(json.dumps(identity)) == identity

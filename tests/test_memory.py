@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from harness.memory import uncollected
+from harness.core.memory import uncollected
 
 
 def test_nothing_is_collected_inside_and_all_is_as_before_outside():

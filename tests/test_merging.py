@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from evaluating import FILES, Scripted, ask, decisions, figure, rows_of, run, says, spec_of, sure
 
+from harness.coordination.exchange import Luck
+from harness.coordination.operating_point import POINTS, named_point
+from harness.core.errors import UserError
+from harness.core.files import digest
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.exchange import Luck
-from harness.files import digest
-from harness.operating_point import POINTS, named_point
-from harness.prompts import load as prompt
-from harness.run import merging
-from harness.run.again import Asking
-from harness.run.evaluate import Evaluated, evaluate
-from harness.study.setting import Setting
-from harness.study.stored import Stored
+from harness.evaluate import merging
+from harness.evaluate.again import Asking
+from harness.evaluate.evaluate import Evaluated, evaluate
+from harness.prompts.versions import load as prompt
+from harness.studies.setting import Setting
+from harness.studies.stored import Stored
 
 MERGE = named_point("6g:consensus=ego-prompt")
 LANGUAGE_MODEL = "swarm-tiny"  # its card: answers come from a script, or from itself

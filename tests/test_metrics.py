@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.metrics import (
+from harness.core.statistics import (
     Estimate,
     brier,
     episode_interval,

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from harness import cards, cli
+from harness import cli
+from harness.backends import cards
 from harness.backends.registry import open_backend
-from harness.errors import UserError
-from harness.files import sha256_file
+from harness.core.errors import UserError
+from harness.core.files import sha256_file
 
 
 def harness(
@@ -89,7 +90,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    from harness import gguf_export
+    from harness.training import gguf_export
 
     folder = tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=4096)
     gguf_export.export(folder, folder / "tiny-f32.gguf", "F32")

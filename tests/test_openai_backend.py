@@ -16,14 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import Asked, Play, completion, read_out, serving
 
-from harness import cli, resources
-from harness.backends import openai_backend, openai_http
+from harness import cli
 from harness.backends.base import AnswerMode, Completion, Request
-from harness.backends.openai_shapes import body, read
-from harness.cards import Card, Latency, Thinking
-from harness.errors import UserError
-from harness.parse import parse
-from harness.servers import KINDS, Kind, Server
+from harness.backends.cards import Card, Latency, Thinking
+from harness.backends.openai import backend as openai_backend
+from harness.backends.openai import http as openai_http
+from harness.backends.openai.shapes import body, read
+from harness.backends.servers import KINDS, Kind, Server
+from harness.core import resources
+from harness.core.errors import UserError
+from harness.parsing.parse import parse
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 KEY = "sk-5ecret/+very"

@@ -14,16 +14,16 @@ from pathlib import Path
 import pytest
 from evaluating import rows_of, run, spec_of
 
-from harness import cards
-from harness.backends import openai_backend
+from harness.backends import cards
 from harness.backends.base import AnswerMode, Completion, Request
+from harness.backends.cards import Card, Latency
+from harness.backends.openai import backend as openai_backend
 from harness.backends.registry import open_backend
-from harness.cards import Card, Latency
+from harness.backends.servers import Server
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
-from harness.errors import UserError
-from harness.parse import parse
-from harness.run.asking import requests
-from harness.servers import Server
+from harness.evaluate.asking import requests
+from harness.parsing.parse import parse
 
 NEEDED = ("torch", "transformers", "llama_cpp", "fastapi", "uvicorn", "starlette_context", "sse_starlette",
           "pydantic_settings")  # fmt: skip
@@ -40,7 +40,7 @@ def gguf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from safetensors.torch import load_file, save_file
     from tokenizers import Tokenizer
 
-    from harness.gguf_export import export
+    from harness.training.gguf_export import export
 
     folder = tiny_qwen3.build(tmp_path_factory.mktemp("served") / "tiny", context_tokens=2048)
     ids = Tokenizer.from_file(str(folder / "tokenizer.json"))

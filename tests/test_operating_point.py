@@ -5,8 +5,8 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from harness.errors import UserError
-from harness.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.core.errors import UserError
 
 
 def test_the_paper_has_three_operating_points_that_differ_only_in_the_channel():

@@ -15,12 +15,12 @@ import transformers
 from evaluating import spec_of
 from typer.testing import CliRunner
 
-from harness import cards
+from harness.backends import cards
 from harness.cli import app
 from harness.dataset.load import Dataset
-from harness.gguf_export import export
-from harness.parity import PASSES, Finding, compare
-from harness.run.asking import requests
+from harness.evaluate.asking import requests
+from harness.training.gguf_export import export
+from harness.training.parity import PASSES, Finding, compare
 
 PROMPTS = 4
 

@@ -3,7 +3,7 @@
 import pytest
 from corpus import ACTIONS, CASES, Case
 
-from harness.parse import Repair, Status, parse
+from harness.parsing.parse import Repair, Status, parse
 
 MESSAGE = ("evidence", "risk", "recommended_maneuver", "confidence")
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judging import ego, hundredths, judged_strict, unhurried
 
-from harness.parse import Status
+from harness.parsing.parse import Status
 
 # The sum is the checksum. One edited character changes a distribution in hundredths by 0.01 or more, or by a
 # third decimal, which is at most 0.009. So a changed intent is never exact, but for that decimal's 0.001.

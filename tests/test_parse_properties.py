@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judging import ROLES, hundredths, unhurried
 
-from harness.errors import UserError
-from harness.parse import Parsed, Status, parse
+from harness.core.errors import UserError
+from harness.parsing.parse import Parsed, Status, parse
 
 PIECES = st.sampled_from(
     [

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judging import ROLES, hundredths, judged_strict, unhurried
 
-from harness.parse import Status, parse
+from harness.parsing.parse import Status, parse
 
 NAMES = st.lists(
     st.from_regex(r"[A-Z]{2,6}(_[A-Z]{2,6})?", fullmatch=True), min_size=2, max_size=6, unique=True

@@ -12,11 +12,11 @@ from graphs import ACTIONS, CAR, CASES, MESSAGES, STANDING, TRUCK, graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness import prompts
+from harness.backends.tokens import counter, tokenizer
+from harness.core.errors import UserError
+from harness.core.resources import folder
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.resources import folder
-from harness.tokens import counter, tokenizer
+from harness.prompts import versions as prompts
 
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = prompts.names()

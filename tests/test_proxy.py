@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from harness.backends.base import Request
 from harness.backends.proxy import answer, distribution
+from harness.coordination.trigger import entropy_nats
 from harness.dataset.load import Dataset
-from harness.parse import parse
-from harness.perception.graph import truth_graph
-from harness.prompts import load
-from harness.scenarios.occluded_intersection import Parameters
-from harness.trigger import entropy_nats
+from harness.parsing.parse import parse
+from harness.prompts.versions import load
+from harness.world.perception.graph import truth_graph
+from harness.world.scenarios.occluded_intersection import Parameters
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 TAU_NATS = 0.7  # the paper's threshold

@@ -9,15 +9,15 @@ import pytest
 from evaluating import FILES, decisions, figure, rows_of, run, spec_of
 from scipy.stats import binom
 
-from harness import cards
+from harness.backends import cards
 from harness.backends.base import Request
+from harness.backends.failures import Failures
 from harness.backends.proxy import answer
 from harness.backends.registry import open_backend
 from harness.backends.spoiling import drawn, spoilt
+from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
-from harness.failures import Failures
-from harness.metrics import rate_interval
-from harness.parse import parse
+from harness.parsing.parse import parse
 
 FAULTY = cards.load("proxy-faulty").failures or Failures()
 STATUS = {

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from small_hub import COMMIT, serving
 
-from harness.backends import checkpoint
-from harness.cards import Card, Latency
-from harness.errors import UserError
-from harness.files import sha256_bytes
+from harness.backends.cards import Card, Latency
+from harness.backends.transformers import checkpoint
+from harness.core.errors import UserError
+from harness.core.files import sha256_bytes
 
 CHECKPOINT: Mapping[str, bytes | None] = {
     "config.json": b"{}",

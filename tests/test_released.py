@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from harness import prompts
+from harness.core.files import sha256_file
 from harness.dataset.verify import check
-from harness.files import sha256_file
+from harness.prompts import versions as prompts
 
 ROOT = Path(__file__).parent.parent
 DATASETS = tomllib.loads((ROOT / "datasets/released.toml").read_text())

@@ -13,14 +13,15 @@ import pandas as pd
 import pytest
 from evaluating import FILES, decisions, figure, rows_of, run, spec_of
 
-from harness import cards, prompts
-from harness.cards import Latency
+from harness.backends import cards
+from harness.backends.cards import Latency
+from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
-from harness.drivers import DRIVERS
-from harness.errors import UserError
-from harness.frozen import driver_choices
-from harness.operating_point import POINTS, OperatingPoint
-from harness.run.spec import Spec
+from harness.evaluate.spec import Spec
+from harness.evaluate.success import driver_choices
+from harness.prompts import versions as prompts
+from harness.world.drivers import DRIVERS
 
 ALL = tuple(POINTS)
 

@@ -8,11 +8,11 @@ import pytest
 from evaluating import FILES, run, spec_of
 
 from harness.backends.registry import open_backend
+from harness.core.errors import UserError
+from harness.core.files import alone
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.files import alone
-from harness.run.asking import ask_all, read_kept, requests
-from harness.run.evaluate import evaluate
+from harness.evaluate.asking import ask_all, read_kept, requests
+from harness.evaluate.evaluate import evaluate
 
 RESULT = {*FILES, "run.json"}
 

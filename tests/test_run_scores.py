@@ -14,16 +14,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness import cards
+from harness.backends import cards
 from harness.backends.base import Completion, Request
-from harness.cards import Latency
+from harness.backends.cards import Latency
+from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
-from harness.frozen import table
-from harness.operating_point import OperatingPoint
-from harness.run import record
-from harness.run.scoring import draw, score, statuses
-from harness.run.summary import COLUMNS, summary
-from harness.run.timing import inference_s, measure
+from harness.evaluate.scoring import draw, score, statuses
+from harness.evaluate.success import table
+from harness.evaluate.timing import inference_s, measure
+from harness.runs import record
+from harness.runs.summary import COLUMNS, summary
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter

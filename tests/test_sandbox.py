@@ -5,7 +5,7 @@ from jinja2 import StrictUndefined, UndefinedError
 from jinja2.exceptions import SecurityError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from harness.prompts import LOOP, Sandbox
+from harness.prompts.versions import LOOP, Sandbox
 
 SANDBOX = Sandbox(undefined=StrictUndefined)
 

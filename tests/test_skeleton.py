@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.answer_schema import answer_schema
 from harness.backends.skeleton import TWO_DIGITS, Skeleton, finished, parts, tokens_after
-from harness.errors import UserError
-from harness.parse import parse
-from harness.tokens import tokenizer
+from harness.backends.tokens import tokenizer
+from harness.core.errors import UserError
+from harness.parsing.parse import parse
+from harness.prompts.answer_schema import answer_schema
 
 THREE = ("SLOWER", "IDLE", "FASTER")
 FIVE = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")

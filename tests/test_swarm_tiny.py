@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from evaluating import decisions, figure, rows_of, run, spec_of
 
+from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
-from harness.resources import DATASET
-from harness.run.evaluate import Evaluated
+from harness.evaluate.evaluate import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 

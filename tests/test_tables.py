@@ -11,11 +11,12 @@ import pytest
 from evaluating import rows_of, run, spec_of
 
 import harness
-from harness import cards, prompts
+from harness.backends import cards
+from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
-from harness.drive.run import run as drive
-from harness.drive.spec import spec_of as live_spec
-from harness.operating_point import POINTS
+from harness.evaluate.drive import run as drive
+from harness.evaluate.live_spec import spec_of as live_spec
+from harness.prompts import versions as prompts
 
 ROOT = Path(__file__).parent.parent
 ACTIONS = ("SLOWER", "IDLE", "FASTER")

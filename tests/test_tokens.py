@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from harness.cards import resolve
-from harness.errors import UserError
-from harness.tokens import counter, tokenizer
+from harness.backends.cards import resolve
+from harness.backends.tokens import counter, tokenizer
+from harness.core.errors import UserError
 
 MESSAGES = ({"role": "system", "content": "ab"}, {"role": "user", "content": "ba 17"})
 

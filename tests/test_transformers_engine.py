@@ -15,12 +15,13 @@ import tiny_qwen3
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.backends import checkpoint, checkup
+from harness.backends import checkup
 from harness.backends.base import Completion, Request
+from harness.backends.cards import Card, Latency, load, resolve
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
-from harness.cards import Card, Latency, load, resolve
-from harness.errors import UserError
+from harness.backends.transformers import checkpoint
+from harness.core.errors import UserError
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

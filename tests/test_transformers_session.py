@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from transformers import Gemma3ForCausalLM, Gemma3TextConfig, Qwen3Config, Qwen3ForCausalLM
 
-from harness.backends import prefixes
-from harness.backends.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
-from harness.backends.transformers_session import Reader
+from harness.backends.transformers import prefixes
+from harness.backends.transformers.prefixes import LEAST_TOKENS, Prefix, Prefixes, common
+from harness.backends.transformers.session import Reader
 
 SHAPE: dict[str, Any] = {
     "vocab_size": 64, "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from harness.trigger import entropy_nats, normalised_entropy, triggered
+from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def build(folder: Path, *, template: str | None = TEMPLATE, context_tokens: int 
     from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast, Qwen3Config, Qwen3ForCausalLM
 
-    from harness.tokens import QWEN2_SPLIT
+    from harness.backends.tokens import QWEN2_SPLIT
 
     bpe = Tokenizer(models.BPE())
     bpe.pre_tokenizer = pre_tokenizers.Sequence(

@@ -24,8 +24,8 @@ class Request:
         max_tokens: most tokens the answer may have.
         form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
         answer: how the answer is had. `json`: the model writes freely. `constrained`: it fills in numbers and
-            choices of a fixed text. `readout`: the messages ask for one letter (see `harness.readout`), whose
-            probabilities are the answer.
+            choices of a fixed text. `readout`: the messages ask for one letter (see
+            `harness.prompts.readout`), whose probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
         sample: which of several answers to one question; 0 where one is asked for.
         view: the viewer's own scene graph. Only backends that are no language model read it

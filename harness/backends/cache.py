@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 from harness import __version__
 from harness.backends.base import Completion, Rendering, Request
 from harness.backends.completion_file import CompletionFile
-from harness.errors import printable
-from harness.files import digest, sha256_bytes
+from harness.core.errors import printable
+from harness.core.files import digest, sha256_bytes
 
 T = TypeVar("T")
 
@@ -29,7 +29,7 @@ NOT_IN_KEY = {
     "truth": "no language model reads it",
 }
 # The program's own part in an answer: how it is asked for and put into text.
-_CODE = ("backends/*.py", "answer_schema.py", "readout.py", "rounding.py")
+_CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
 
 def default_file() -> Path:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from harness.cards import Thinking
-from harness.errors import UserError, printable
+from harness.backends.cards import Thinking
+from harness.core.errors import UserError, printable
 
 
 class Chat:

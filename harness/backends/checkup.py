@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.backends.base import AnswerMode, Completion, Rendering, Request
+from harness.backends.cards import Thinking
 from harness.backends.chat import Chat
-from harness.cards import Thinking
-from harness.errors import UserError
+from harness.core.errors import UserError
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from harness.backends.base import FinishReason, Request
 from harness.backends.engine import Engine, Session
 from harness.backends.skeleton import Skeleton, finished, tokens_after
-from harness.errors import UserError, printable
-from harness.readout import letters, stated
+from harness.core.errors import UserError, printable
+from harness.prompts.readout import letters, stated
 
 
 @dataclass(frozen=True)

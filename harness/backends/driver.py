@@ -5,10 +5,10 @@ from typing import Any
 
 from harness import __version__
 from harness.backends.base import Completion, Request
-from harness.cards import Card
-from harness.drivers import DRIVERS, choose
-from harness.errors import unknown
-from harness.files import canonical_json
+from harness.backends.cards import Card
+from harness.core.errors import unknown
+from harness.core.files import canonical_json
+from harness.world.drivers import DRIVERS, choose
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":

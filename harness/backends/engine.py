@@ -6,8 +6,8 @@ The answer modes are written once, on top of this; an engine knows nothing of JS
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from harness.arrays import Floats
 from harness.backends.chat import Chat
+from harness.core.arrays import Floats
 
 
 class Session(Protocol):

@@ -6,11 +6,11 @@ from contextlib import closing
 from itertools import groupby
 from typing import Any, NamedTuple
 
-from harness.arrays import Floats
 from harness.backends.base import Completion, Request
 from harness.backends.decoding import Answer, Decoding
 from harness.backends.engine import Engine
-from harness.errors import printable
+from harness.core.arrays import Floats
+from harness.core.errors import printable
 
 
 class _Prompt(NamedTuple):

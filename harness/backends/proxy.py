@@ -10,12 +10,12 @@ from dataclasses import asdict
 from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request
+from harness.backends.cards import Card
+from harness.backends.failures import Failures
 from harness.backends.spoiling import drawn, spoilt
-from harness.cards import Card
-from harness.failures import Failures
-from harness.files import canonical_json
-from harness.planner import plan
-from harness.rounding import rounded
+from harness.core.files import canonical_json
+from harness.core.rounding import rounded
+from harness.world.planner import plan
 
 VERSION = "proxy/1"
 

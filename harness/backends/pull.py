@@ -3,10 +3,11 @@
 import sys
 from pathlib import Path
 
-from harness.backends import checkpoint, llama_backend
-from harness.cards import WEIGHTED, Card
-from harness.errors import UserError, printable
-from harness.resources import find
+from harness.backends.cards import WEIGHTED, Card
+from harness.backends.llama_cpp import backend as llama_backend
+from harness.backends.transformers import checkpoint
+from harness.core.errors import UserError, printable
+from harness.core.resources import find
 
 
 def pull(card: Card) -> Path:

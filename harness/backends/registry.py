@@ -4,16 +4,16 @@ from importlib import import_module
 from types import ModuleType
 
 from harness.backends.base import Backend
-from harness.cards import WEIGHTED, Card, Engine
-from harness.errors import UserError
+from harness.backends.cards import WEIGHTED, Card, Engine
+from harness.core.errors import UserError
 
 _OPEN: dict[Engine, str] = {
     "proxy": "harness.backends.proxy:open",
     "driver": "harness.backends.driver:open",
     "replay": "harness.backends.replay:open",
-    "transformers": "harness.backends.transformers_engine:open",
-    "llama-cpp": "harness.backends.llama_backend:open",
-    "openai": "harness.backends.openai_backend:open",
+    "transformers": "harness.backends.transformers.engine:open",
+    "llama-cpp": "harness.backends.llama_cpp.backend:open",
+    "openai": "harness.backends.openai.backend:open",
 }
 
 
@@ -58,6 +58,7 @@ def missing(card: Card) -> str | None:
 
 def _weighted(engine: Engine) -> ModuleType:
     """The module that knows what an engine with weights needs, and where they lie; it loads no engine."""
-    from harness.backends import checkpoint, llama_backend
+    from harness.backends.llama_cpp import backend as llama_backend
+    from harness.backends.transformers import checkpoint
 
     return checkpoint if engine == "transformers" else llama_backend

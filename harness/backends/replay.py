@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends.base import Completion, Request
-from harness.cards import Card
-from harness.errors import UserError, printable
-from harness.files import digest, sha256_file
+from harness.backends.cards import Card
+from harness.core.errors import UserError, printable
+from harness.core.files import digest, sha256_file
 
 
 def open(card: Card, **_: Any) -> "Replay":

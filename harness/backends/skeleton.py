@@ -12,11 +12,11 @@ from collections.abc import Generator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from harness.answer_schema import RISKS
 from harness.backends.chat import Chat
-from harness.errors import UserError, printable
-from harness.files import canonical_json
-from harness.rounding import rounded
+from harness.core.errors import UserError, printable
+from harness.core.files import canonical_json
+from harness.core.rounding import rounded
+from harness.prompts.answer_schema import RISKS
 
 Part = str | tuple[str, ...]
 TWO_DIGITS = tuple(f"{n:02d}" for n in range(100))

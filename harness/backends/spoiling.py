@@ -3,9 +3,9 @@
 import re
 from collections.abc import Sequence
 
-from harness import luck
 from harness.backends.base import FinishReason
-from harness.failures import Failures
+from harness.backends.failures import Failures
+from harness.core import noise as luck
 
 
 def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:

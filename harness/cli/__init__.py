@@ -29,7 +29,7 @@ from harness.cli import (
     video,
     view,
 )
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 app = typer.Typer(
     name="harness",

@@ -9,7 +9,7 @@ from harness.cli.progress import QUIET
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.run.spec import Latency
+    from harness.evaluate.spec import Latency
 
 app = typer.Typer(
     help="Whole studies: the paper's, from one causal simulator, and driven live.", no_args_is_help=True
@@ -29,10 +29,10 @@ def paper(
     """Every number of the paper beside the calibrated proxy's, and its Figures A and B."""
     from harness.cli.estimates import in_range
     from harness.cli.progress import bar
-    from harness.errors import printable
-    from harness.study.campaign import run_paper
-    from harness.study.page import shown, tally
-    from harness.study.paper import panels
+    from harness.core.errors import printable
+    from harness.studies.campaign import run_paper
+    from harness.studies.page import shown, tally
+    from harness.studies.paper import panels
 
     in_range("--episodes", episodes, 10, 1_000_000)
     in_range("--sweep-episodes", sweep_episodes, 10, 1_000_000)
@@ -77,17 +77,18 @@ def closed_loop(
     quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """The paper's panels driven live in highway-env, and its Figures A and B from that."""
-    from harness import cards, prompts
+    from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.cli.estimates import in_range
     from harness.cli.evaluate import file_name, parse_seeds
     from harness.cli.progress import bar
     from harness.cli.scenario import MOST_WORKERS
     from harness.cli.sweep import tables
+    from harness.core.errors import printable
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.drive.spec import spec_of
-    from harness.errors import printable
-    from harness.study.closed_loop import panels, run_closed_loop
+    from harness.evaluate.live_spec import spec_of
+    from harness.prompts import versions as prompts
+    from harness.studies.closed_loop import panels, run_closed_loop
 
     in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     in_range("--first-seed", first_seed, 0, LAST_SEED)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 
 def compare(
@@ -28,10 +28,10 @@ def compare(
 ) -> None:
     """What changed from run A to run B, paired by episode and seed. Exit code 1 if a gate fails."""
     from harness.cli.estimates import in_range
-    from harness.compare import text
-    from harness.compare.difference import compare as compared
-    from harness.compare.gate import gate, judge
-    from harness.compare.pair import pair
+    from harness.report.compare import text
+    from harness.report.compare.difference import compare as compared
+    from harness.report.compare.gate import gate, judge
+    from harness.report.compare.pair import pair
 
     if as_markdown and as_json:
         raise UserError("--markdown and --json: give one of them")
@@ -42,7 +42,7 @@ def compare(
     found = compared(pair(a, b))
     verdicts = [judge(one, found) for one in gates]
     if html:
-        from harness.compare.page import write  # loads matplotlib, which no table waits for
+        from harness.report.compare.page import write  # loads matplotlib, which no table waits for
 
         write(found, verdicts, show, html)
     if as_json:

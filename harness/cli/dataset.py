@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
-    from harness.rank import Standing
+    from harness.studies.rank import Standing
 
 app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
@@ -72,10 +72,10 @@ def show(
     """Draw a scene from above, with what one vehicle sees of it."""
     from io import BytesIO
 
+    from harness.core.errors import unknown
+    from harness.core.files import write_whole
     from harness.dataset import load
-    from harness.drawing.scene import draw
-    from harness.errors import unknown
-    from harness.files import write_whole
+    from harness.report.drawing.scene import draw
 
     if out.suffix not in (".svg", ".png"):
         raise UserError(f"--out {printable(out)} is no picture that can be written; end it in .svg or .png")
@@ -103,7 +103,7 @@ def rank_drivers(dataset: str = DATASET, workers: int = WORKERS, as_json: bool =
 
     in_range("--workers", workers, 1, MOST_WORKERS)
     data = load.load(load.find(dataset))
-    from harness.rank import rank, ranks_agree
+    from harness.studies.rank import rank, ranks_agree
 
     episodes = int(data.manifest["episodes"])
     with bar(f"driving {printable(data.name, 30)} live", episodes) as progress:

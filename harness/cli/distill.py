@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from harness import resources
-from harness.errors import UserError, printable
+from harness.core import resources
+from harness.core.errors import UserError, printable
 
 SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
@@ -33,9 +33,9 @@ def distill(
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
     """Train a small Qwen3 on a frozen dataset; the same command again goes on where a killed one stopped."""
-    from harness import prompts
-    from harness.backends import checkpoint
+    from harness.backends.transformers import checkpoint
     from harness.dataset import load
+    from harness.prompts import versions as prompts
 
     if package := checkpoint.missing_package():
         raise UserError(
@@ -55,9 +55,9 @@ def distill(
             "build the one with other seeds (`harness dataset build --seed`)"
         )
 
-    from harness.backends.transformers_engine import device_of
-    from harness.distill.distill import distill as run
-    from harness.distill.train import STAGES, Plan
+    from harness.backends.transformers.engine import device_of
+    from harness.training.distill import distill as run
+    from harness.training.train import STAGES, Plan
 
     plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
     begun_s = time.monotonic()

@@ -5,7 +5,7 @@ from textwrap import wrap
 
 import typer
 
-from harness.errors import printable
+from harness.core.errors import printable
 
 WIDTH, MARGIN = 80, 10
 
@@ -15,7 +15,7 @@ def doctor(
     as_json: bool = typer.Option(False, "--json", help="Print JSON."),
 ) -> None:
     """Show versions, the machine, which models can run here and what the others lack, and the cache."""
-    from harness.doctor import look
+    from harness.cli.machine import look
 
     found = look(gpu)
     if as_json:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, cast
 import typer
 
 from harness.cli.progress import QUIET
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.drive.spec import Drive
-    from harness.run.evaluate import Evaluated
-    from harness.run.spec import Latency
+    from harness.evaluate.evaluate import Evaluated
+    from harness.evaluate.live_spec import Drive
+    from harness.evaluate.spec import Latency
 
 ALL = "all"
 
@@ -50,13 +50,14 @@ def drive(
     quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
-    from harness import cards, prompts
+    from harness.backends import cards
     from harness.cli.estimates import in_range
     from harness.cli.evaluate import parse_seeds
     from harness.cli.scenario import MOST_WORKERS
+    from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.drive.spec import spec_of
-    from harness.operating_point import POINTS, named_point
+    from harness.evaluate.live_spec import spec_of
+    from harness.prompts import versions as prompts
 
     if ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
@@ -87,7 +88,7 @@ def drive(
 
 
 def _shipped() -> dict[str, Any]:
-    from harness.resources import DATASET, folder
+    from harness.core.resources import DATASET, folder
 
     manifest: dict[str, Any] = json.loads((folder("datasets") / DATASET / "manifest.json").read_text())
     return manifest
@@ -115,7 +116,7 @@ def _run(
     from harness.backends.cache import default_file
     from harness.cli.evaluate import as_mapping
     from harness.cli.progress import bar
-    from harness.drive.run import run
+    from harness.evaluate.drive import run
 
     with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json or quiet) as progress:
         done = run(spec, out, resume, workers, progress, None if no_cache else default_file())

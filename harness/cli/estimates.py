@@ -4,12 +4,12 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from harness.metrics import Estimate
+    from harness.core.statistics import Estimate
 
 
 def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
-from harness import resources
 from harness.cli.progress import QUIET
-from harness.errors import UserError, printable
+from harness.core import resources
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.run.evaluate import Evaluated
-    from harness.run.spec import Latency, Spec
+    from harness.evaluate.evaluate import Evaluated
+    from harness.evaluate.spec import Latency, Spec
 
 MOST_SEEDS = 1000
 
@@ -54,10 +54,11 @@ def evaluate(
     quiet: bool = typer.Option(False, "--quiet", help=QUIET),
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes, and write a report."""
-    from harness import cards, prompts
+    from harness.backends import cards
+    from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load
-    from harness.operating_point import POINTS, named_point
-    from harness.run.spec import Spec
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions as prompts
 
     if limit is not None and limit < 1:
         raise UserError(f"--limit {limit}: give 1 or more episodes")
@@ -85,8 +86,8 @@ def evaluate(
 def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, quiet: bool) -> None:
     from harness.backends.cache import default_file
     from harness.cli.progress import bar
-    from harness.run.asking import request_count
-    from harness.run.evaluate import evaluate as evaluate_run
+    from harness.evaluate.asking import request_count
+    from harness.evaluate.evaluate import evaluate as evaluate_run
 
     with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), as_json or quiet) as progress:
         cache = None if no_cache else default_file()
@@ -196,8 +197,8 @@ def _table(done: "Evaluated") -> None:
 
 
 def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:
-    from harness.run.asking import requests
-    from harness.tokens import counter, spread_of
+    from harness.backends.tokens import counter, spread_of
+    from harness.evaluate.asking import requests
 
     count = counter(tokenizer, spec.card)
     sizes: dict[str, list[int]] = {}

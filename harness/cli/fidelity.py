@@ -13,9 +13,9 @@ def fidelity(
     as_json: bool = typer.Option(False, "--json", help="Print the table as JSON."),
 ) -> None:
     """How far success on frozen scenes is that of driving, episode by episode."""
-    from harness.errors import printable
-    from harness.study import fidelity_page
-    from harness.study.fidelity import fidelity as compared
+    from harness.core.errors import printable
+    from harness.studies import fidelity_page
+    from harness.studies.fidelity import fidelity as compared
 
     found = compared(runs)
     page = fidelity_page.write(found, out)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from harness.errors import UserError, printable
+from harness.core.errors import UserError, printable
 
 PROMPT = "v2"  # what one's own prompt begins as
 
@@ -14,9 +14,9 @@ def init(folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an e
     from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory
 
-    from harness import resources
+    from harness.core import resources
 
-    starter = Path(__file__).parent.parent / "starter"
+    starter = Path(__file__).parent / "starter"
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from harness.errors import printable
+from harness.core.errors import printable
 
 if TYPE_CHECKING:
-    from harness.listing import Listed
+    from harness.runs.listing import Listed
 
 WIDTH = 80
 
@@ -20,7 +20,7 @@ def ls(
     as_json: bool = typer.Option(False, "--json", help="Print JSON."),
 ) -> None:
     """List runs, sweeps and studies, newest first, each with the success of its best condition."""
-    from harness.listing import runs
+    from harness.runs.listing import runs
 
     found = runs(folder)
     if as_json:

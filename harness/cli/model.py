@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
-from harness.errors import printable
-from harness.resources import DATASET
+from harness.core.errors import printable
+from harness.core.resources import DATASET
 
 if TYPE_CHECKING:
+    from harness.backends.cards import Card
     from harness.backends.checkup import Checkup
-    from harness.cards import Card
-    from harness.run.spec import Spec
+    from harness.evaluate.spec import Spec
 
 app = typer.Typer(help="List models, fetch one, or look at one before a run.", no_args_is_help=True)
 
@@ -23,7 +23,7 @@ _WIDTH = 100  # of lines of tokens
 @app.command("list")
 def list_models(as_json: bool = typer.Option(False, "--json", help="Print the cards as JSON.")) -> None:
     """List the model cards, on each of their engines, and which of them can run here."""
-    from harness import cards
+    from harness.backends import cards
     from harness.backends.registry import missing
 
     rows = [(card, missing(card)) for card in cards.load_all()]
@@ -49,8 +49,8 @@ def pull(
     engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
 ) -> None:
     """Fetch a model's weights from its hub, at the revision that its card names."""
+    from harness.backends.cards import resolve
     from harness.backends.pull import pull as fetch
-    from harness.cards import resolve
 
     card = resolve(name, engine)
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
@@ -67,7 +67,7 @@ def check(
     as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
 ) -> None:
     """Load a model, show the prompt that it reads, and time one decision in each answer mode."""
-    from harness import cards
+    from harness.backends import cards
 
     card = cards.resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
@@ -97,13 +97,13 @@ def _failed(seen: "Checkup") -> int:
 
 
 def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -> "tuple[Spec, Checkup]":
-    from harness import prompts
     from harness.backends.base import AnswerMode, Rendering
     from harness.backends.checkup import check as look
     from harness.backends.registry import open_backend
     from harness.dataset import load
-    from harness.run.asking import requests
-    from harness.run.spec import Spec
+    from harness.evaluate.asking import requests
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions as prompts
 
     data = load.load(load.find(DATASET), 1)
     spec = Spec(card, prompts.load(PROMPT), data, (), (0,), 1, thinking, "json", 1, device, dtype)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from harness import resources
-from harness.errors import UserError, printable
+from harness.core import resources
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
-    from harness.parity import Finding
+    from harness.training.parity import Finding
 
 
 def parity(
@@ -22,15 +22,15 @@ def parity(
     as_json: bool = typer.Option(False, "--json", help="Print what was found as JSON."),
 ) -> None:
     """Run the same prompts through transformers and llama.cpp. Exit code 1 if they differ too much."""
-    from harness import cards, readout
-    from harness import prompts as versions
+    from harness.backends import cards
     from harness.backends.registry import missing
     from harness.cli.progress import bar
+    from harness.coordination.operating_point import POINTS
     from harness.dataset import load
-    from harness.operating_point import POINTS
-    from harness.parity import PASSES, compare
-    from harness.run.asking import requests
-    from harness.run.spec import Spec
+    from harness.evaluate.asking import requests
+    from harness.evaluate.spec import Spec
+    from harness.prompts import readout, versions
+    from harness.training.parity import PASSES, compare
 
     if prompts < 1:
         raise UserError(f"--prompts {prompts}: give 1 or more")

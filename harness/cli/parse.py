@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from harness import errors
+from harness.core import errors
 
 if TYPE_CHECKING:
-    from harness.parse import Parsed
+    from harness.parsing.parse import Parsed
 
 _FINISH_REASONS = ("stop", "length", "error")
 
@@ -25,8 +25,8 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Parse one completion and say what was read, what was mended, or why it failed."""
-    from harness import scenarios
-    from harness.parse import parse
+    from harness.parsing.parse import parse
+    from harness.world import scenarios
 
     if finish_reason not in _FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, _FINISH_REASONS)

@@ -6,8 +6,8 @@ from typing import Any
 
 import typer
 
-from harness import resources
-from harness.errors import UserError, printable
+from harness.core import resources
+from harness.core.errors import UserError, printable
 
 app = typer.Typer(
     help="List prompt versions, show what a model is sent, check or release one.", no_args_is_help=True
@@ -19,7 +19,7 @@ DATASET = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's 
 @app.command("list")
 def list_prompts(as_json: bool = typer.Option(False, "--json", help="Print as JSON.")) -> None:
     """List the prompt versions."""
-    from harness import prompts
+    from harness.prompts import versions as prompts
 
     found = [prompts.load(name) for name in prompts.names()]
     rows = [
@@ -44,9 +44,9 @@ def show(
     as_json: bool = typer.Option(False, "--json", help="Print the chat messages as JSON."),
 ) -> None:
     """Print exactly what a model is sent for a scene (before its own chat template)."""
-    from harness import prompts
+    from harness.core.errors import unknown
     from harness.dataset import load
-    from harness.errors import unknown
+    from harness.prompts import versions as prompts
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     found = data.scene(scene)
@@ -74,9 +74,9 @@ def check(
     as_json: bool = typer.Option(False, "--json", help="Print the figures as JSON."),
 ) -> None:
     """Render every scene for every viewer; with a tokenizer, count tokens against the budget."""
-    from harness import prompts
+    from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
-    from harness.tokens import counter, spread_of
+    from harness.prompts import versions as prompts
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     count = counter(tokenizer)
@@ -116,7 +116,7 @@ def check(
 @app.command()
 def lock(version: str = typer.Argument(help="Prompt version to release.")) -> None:
     """Release a version: pin its digest, so that a changed text is an error."""
-    from harness import prompts
+    from harness.prompts import versions as prompts
 
     if prompts.load(version).released:
         raise UserError(f"prompt {version} is released already; copy it to a new version to change it")

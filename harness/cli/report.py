@@ -15,7 +15,7 @@ def command(
     ] = None,
 ) -> None:
     """Write a report: one HTML file that needs no network. Several runs stand side by side in it."""
-    from harness.errors import UserError
+    from harness.core.errors import UserError
 
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.errors import UserError
+from harness.core.errors import UserError
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -18,7 +18,7 @@ MOST_WORKERS = 256
 @app.command("list")
 def list_scenarios(as_json: bool = typer.Option(False, "--json", help="Print JSON.")) -> None:
     """List the scenarios."""
-    from harness import scenarios
+    from harness.world import scenarios
 
     rows = [{"name": name, "summary": _summary(scenarios.get(name))} for name in scenarios.names()]
     if as_json:
@@ -36,12 +36,12 @@ def show(
     """Print what a scenario is, its actions, and every parameter with its meaning and value."""
     import textwrap
 
-    from harness import scenarios
+    from harness.world import scenarios
 
     scenario = scenarios.get(name)
     parameters = _parameters(scenario)
     if as_json:
-        from harness.answer_schema import ROLES, answer_schema
+        from harness.prompts.answer_schema import ROLES, answer_schema
 
         described = {"name": name, "description": scenario.__doc__, "actions": scenario.ACTIONS}
         schemas = {role: answer_schema(role, scenario.ACTIONS, name) for role in ROLES}
@@ -68,7 +68,7 @@ def check(
     from harness.cli.progress import bar
 
     ready_to_drive(name, episodes, seed, workers)
-    from harness import live
+    from harness.world import reference as live
 
     with bar(f"driving {name}", episodes) as progress:
         found = live.check(episodes, seed, workers, progress)
@@ -80,10 +80,10 @@ def check(
 
 def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> None:
     """Raises UserError where the simulator cannot drive those episodes."""
-    from harness import scenarios
     from harness.cli.estimates import in_range
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.world import NAME
+    from harness.world import scenarios
+    from harness.world.world import NAME
 
     if scenarios.get(name).NAME != NAME:
         raise UserError(f"scenario {name} has no simulator; give {NAME}")
@@ -112,7 +112,7 @@ def _parameters(scenario: "ModuleType") -> dict[str, dict[str, Any]]:
 
 def _as_mapping(name: str, episodes: int, seed: int, found: dict[str, Any]) -> dict[str, Any]:
     from harness.cli.estimates import as_mapping
-    from harness.metrics import Estimate
+    from harness.core.statistics import Estimate
 
     drivers = {
         driver: {k: as_mapping(v) if isinstance(v, Estimate) else v for k, v in results.items()}

@@ -45,14 +45,14 @@ def sweep(
     """Play stored answers at other operating points. No model is asked, but for ego-prompt."""
     from harness.cli.evaluate import parse_seeds
     from harness.cli.progress import bar
-    from harness.errors import UserError, printable, unknown
-    from harness.run.again import Asking
-    from harness.study.axes import axis_of
-    from harness.study.axes import grid as values_of
-    from harness.study.calibrated import Calibrated
-    from harness.study.play import Source
-    from harness.study.stored import Stored
-    from harness.study.sweep import run_sweep, settings, usual
+    from harness.core.errors import UserError, printable, unknown
+    from harness.evaluate.again import Asking
+    from harness.studies.axes import axis_of
+    from harness.studies.axes import grid as values_of
+    from harness.studies.calibrated import Calibrated
+    from harness.studies.play import Source
+    from harness.studies.stored import Stored
+    from harness.studies.sweep import run_sweep, settings, usual
 
     axes = [axis_of(name) for name in dict.fromkeys(over)]
     if len(grid) > len(axes):
@@ -86,8 +86,8 @@ def sweep(
 def tables(summary: "pd.DataFrame") -> None:
     """A study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
     from harness.cli.estimates import interval
-    from harness.errors import printable
-    from harness.study.setting import CORE
+    from harness.core.errors import printable
+    from harness.studies.setting import CORE
 
     heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
     shown = ""

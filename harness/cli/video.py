@@ -17,8 +17,8 @@ def command(
 ) -> None:
     """Play a driven episode again and draw it from above: sight, messages on their way, the ego's policy."""
     from harness.cli.progress import bar
-    from harness.drawing.video import check, write_video
-    from harness.drive.replay import find, stills
+    from harness.evaluate.replay import find, stills
+    from harness.report.drawing.video import check, write_video
 
     check(out)
     played = find(run, episode, condition, seed)
@@ -33,9 +33,9 @@ def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:
     They are written to the run's `videos`, the best kind that can be written here; returns the files.
     """
     from harness.cli.progress import bar
-    from harness.drawing.video import formats, write_video
-    from harness.drive.folder import read
-    from harness.drive.replay import played
+    from harness.evaluate.replay import played
+    from harness.report.drawing.video import formats, write_video
+    from harness.runs.driven_folder import read
 
     found = read(run)
     last, seeds = found.conditions[-1], found.config["seeds"]

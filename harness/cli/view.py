@@ -13,8 +13,8 @@ def view(
 ) -> None:
     """Show runs, sweeps and studies in a browser on this machine: list, open, compare. Ctrl-C ends it."""
     from harness.cli.estimates import in_range
-    from harness.listing import runs
-    from harness.view.serve import serve
+    from harness.report.view.serve import serve
+    from harness.runs.listing import runs
 
     def listening(url: str) -> None:
         typer.echo(f"{url} shows them until Ctrl-C")

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from harness import __version__
+from harness.core.errors import UserError, printable
+from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.parallel import spread
 from harness.dataset.freeze import Behaviour, freeze
 from harness.dataset.schema import FILE_NAME, manifest_schema, record_schema, record_validator
-from harness.errors import UserError, printable
-from harness.files import canonical_json, sha256_bytes, write_whole
-from harness.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
-from harness.workers import spread
+from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
 
 WORK = ".building"
 

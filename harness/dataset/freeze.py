@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from harness import luck
-from harness.drivers import PRIVILEGED
-from harness.live import decide, finish
-from harness.outcome import Outcome
-from harness.perception.graph import scene_graph
-from harness.road import JUNCTION_M, LANE_WIDTH_M, conflict_zone
-from harness.scene import VehicleState, WorldState
-from harness.world import World
+from harness.core import noise as luck
+from harness.world.drivers import PRIVILEGED
+from harness.world.outcome import Outcome
+from harness.world.perception.graph import scene_graph
+from harness.world.reference import decide, finish
+from harness.world.road import JUNCTION_M, LANE_WIDTH_M, conflict_zone
+from harness.world.state import VehicleState, WorldState
+from harness.world.world import World
 
 Record = dict[str, Any]
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import canonical_json
+from harness.core.memory import uncollected
+from harness.core.resources import entries, folder
+from harness.core.resources import find as beside
 from harness.dataset.verify import file_problems, read_manifest, records, released
-from harness.errors import UserError, printable, unknown
-from harness.files import canonical_json
-from harness.memory import uncollected
-from harness.resources import entries, folder
-from harness.resources import find as beside
-from harness.scene import WorldState
+from harness.world.state import WorldState
 
 
 @dataclass(frozen=True)

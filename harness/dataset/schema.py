@@ -5,9 +5,9 @@ from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
-from harness.road import APPROACHES, ROUTES, SECTORS
-from harness.scenarios.occluded_intersection import Parameters
-from harness.scene import SIZES_M
+from harness.world.road import APPROACHES, ROUTES, SECTORS
+from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.state import SIZES_M
 
 Schema = dict[str, Any]
 

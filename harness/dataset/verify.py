@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from harness.core.errors import UserError, printable
+from harness.core.files import sha256_bytes, sha256_file
 from harness.dataset.schema import fits_manifest, fits_record, manifest_validator, record_validator
-from harness.errors import UserError, printable
-from harness.files import sha256_bytes, sha256_file
-from harness.road import crossings
+from harness.world.road import crossings
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], str]:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from harness.answer_schema import EVIDENCE_CHARS, RISKS
-from harness.errors import printable
+from harness.core.errors import printable
 from harness.parsing import values
 from harness.parsing.status import Failure, Repair, Status
+from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
 
 FIELDS = {
     "ego": ("action_distribution",),

@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Sequence
 from typing import Any
 
-from harness.errors import printable
+from harness.core.errors import printable
 from harness.parsing.relaxed import Repeated
 from harness.parsing.status import Failure, Repair, Status
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from harness.drive.folder import Driven
-from harness.run.folder import Row, Run, answers_of
+from harness.runs.driven_folder import Driven
+from harness.runs.folder import Row, Run, answers_of
 
 FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
     "first failure",

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from harness.drawing.pictures import uri
-from harness.drive.folder import Driven
 from harness.report import words
+from harness.report.drawing.pictures import uri
 from harness.report.runs import Runs
-from harness.run.folder import Run, answers_of
+from harness.runs.driven_folder import Driven
+from harness.runs.folder import Run, answers_of
 
 EXAMPLES = 3  # of each status of answers
 

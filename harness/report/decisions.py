@@ -3,18 +3,17 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from harness import prompts as versions
-from harness import readout
+from harness.core.errors import UserError, printable
+from harness.core.files import digest
 from harness.dataset.load import Scene
-from harness.drive.folder import Driven
-from harness.drive.replay import scene_of
-from harness.errors import UserError, printable
-from harness.files import digest
-from harness.parse import Status, spans
+from harness.evaluate.replay import scene_of
+from harness.parsing.parse import Status, spans
+from harness.prompts import readout, versions
 from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.runs import Runs
-from harness.run.folder import Row, Run, answers_of
+from harness.runs.driven_folder import Driven
+from harness.runs.folder import Row, Run, answers_of
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts

@@ -6,11 +6,11 @@ from statistics import median
 
 import numpy as np
 
-from harness.errors import UserError, printable
-from harness.paired import SuccessTest, success_test
+from harness.core.errors import UserError, printable
+from harness.core.paired import SuccessTest, success_test
 from harness.report.runs import Runs
 from harness.report.words import LATENCY, SUCCESS, success_of
-from harness.run.folder import Run, Score, answers_of, table
+from harness.runs.folder import Run, Score, answers_of, table
 
 P_VALUE = 0.05
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"

@@ -12,14 +12,14 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
-from harness.drawing.ground import roads
-from harness.drawing.scene import VIEW_M
-from harness.errors import UserError, printable
-from harness.files import write_whole
-from harness.parse import Repair, Status
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
 from harness.report.decision_charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
+from harness.report.drawing.ground import roads
+from harness.report.drawing.scene import VIEW_M
 from harness.report.panels import panels
 from harness.report.runs import Runs
 

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from harness.drivers import DRIVERS
-from harness.frozen import driver_choices, judge_choices, table
+from harness.evaluate.success import driver_choices, judge_choices, table
 from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
-from harness.run.folder import Run
+from harness.runs.folder import Run
+from harness.world.drivers import DRIVERS
 
 Part = Literal["overview", "answers", "communication"]
 BUDGET = (200, 400)  # tokens of a prompt: the paper's

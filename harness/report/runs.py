@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset
-from harness.drive.folder import LIVE, Driven, driven
-from harness.errors import UserError, printable
-from harness.run.folder import FROZEN, Run, answers_of, dataset_of, read
+from harness.runs.driven_folder import LIVE, Driven, driven
+from harness.runs.folder import FROZEN, Run, answers_of, dataset_of, read
 
 # What a page reads of each decision, of each of its messages, and of each answer.
 DECISION = ("entropy_nats", "triggered", "own_weight", "own_failed", "latency_ms", "deadline_missed")

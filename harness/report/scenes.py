@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.dataset.load import Scene
-from harness.drawing.scene import conflict_points
-from harness.run.folder import Row
+from harness.report.drawing.scene import conflict_points
+from harness.runs.folder import Row
 
 
 def world(scene: Scene) -> dict[str, Any]:

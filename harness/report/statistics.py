@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import Floats, Ints
-from harness.metrics import share_interval
-from harness.parse import Status
+from harness.core.arrays import Floats, Ints
+from harness.core.statistics import share_interval
+from harness.parsing.parse import Status
 from harness.report.words import LATENCY, SUCCESS
-from harness.run.folder import Run, answers_of
+from harness.runs.folder import Run, answers_of
 
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from harness.run.folder import Run, Score
+from harness.runs.folder import Run, Score
 
 SUCCESS, LATENCY = "success_rate", "latency_proxy_ms"
 GAIN = "success_gain_over_"  # and the name of the condition it is over

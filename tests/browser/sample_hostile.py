@@ -4,7 +4,7 @@ import csv
 import json
 from dataclasses import asdict
 
-from harness.operating_point import POINTS
+from harness.coordination.operating_point import POINTS
 
 WAYS_IN = (
     "{}", '">{}', "'>{}", "</td></tr></table>{}", "</title>{}", "</style>{}", "</script>{}", "</textarea>{}",

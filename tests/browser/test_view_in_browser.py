@@ -11,7 +11,7 @@ from evaluating import spec_of
 from opening import NARROW, WIDE, picture, wait
 from playwright.sync_api import expect
 
-from harness.operating_point import POINTS
+from harness.coordination.operating_point import POINTS
 from harness.report.page import write_report
 from harness.report.runs import gather
 

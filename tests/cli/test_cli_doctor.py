@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.cards import load_all
+from harness.backends.cards import load_all
 
 Said = tuple[int, str, str]
 DOCTOR = "import harness.cli as c; sys.argv = ['harness', 'doctor', *sys.argv[1:]]\ntry: c.main()\n"

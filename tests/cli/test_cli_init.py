@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from harness import cards, prompts, resources
+from harness.backends import cards
+from harness.core import resources
+from harness.prompts import versions as prompts
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from harness import cli
-from harness.listing import runs
+from harness.runs.listing import runs
 
 Said = tuple[int, str, str]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from evaluating import FILES, run, spec_of
 
-from harness.compare.difference import compare
-from harness.compare.pair import pair
 from harness.dataset.load import Dataset
-from harness.listing import runs
-from harness.run.evaluate import evaluate
+from harness.evaluate.evaluate import evaluate
+from harness.report.compare.difference import compare
+from harness.report.compare.pair import pair
+from harness.runs.listing import runs
 
 Said = tuple[int, str, str]
 

@@ -6,8 +6,8 @@ from changing import SEEDS
 from evaluating import run as evaluate
 from evaluating import spec_of
 
+from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
-from harness.operating_point import POINTS
 
 
 @pytest.fixture(scope="session")

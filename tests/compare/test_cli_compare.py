@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from changing import configure, ends, rewrite
 
-from harness.compare.text import code
+from harness.report.compare.text import code
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]

@@ -11,14 +11,14 @@ from changing import SEEDS, configure, ends, rewrite
 from evaluating import run as evaluate
 from evaluating import spec_of
 
-from harness.compare.difference import Comparison, Difference, Turned, compare
-from harness.compare.pair import pair
-from harness.compare.table import LIVE_ENDS, LIVE_PER_EPISODE, METRICS
+from harness.coordination.operating_point import POINTS
+from harness.core.errors import UserError
+from harness.core.paired import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
-from harness.errors import UserError
-from harness.operating_point import POINTS
-from harness.paired import SuccessTest
+from harness.report.compare.difference import Comparison, Difference, Turned, compare
+from harness.report.compare.pair import pair
+from harness.report.compare.table import LIVE_ENDS, LIVE_PER_EPISODE, METRICS
 
 Said = tuple[int, str, str]
 

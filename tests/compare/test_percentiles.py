@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.compare.percentiles import Decided, differences
-from harness.metrics import known_mean
-from harness.run.summary import PERCENTILES
+from harness.core.statistics import known_mean
+from harness.report.compare.percentiles import Decided, differences
+from harness.runs.summary import PERCENTILES
 
 DECISIONS = st.lists(
     st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])), max_size=12

@@ -11,13 +11,13 @@ import pytest
 from evaluating import run, spec_of
 from misbehaving import completion, serving
 
-from harness import cards
+from harness.backends import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.registry import missing, open_backend
+from harness.core.files import digest
 from harness.dataset.load import load
-from harness.files import digest
-from harness.gguf_export import export
-from harness.run.asking import requests
+from harness.evaluate.asking import requests
+from harness.training.gguf_export import export
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from harness import prompts
 from harness.dataset.load import Dataset
+from harness.prompts import versions as prompts
 
 
 @pytest.mark.parametrize("version", prompts.names())

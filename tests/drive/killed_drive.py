@@ -5,7 +5,7 @@ from pathlib import Path
 
 from driving import spec
 
-from harness.drive.run import run
+from harness.evaluate.drive import run
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))

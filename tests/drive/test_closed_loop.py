@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from harness.study.closed_loop import panels
+from harness.studies.closed_loop import panels
 
 Said = tuple[int, str, str]
 OPTIONS = (

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from driving import spec
 
-from harness.drive.run import run
-from harness.errors import UserError
+from harness.core.errors import UserError
+from harness.evaluate.drive import run
 
 FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
 HERE = Path(__file__).parent

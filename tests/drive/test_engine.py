@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, decisions, driven, spec
 
-from harness import live
-from harness.drive.engine import P, _luck, frames
-from harness.drive.episode import Decision, Episode, Trajectory
-from harness.drivers import DRIVERS
-from harness.frozen import table
-from harness.luck import uniforms
-from harness.operating_point import POINTS, named_point
-from harness.run.scoring import draw
-from harness.world import World
+from harness.coordination.operating_point import POINTS, named_point
+from harness.core.noise import uniforms
+from harness.evaluate.branches import Decision, Episode, Trajectory
+from harness.evaluate.live import P, _luck, frames
+from harness.evaluate.scoring import draw
+from harness.evaluate.success import table
+from harness.world import reference as live
+from harness.world.drivers import DRIVERS
+from harness.world.world import World
 
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)
 

@@ -10,9 +10,9 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.study.fidelity import disagreements, fidelity
+from harness.studies.fidelity import disagreements, fidelity
 
 Said = tuple[int, str, str]
 LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0:2", "--workers", "1")  # those of `small`

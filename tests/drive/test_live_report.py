@@ -7,16 +7,16 @@ import pytest
 from driving import FROM_LEFT, spec
 from reading import Page, details
 
-from harness import prompts
-from harness.drive.folder import read
-from harness.drive.replay import scene_of
-from harness.drive.run import run
-from harness.errors import UserError
-from harness.operating_point import named_point
+from harness.coordination.operating_point import named_point
+from harness.core.errors import UserError
+from harness.evaluate.drive import run
+from harness.evaluate.replay import scene_of
+from harness.prompts import versions as prompts
 from harness.report.choose import FAILURE, failures, pick
 from harness.report.page import render
 from harness.report.runs import gather
-from harness.run import folder
+from harness.runs import folder
+from harness.runs.driven_folder import read
 
 V2 = prompts.load("v2")
 

@@ -12,10 +12,10 @@ from driving import FROM_LEFT, spec
 from PIL import Image, ImageSequence
 
 from harness.cli import main
-from harness.drawing.video import write_video
-from harness.drive.replay import find, stills
-from harness.drive.run import run
-from harness.errors import UserError
+from harness.core.errors import UserError
+from harness.evaluate.drive import run
+from harness.evaluate.replay import find, stills
+from harness.report.drawing.video import write_video
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ from dataclasses import asdict
 
 import numpy as np
 
-from harness import luck
-from harness.coordination import coordinate
-from harness.exchange import Luck
-from harness.metrics import episode_interval, rate_interval, seed_interval
-from harness.operating_point import POINTS
+from harness.coordination.coordinate import coordinate
+from harness.coordination.exchange import Luck
+from harness.coordination.operating_point import POINTS
+from harness.core import noise as luck
+from harness.core.statistics import episode_interval, rate_interval, seed_interval
 
 INFERENCE_S = 0.145
 SEEDS = (0, 1, 2)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.report import choose
-from harness.run.folder import Run
+from harness.runs.folder import Run
 
 
 def pick(rows, n):

@@ -11,11 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from harness.core.errors import UserError
 from harness.dataset.load import Scene
-from harness.drawing.labels import Labels
-from harness.drawing.pictures import styled
-from harness.drawing.scene import draw
-from harness.errors import UserError
+from harness.report.drawing.labels import Labels
+from harness.report.drawing.pictures import styled
+from harness.report.drawing.scene import draw
 
 
 def picture(scene, format="svg", viewer=None):

@@ -9,7 +9,7 @@ from sample_run import write_run
 from harness.report import matrix, statistics
 from harness.report.charts import statuses
 from harness.report.runs import gather
-from harness.run.folder import read
+from harness.runs.folder import read
 
 
 def marks(*ended):

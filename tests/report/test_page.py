@@ -12,14 +12,14 @@ from reading import Page, details, packed
 from sample_run import write_run
 from typer.testing import CliRunner
 
-from harness import prompts
 from harness.cli.report import command
-from harness.errors import UserError
+from harness.core.errors import UserError
+from harness.prompts import versions as prompts
 from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import headline, latency_source
-from harness.run.folder import Score, read
+from harness.runs.folder import Score, read
 
 V2 = prompts.load("v2")
 

@@ -140,7 +140,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
 
 
 def test_a_scene_is_drawn_whole(harness, small_folder, tmp_path):
-    pytest.importorskip("harness.drawing")
+    pytest.importorskip("harness.report.drawing")
     for suffix, start in {"svg": b"<?xml", "png": b"\x89PNG"}.items():
         picture = tmp_path / f"scene.{suffix}"
         code, out, _ = harness("dataset", "show", small_folder, "00000-2", "--viewer", "v2", "--out", picture)

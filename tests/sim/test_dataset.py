@@ -12,15 +12,15 @@ import time
 import numpy as np
 import pytest
 
+from harness.core.errors import UserError
+from harness.core.files import canonical_json, sha256_file
 from harness.dataset.build import build
 from harness.dataset.freeze import Behaviour, freeze
 from harness.dataset.load import find, load
 from harness.dataset.verify import check
-from harness.errors import UserError
-from harness.files import canonical_json, sha256_file
-from harness.live import finish
-from harness.perception.graph import scene_graph
-from harness.world import World
+from harness.world.perception.graph import scene_graph
+from harness.world.reference import finish
+from harness.world.world import World
 
 FIRST_SEED = 178
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.frozen import driver_choices, judge
-from harness.metrics import Estimate
-from harness.rank import Standing, frozen_success, ranks_agree
+from harness.core.statistics import Estimate
+from harness.evaluate.success import driver_choices, judge
+from harness.studies.rank import Standing, frozen_success, ranks_agree
 
 NAN = float("nan")
 FRAME_S = 0.02

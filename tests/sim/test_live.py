@@ -1,8 +1,8 @@
 """Reference drivers in the simulator."""
 
-from harness.drivers import DRIVERS
-from harness.live import check, drive_all, summary
-from harness.outcome import Outcome
+from harness.world.drivers import DRIVERS
+from harness.world.outcome import Outcome
+from harness.world.reference import check, drive_all, summary
 
 
 def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():

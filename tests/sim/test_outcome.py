@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from harness.outcome import Outcome, fault, outline, striker
-from harness.scenarios.occluded_intersection import Parameters
-from harness.scene import VehicleState
+from harness.world.outcome import Outcome, fault, outline, striker
+from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.state import VehicleState
 
 NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.files import canonical_json
-from harness.perception.graph import scene_graph, truth_graph
-from harness.perception.rays import blocked_by, first_hits, sweep
-from harness.perception.sensors import detect
-from harness.scene import Building, VehicleState, WorldState
-from harness.world import World
+from harness.core.files import canonical_json
+from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.perception.rays import blocked_by, first_hits, sweep
+from harness.world.perception.sensors import detect
+from harness.world.state import Building, VehicleState, WorldState
+from harness.world.world import World
 
 NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
 EGO = VehicleState("v1", "car", "ego", 2.0, 52.0, NORTH, 14.0, "own", "straight")

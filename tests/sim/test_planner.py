@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.drivers import DRIVERS, choose
-from harness.perception.graph import truth_graph
-from harness.planner import DISC_RADIUS_M, MARGIN_M, STEP_S, least_gap, plan, rollouts
-from harness.scenarios.occluded_intersection import ACTIONS, Parameters
-from harness.scene import VehicleState, WorldState
-from harness.world import World
+from harness.world.drivers import DRIVERS, choose
+from harness.world.perception.graph import truth_graph
+from harness.world.planner import DISC_RADIUS_M, MARGIN_M, STEP_S, least_gap, plan, rollouts
+from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.state import VehicleState, WorldState
+from harness.world.world import World
 
 P = Parameters()
 EGO = VehicleState("v1", "car", "ego", 2.0, 44.0, -np.pi / 2, 14.0, "own", "straight")  # 42 m before (2, 2)

@@ -8,8 +8,8 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.outcome import PRIORITY
-from harness.road import APPROACHES, ARM_M, ROUTES, conflict_zone, crossings, paths
+from harness.world.outcome import PRIORITY
+from harness.world.road import APPROACHES, ARM_M, ROUTES, conflict_zone, crossings, paths
 
 KEYS = [(approach, route) for approach in APPROACHES for route in ROUTES]
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from harness import scenarios
-from harness.errors import UserError
-from harness.road import SECTORS, crossings
-from harness.scenarios.occluded_intersection import ACTIONS, NAME, Parameters, layout
+from harness.core.errors import UserError
+from harness.world import scenarios
+from harness.world.road import SECTORS, crossings
+from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters, layout
 
 P = Parameters()
 

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from harness.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
 
 PAGE = (Path(__file__).parents[2] / "docs/scenarios/occluded-intersection.md").read_text()
 

@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.files import canonical_json
-from harness.road import APPROACHES, ROUTES
-from harness.scene import Building, VehicleState, WorldState, rectangle
+from harness.core.files import canonical_json
+from harness.world.road import APPROACHES, ROUTES
+from harness.world.state import Building, VehicleState, WorldState, rectangle
 
 numbers = st.floats(-1e4, 1e4)
 vehicles = st.builds(

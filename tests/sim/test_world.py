@@ -12,13 +12,13 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 
-from harness import simulator
-from harness.files import digest
-from harness.live import drive
-from harness.outcome import Outcome, outline
-from harness.scenarios.occluded_intersection import ACTIONS, Parameters
-from harness.scene import WorldState
-from harness.world import World
+from harness.core.files import digest
+from harness.world import simulator
+from harness.world.outcome import Outcome, outline
+from harness.world.reference import drive
+from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.state import WorldState
+from harness.world.world import World
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # seeds
 P = Parameters()
@@ -99,8 +99,9 @@ def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
     finally:
         IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
     code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from harness.files import digest; "
-        "import test_world as t; print(digest(t.trajectory(t.ONCOMING)))"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+        "from harness.core.files import digest; import test_world as t; "
+        "print(digest(t.trajectory(t.ONCOMING)))"
     )
     fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert fresh.stdout.strip() == here

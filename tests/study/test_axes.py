@@ -2,10 +2,10 @@
 
 import pytest
 
-from harness.consensus import RULES
-from harness.errors import UserError
-from harness.operating_point import POINTS
-from harness.study.axes import AXES, axis_of, grid
+from harness.coordination.consensus import RULES
+from harness.coordination.operating_point import POINTS
+from harness.core.errors import UserError
+from harness.studies.axes import AXES, axis_of, grid
 
 
 @pytest.mark.parametrize(

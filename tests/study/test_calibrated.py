@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.operating_point import POINTS, OperatingPoint
-from harness.study.calibrated import STEPS, Calibrated, Parameters
-from harness.study.entropies import ACTIONS, peaked, spread
-from harness.study.fit import fit
-from harness.trigger import entropy_nats
+from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.trigger import entropy_nats
+from harness.studies.calibrated import STEPS, Calibrated, Parameters
+from harness.studies.entropies import ACTIONS, peaked, spread
+from harness.studies.fit import fit
 
 SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
 

@@ -8,12 +8,12 @@ import pandas as pd
 import pytest
 from evaluating import figure, run, spec_of
 
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.errors import UserError
-from harness.run.evaluate import Evaluated
-from harness.study.axes import AXES, grid
-from harness.study.stored import Stored
-from harness.study.sweep import run_sweep, settings
+from harness.evaluate.evaluate import Evaluated
+from harness.studies.axes import AXES, grid
+from harness.studies.stored import Stored
+from harness.studies.sweep import run_sweep, settings
 
 
 @pytest.fixture(scope="module")

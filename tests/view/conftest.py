@@ -7,11 +7,11 @@ from evaluating import spec_of
 from starlette.testclient import TestClient
 from viewing import SECRET, configure
 
+from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
-from harness.operating_point import POINTS
 from harness.report.page import write_report
 from harness.report.runs import gather
-from harness.view.app import app
+from harness.report.view.app import app
 
 
 @pytest.fixture(scope="session")

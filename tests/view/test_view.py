@@ -16,7 +16,7 @@ from viewing import configure, names, said
 
 from harness.dataset.build import build
 from harness.dataset.load import load
-from harness.view import pages
+from harness.report.view import pages
 
 
 def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:

@@ -1,0 +1,105 @@
+"""The chat template of a GGUF file, rendered as transformers renders it, and llama.cpp's own tokenizer."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any, Protocol
+
+from jinja2 import TemplateError, nodes
+from jinja2.ext import Extension
+from jinja2.parser import Parser
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from harness.backends.chat import Chat
+from harness.core.errors import UserError, printable
+
+
+class Vocabulary(Protocol):
+    """What a GGUF file says of text; `harness.backends.llama_cpp.model.LlamaModel` is one."""
+
+    template: str
+    specials: dict[str, str]
+    bos: int | None
+
+    def encode(self, text: str) -> list[int]:
+        """Token ids of a text."""
+        ...
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Text of token ids."""
+        ...
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, special ones as they are written."""
+        ...
+
+
+class GgufChat(Chat):
+    """A GGUF file's tokenizer and chat template."""
+
+    def __init__(self, name: str, vocabulary: Vocabulary) -> None:
+        self.name = name
+        self.template = vocabulary.template
+        self._vocabulary = vocabulary
+        try:
+            self._compiled = _environment().from_string(self.template)
+        except TemplateError as error:
+            raise UserError(
+                f"model {name!r}: its chat template is no Jinja ({printable(error)}); give another GGUF file"
+            ) from None
+
+    @property
+    def bos(self) -> int | None:
+        """Id of the token that begins a sequence; None if there is none."""
+        return self._vocabulary.bos
+
+    def encode(self, prompt: str) -> list[int]:
+        """Token ids of a rendered prompt; the template has written BOS already, where there is one."""
+        return self._vocabulary.encode(prompt)
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Text of an answer without its control tokens."""
+        return self._vocabulary.decode(ids)
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, control tokens as they are written."""
+        return self._vocabulary.pieces(ids)
+
+    def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:
+        return self._compiled.render(
+            messages=messages,
+            tools=None,
+            documents=None,
+            add_generation_prompt=True,
+            **self._vocabulary.specials,
+            **switch,
+        )
+
+
+class _Generation(Extension):
+    """`{% generation %}`, with which a template marks what a model said, for training. Its text stays."""
+
+    tags = {"generation"}  # noqa: RUF012 jinja2 declares it so
+
+    def parse(self, parser: Parser) -> list[nodes.Node]:
+        """The block's own content."""
+        next(parser.stream)
+        return parser.parse_statements(("name:endgeneration",), drop_needle=True)
+
+
+def _environment() -> ImmutableSandboxedEnvironment:
+    """Jinja with the names that templates on the hub count on."""
+
+    def raise_exception(message: str) -> None:
+        raise TemplateError(message)
+
+    def tojson(value: Any, **options: Any) -> str:  # Jinja's own escapes for HTML
+        return json.dumps(value, **{"ensure_ascii": False, **options})
+
+    built = ImmutableSandboxedEnvironment(
+        trim_blocks=True, lstrip_blocks=True, extensions=[_Generation, "jinja2.ext.loopcontrols"]
+    )
+    built.filters["tojson"] = tojson
+    built.globals["raise_exception"] = raise_exception
+    built.globals["strftime_now"] = lambda form: datetime.now().strftime(form)
+    return built

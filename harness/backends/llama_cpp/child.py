@@ -1,0 +1,199 @@
+"""A backend in a process of its own: an engine that dies does not take the run with it.
+
+The process is spawned, so that it has only what its opener loads. Messages are pickled through a pipe.
+"""
+
+import os
+import signal
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from operator import attrgetter
+from threading import Thread
+from typing import Any
+
+from harness.backends.base import Completion, Request
+from harness.core.errors import UserError, printable
+
+LOADS = 3  # deaths in a row, while it loads, before we give up
+
+
+class _Died(Exception):
+    """The process is gone; says what ended it."""
+
+
+class Child:
+    """The backend that an opener returns, opened and asked in a child process.
+
+    Seconds are measured by the backend, where it is. After a death what was under way is asked again
+    together, as company may move an answer by rounding. If that kills the engine too, it is asked one at a
+    time, and the request that kills it then is a completion with an error.
+    """
+
+    def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
+        """Open the backend.
+
+        Args:
+            name: the model's, for messages.
+            opener: `module:function`, called in the child with `arguments` and `options`, which are pickled.
+            arguments: of the opener.
+            options: of the opener.
+
+        Raises:
+            UserError: the opener raised it, or its process died time after time.
+        """
+        self._name = name
+        self._opener = opener, arguments, options
+        self._running: tuple[SpawnProcess, Connection] | None = None
+        self._start()
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in the same order."""
+        for _ in range(2):
+            with suppress(_Died):
+                answers: list[Completion] = self._ask("complete", requests)
+                return answers
+        return [self._alone(request) for request in requests]
+
+    def identity(self) -> dict[str, Any]:
+        """The backend's own."""
+        found: dict[str, Any] = self.call("identity")
+        return found
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """The backend's own."""
+        found: list[str] = self.call("rendered", requests)
+        return found
+
+    def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
+        """An attribute of the backend, by its dotted name; what it returns, where it is a method.
+
+        Raises:
+            UserError: the backend raised it, or dies of the question.
+        """
+        for _ in range(2):
+            try:
+                return self._ask(attribute, *arguments, **options)
+            except _Died as death:
+                last = death
+        raise UserError(f"model {printable(self._name)!r}: {last} of {attribute}; see `harness model check`")
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        if self._running:
+            process, pipe = self._running
+            self._running = None
+            process.kill()
+            process.join()
+            process.close()
+            pipe.close()
+
+    def _alone(self, request: Request) -> Completion:
+        try:
+            (answer,) = self._ask("complete", [request])
+        except _Died as death:
+            return Completion(request.id, "", None, None, "error", None, 1, str(death))
+        completion: Completion = answer
+        return completion
+
+    def _start(self) -> None:
+        for _ in range(LOADS):
+            context = get_context("spawn")
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, *self._opener), daemon=True)
+            with _uninterrupted():
+                process.start()
+            theirs.close()  # else its death would not close the pipe
+            self._running = process, ours
+            try:
+                self._receive()
+                return
+            except _Died as death:
+                last = death
+            except BaseException:
+                self.close()
+                raise
+        raise UserError(
+            f"model {printable(self._name)!r}: {last} while it loaded, {LOADS} times; "
+            "it may need more memory than there is, or the file may be damaged"
+        )
+
+    def _ask(self, attribute: str, *arguments: Any, **options: Any) -> Any:
+        if not self._running:
+            self._start()
+        assert self._running
+        with suppress(BrokenPipeError, ConnectionResetError):  # it died idle: receiving finds out
+            self._running[1].send((attribute, arguments, options))
+        return self._receive()
+
+    def _receive(self) -> Any:
+        assert self._running
+        process, pipe = self._running
+        try:
+            value, error = pipe.recv()
+        except (EOFError, ConnectionResetError):
+            process.join()
+            code = process.exitcode or 0
+            self.close()
+            raise _Died(f"engine died: {f'signal {-code}' if code < 0 else f'exit code {code}'}") from None
+        except BaseException:  # Ctrl-C: its answer must not be taken for that of the next question
+            self.close()
+            raise
+        if error:
+            raise error
+        return value
+
+
+def _serve(pipe: Connection, opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+    """Open a backend and answer until the parent is gone. Runs in the child."""
+    Thread(target=_die_with_parent, daemon=True).start()
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        backend, failed = _attempt(_open, opener, arguments, options)
+        pipe.send((None, failed))
+        while not failed:
+            pipe.send(_attempt(_get, backend, *pipe.recv()))
+
+
+def _die_with_parent() -> None:
+    """End this process with the parent's, however that ends, also in the middle of an answer."""
+    parent = parent_process()
+    assert parent
+    parent.join()
+    os._exit(1)
+
+
+def _open(opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
+    module, _, function = opener.partition(":")
+    return getattr(import_module(module), function)(*arguments, **options)
+
+
+def _get(backend: Any, attribute: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
+    found = attrgetter(attribute)(backend)
+    return found(*arguments, **options) if callable(found) else found
+
+
+def _attempt(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
+    """What some work gives, or what it raises."""
+    try:
+        return work(*arguments), None
+    except UserError as error:
+        return None, error
+    except Exception:  # a bug, which crashes the parent with the child's traceback
+        return None, RuntimeError(f"in the engine's process:\n{traceback.format_exc()}")
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """What starts meanwhile never hears Ctrl-C: the parent does, and ends it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,176 @@
+"""Sequences of tokens in llama.cpp's memory, which grows with them."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import llama_cpp as c
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.backends.llama_cpp.model import LlamaModel, last_error
+
+Ints = NDArray[np.int32]
+Logits = NDArray[np.float32]
+
+_BATCH = 512  # most tokens of one call; more go in several
+_PAGE = 256  # llama.cpp rounds its memory up to so many tokens
+_FULL = 1  # llama_decode: no room left
+_FIELDS = c.llama_batch._fields_
+
+
+class LlamaContext:
+    """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
+
+    Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would
+    attend to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a
+    sequence has filled its room it is made anew at twice the size, and filled again from the tokens.
+
+    Attributes:
+        tokens: of each sequence that is there.
+        cache_type: number format of keys and values, `F32` for F32 weights and else `F16`.
+    """
+
+    def __init__(self, model: LlamaModel, sequences: int) -> None:
+        self._model = model
+        self._sequences = sequences
+        self._context: int | None = None
+        self._room = 0
+        self.cache_type = "F32" if model.dtype == "F32" else "F16"
+        self.tokens: dict[int, list[int]] = {}
+
+    def fork(self, source: int, copy: int, length: int) -> None:
+        """Let a new sequence begin with the first `length` tokens of another, as they were computed."""
+        if length:  # between rooms llama.cpp copies a whole sequence only
+            c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
+            c.llama_memory_seq_rm(self._memory(), copy, length, -1)
+        self.tokens[copy] = self.tokens[source][:length] if length else []
+
+    def drop(self, sequence: int) -> None:
+        """Forget a sequence, if it is there."""
+        if self.tokens.pop(sequence, None) is not None and self._context:
+            c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
+
+    def reserve(self, room: int) -> None:
+        """Make the memory, for so many tokens of each sequence, if there is none yet."""
+        if not self._context:
+            self._make(room)
+
+    def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
+        """Append a chunk, which is not empty, to each of some sequences.
+
+        Returns:
+            Logits after the last token of each, (len(chunks), vocabulary).
+
+        Raises:
+            RuntimeError: llama.cpp fails; all sequences are gone then.
+        """
+        try:
+            logits = self._decode(chunks)
+            if logits is None:
+                longest = max(len(self.tokens[s]) + len(chunk) for s, chunk in chunks.items())
+                self._make(max(2 * self._room, longest))
+                self._fill()
+                logits = self._decode(chunks)
+            if logits is None:
+                raise RuntimeError(f"llama.cpp finds no room in {self._room} tokens: {last_error()}")
+        except BaseException:
+            self.free()
+            raise
+        for sequence, chunk in chunks.items():
+            self.tokens[sequence] += chunk
+        return logits
+
+    def free(self) -> None:
+        """Give all memory back; every sequence is gone."""
+        if self._context:
+            c.llama_free(self._context)
+        self._context, self.tokens = None, {}
+
+    def _memory(self) -> int:
+        memory: int = c.llama_get_memory(self._context)
+        return memory
+
+    def _make(self, room: int) -> None:
+        if self._context:  # before the new one is there: both may not fit
+            c.llama_free(self._context)
+            self._context = None
+        params = c.llama_context_default_params()
+        self._room = -(-room // _PAGE) * _PAGE
+        params.n_ctx = self._room * self._sequences
+        params.n_batch = params.n_ubatch = _BATCH
+        params.n_seq_max = params.n_outputs_max = self._sequences
+        params.kv_unified = False
+        params.swa_full = True  # else a beginning is forgotten as its window passes
+        if self.cache_type == "F32":
+            # As exact as the weights: llama.cpp's own choice, and its fused attention, round to F16.
+            params.type_k = params.type_v = c.GGML_TYPE_F32
+            params.flash_attn_type = c.LLAMA_FLASH_ATTN_TYPE_DISABLED
+        params.n_threads = params.n_threads_batch = threads()
+        params.offload_kqv = params.op_offload = self._model.device == "gpu"
+        params.no_perf = True
+        last_error()
+        self._context = c.llama_init_from_model(self._model.pointer, params)
+        if not self._context:
+            raise RuntimeError(f"no memory for {self._sequences} x {self._room} tokens: {last_error()}")
+
+    def _fill(self) -> None:
+        """Compute all sequences again. In this order each begins like the one before as far as like any."""
+        held = sorted(self.tokens.items(), key=lambda item: item[1])
+        before, self.tokens = held[0][0], {}
+        for sequence, tokens in held:
+            shared = [] if self._model.whole_state else self.tokens.get(before, [])
+            self.fork(before, sequence, common_length([shared, tokens]))
+            if rest := tokens[len(self.tokens[sequence]) :]:
+                self._decode({sequence: rest})
+            self.tokens[sequence], before = tokens, sequence
+
+    def _decode(self, chunks: Mapping[int, Sequence[int]]) -> Logits | None:
+        """Logits after each chunk; None if there is no room."""
+        each = [(t, len(self.tokens[s]) + i, s) for s, chunk in chunks.items() for i, t in enumerate(chunk)]
+        token, place, owner = np.array(each, dtype=np.int32).T.copy()
+        last = np.cumsum([len(chunk) for chunk in chunks.values()]) - 1
+        wanted = np.zeros(len(token), dtype=np.int8)
+        wanted[last] = 1
+        logits = np.empty((len(chunks), self._model.vocabulary), dtype=np.float32)
+        for start in range(0, len(token), _BATCH):
+            part = slice(start, start + _BATCH)
+            code = self._call(token[part], place[part], owner[part], wanted[part])
+            if code == _FULL:
+                return None
+            if code:
+                raise RuntimeError(f"llama_decode returned {code}: {last_error()}")
+            for row in np.flatnonzero((last >= start) & (last < start + _BATCH)):
+                found = c.llama_get_logits_ith(self._context, int(last[row]) - start)
+                logits[row] = np.ctypeslib.as_array(found, (self._model.vocabulary,))
+        return logits
+
+    def _call(self, token: Ints, place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
+        """llama_decode on arrays of one length, without a copy."""
+        one = np.ones_like(owner)
+        # One address a token: it belongs to one sequence.
+        owners = owner.ctypes.data + owner.itemsize * np.arange(len(owner), dtype=np.uintp)
+        arrays: dict[str, NDArray[Any]] = {
+            "token": token,
+            "pos": place,
+            "n_seq_id": one,
+            "seq_id": owners,
+            "logits": wanted,
+        }
+        pointers = {name: arrays[name].ctypes.data_as(kind) for name, kind in _FIELDS if name in arrays}
+        code: int = c.llama_decode(self._context, c.llama_batch(n_tokens=len(token), **pointers))
+        return code
+
+
+def common_length(sequences: Sequence[list[int]]) -> int:
+    """How many tokens all of them begin with."""
+    first, last = min(sequences), max(sequences)
+    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+
+
+def threads() -> int:
+    """Threads of a computation: OMP_NUM_THREADS, as for any other engine, else one a core."""
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    if asked.isdigit() and int(asked):
+        return int(asked)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

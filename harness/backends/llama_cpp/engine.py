@@ -1,0 +1,178 @@
+"""llama.cpp as an engine: GGUF files, mostly on a CPU."""
+
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.backends.cards import Card
+from harness.backends.chat import Chat
+from harness.backends.language_model import LanguageModel
+from harness.backends.llama_cpp.chat import GgufChat
+from harness.backends.llama_cpp.context import LlamaContext, Logits, common_length
+from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
+from harness.core.arrays import Floats
+from harness.core.errors import UserError
+from harness.core.files import sha256_bytes, sha256_file
+
+BEGINNINGS = 3  # of prompts, kept between calls: one a role, and one of a batch with both
+_ANSWER = 256  # tokens of an answer that memory is made for at once
+
+
+def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
+    """Load a GGUF file in this process, which llama.cpp may end.
+
+    Raises:
+        UserError: the file, the device or the batch size is none for llama.cpp.
+    """
+    os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # which starts a debugger where there is one
+    most = most_sequences() - BEGINNINGS
+    if batch_size > most:
+        raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
+    return LanguageModel(LlamaEngine(card, file, LlamaModel(card.name, file, device), batch_size), batch_size)
+
+
+class LlamaEngine:
+    """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts.
+
+    Attributes:
+        chat: its tokenizer and chat template.
+        context_tokens: most tokens of one sequence.
+        stops: token ids that end an answer, sorted.
+    """
+
+    def __init__(self, card: Card, file: Path, model: LlamaModel, batch_size: int) -> None:
+        self.chat: Chat = GgufChat(card.name, model)
+        self.context_tokens = card.context_tokens or model.trained_tokens
+        self.stops: Sequence[int] = model.stops
+        self._card, self._file, self._model = card, file, model
+        self._context = LlamaContext(model, batch_size + BEGINNINGS)
+        self._free = list(range(batch_size))
+        # Least lately used first.
+        self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
+
+    def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
+        """Read some prompts, none of them empty; what they begin with in common is computed once.
+
+        A beginning is kept for later calls, unless half of it is part of one that is kept already.
+        """
+        if len(prompts) > len(self._free):
+            raise ValueError(f"{len(prompts)} prompts for {len(self._free)} free places")
+        places = [self._free.pop() for _ in prompts]
+        try:
+            logits = self._read(dict(zip(places, map(list, prompts), strict=True)))
+        except BaseException:
+            self.release(places)
+            raise
+        return LlamaSession(self, places, logits)
+
+    def _read(self, prompts: dict[int, list[int]]) -> Logits:
+        first, *rest = prompts
+        # The last token of each is left for its logits.
+        common = 0 if self._model.whole_state else common_length([p[:-1] for p in prompts.values()])
+        shared = prompts[first][:common]
+        self._context.reserve(max(map(len, prompts.values())) + _ANSWER)
+        kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
+        new = 2 * max(kept.values()) < common
+        if not rest:  # a prompt that is asked again is read again: else its time would be no answer's time
+            kept = {b: n if n < common else 0 for b, n in kept.items()}
+        nearest = max(self._beginnings, key=kept.__getitem__)
+        known = kept[nearest]
+        self._context.fork(nearest, first, known)
+        if rest and common > known:
+            self._context.extend({first: shared[known:]})
+        for place in rest:
+            self._context.fork(first, place, common)
+        logits = self._context.extend({p: ids[len(self._context.tokens[p]) :] for p, ids in prompts.items()})
+        if known:
+            self._used(nearest)
+        if new:
+            oldest = self._beginnings[0]
+            self._context.drop(oldest)
+            self._context.fork(first, oldest, common)
+            self._used(oldest)
+        return logits
+
+    def _used(self, beginning: int) -> None:
+        self._beginnings.remove(beginning)
+        self._beginnings.append(beginning)
+
+    def extend(self, chunks: dict[int, Sequence[int]]) -> Logits:
+        """Append tokens to sequences by place; logits after each, (len(chunks), vocabulary)."""
+        return self._context.extend(chunks)
+
+    def release(self, places: Sequence[int]) -> None:
+        """Forget the sequences at some places, which are free then."""
+        for place in places:
+            self._context.drop(place)
+        self._free += places
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the answers: the build of llama.cpp, and the file by its hub commit or its content."""
+        return {
+            "engine": "llama-cpp",
+            **build(),
+            "weights": self._card.weights,
+            "file": self._card.file,
+            "revision": self._file.parent.name if self._cached else None,
+            "file_sha256": None if self._cached else self._sha256,
+            "dtype": self._model.dtype,
+            "kv_cache": self._context.cache_type,
+            "device": self._model.device,
+            "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+        }
+
+    @property
+    def _cached(self) -> bool:
+        return self._file.parent.parent.name == "snapshots"
+
+    @cached_property
+    def _sha256(self) -> str:
+        return sha256_file(self._file)
+
+
+class LlamaSession:
+    """Sequences that go forward together; `harness.backends.engine.Session` says what each method does."""
+
+    def __init__(self, engine: LlamaEngine, places: list[int], logits: Logits) -> None:
+        self._engine = engine
+        self._places = places
+        self._logits = logits
+
+    def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        """Most likely next token of each sequence, of those listed for it."""
+        best = []
+        for row, listed in zip(self._logits, among, strict=True):
+            if listed is None:
+                best.append(int(row.argmax()))
+            else:
+                tokens = np.unique(listed)
+                best.append(int(tokens[row[tokens].argmax()]))
+        return best
+
+    def log_probs(self, tokens: Sequence[int]) -> Floats:
+        """Natural log-probabilities of some tokens as the next one, (n, len)."""
+        logits = self._logits - self._logits.max(axis=1, keepdims=True).astype(np.float64)
+        total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
+        found: Floats = logits[:, list(tokens)] - total
+        return found
+
+    def advance(self, chunks: Sequence[Sequence[int]]) -> None:
+        """Append tokens to each sequence; an empty chunk leaves it alone."""
+        rows = [row for row, chunk in enumerate(chunks) if chunk]
+        if rows:
+            self._logits[rows] = self._engine.extend({self._places[row]: chunks[row] for row in rows})
+
+    def keep(self, places: Sequence[int]) -> None:
+        """Go on with these sequences only, in this order."""
+        kept = [self._places[place] for place in places]
+        self._engine.release([place for place in self._places if place not in kept])
+        self._places, self._logits = kept, self._logits[list(places)]
+
+    def close(self) -> None:
+        """Give the sequences' memory back."""
+        self._engine.release(self._places)
+        self._places = []

@@ -1,0 +1,134 @@
+"""A GGUF file loaded by llama.cpp: its weights, its vocabulary and what it says of itself.
+
+Everything here runs in the child process (`harness.backends.llama_cpp.child`): llama.cpp can end its process.
+"""
+
+import ctypes
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import llama_cpp as c
+import numpy as np
+
+from harness.core.errors import UserError, printable
+
+_ERROR = 4  # of ggml's log levels
+_errors: list[str] = []
+
+
+@c.llama_log_callback  # type: ignore[untyped-decorator]
+def _log(level: int, text: bytes, _: Any) -> None:
+    """Keep what went wrong for the user's one line; the rest is chatter."""
+    if level == _ERROR:
+        _errors.append(text.decode(errors="replace").strip())
+
+
+def last_error() -> str:
+    """The first thing that llama.cpp complained of since the last call, made safe to show."""
+    said = printable(_errors[0], 200) if _errors else "llama.cpp does not say why"
+    _errors.clear()
+    return said
+
+
+class LlamaModel:
+    """A loaded model.
+
+    Attributes:
+        pointer: llama.cpp's model.
+        vocabulary: number of tokens, rows without a token included.
+        trained_tokens: context it was trained for.
+        dtype: number format of the weights, as llama.cpp names it.
+        stops: token ids that end an answer, sorted.
+        template: its chat template.
+        specials: texts of its special tokens by their name in a chat template, such as `bos_token`.
+        bos: id of its BOS token, None if it has none.
+        whole_state: a sequence's state cannot be cut (recurrent layers), so no beginning can be shared.
+        device: `cpu` or `gpu`.
+    """
+
+    def __init__(self, name: str, file: Path, device: str | None) -> None:
+        c.llama_log_set(_log, ctypes.c_void_p(0))
+        shown = f"model {name!r} in {printable(file)}"
+        if device not in (None, "cpu") and not (device == "gpu" and c.llama_supports_gpu_offload()):
+            known = "cpu, gpu" if c.llama_supports_gpu_offload() else "cpu"
+            raise UserError(f"device {printable(device)!r}; llama.cpp as it is built here has: {known}")
+        params = c.llama_model_default_params()
+        # ggml-org/llama.cpp#20824: repacked quantised weights crash on CPUs with AMX.
+        params.use_extra_bufts = False
+        if device == "cpu":
+            params.n_gpu_layers = 0
+        last_error()
+        self.pointer = c.llama_model_load_from_file(bytes(file), params)
+        if not self.pointer:
+            raise UserError(f"{shown} does not load: {last_error()}; copy or download the file again")
+        self._vocab = c.llama_model_get_vocab(self.pointer)
+        self.vocabulary: int = c.llama_vocab_n_tokens(self._vocab)
+        if not self.vocabulary or c.llama_vocab_type(self._vocab) == c.LLAMA_VOCAB_TYPE_NONE:
+            raise UserError(f"{shown} has no tokenizer; give a GGUF file of a chat model")
+        template = c.llama_model_chat_template(self.pointer, None)
+        if not template:
+            raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
+        self.template: str = template.decode(errors="replace")
+        self.trained_tokens: int = c.llama_model_n_ctx_train(self.pointer)
+        self.dtype = self._described().split(" ", 2)[-1].removeprefix("all ")
+        self.stops = [t for t in range(self.vocabulary) if c.llama_vocab_is_eog(self._vocab, t)]
+        bos, eos = c.llama_vocab_bos(self._vocab), c.llama_vocab_eos(self._vocab)
+        named = {"bos_token": bos, "eos_token": eos, "pad_token": c.llama_vocab_pad(self._vocab)}
+        self.specials = {
+            key: c.llama_vocab_get_text(self._vocab, token).decode(errors="replace")
+            for key, token in named.items()
+            if token >= 0
+        }
+        self.bos: int | None = bos if bos >= 0 else None
+        self.whole_state: bool = c.llama_model_is_recurrent(self.pointer) or c.llama_model_is_hybrid(
+            self.pointer
+        )
+        self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
+
+    def encode(self, text: str) -> list[int]:
+        """Token ids of a text; special tokens written in it are taken for what they are, none is added."""
+        data = text.encode(errors="replace")
+        ids = np.empty(len(data) + 1, dtype=np.int32)  # a token is a byte at least
+        pointer = ids.ctypes.data_as(ctypes.POINTER(c.llama_token))
+        count = c.llama_tokenize(self._vocab, data, len(data), pointer, len(ids), False, True)
+        if count < 0:
+            raise ValueError(f"llama.cpp cannot tokenise {len(data)} bytes ({count})")
+        found: list[int] = ids[:count].tolist()
+        return found
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Text of token ids, control tokens left out. Bytes that are no text become U+FFFD."""
+        return b"".join(self._piece(token) for token in ids).decode(errors="replace")
+
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        """The text of each token on its own, control tokens as they are written."""
+        return [self._piece(token, control=True).decode(errors="replace") for token in ids]
+
+    def _piece(self, token: int, control: bool = False) -> bytes:
+        size = 64
+        while True:
+            buffer = ctypes.create_string_buffer(size)
+            length: int = c.llama_token_to_piece(self._vocab, token, buffer, size, 0, control)
+            if length >= 0:
+                return buffer.raw[:length]
+            size = -length
+
+    def _described(self) -> str:
+        """Such as `qwen3 4B Q4_K - Medium`."""
+        buffer = ctypes.create_string_buffer(128)
+        c.llama_model_desc(self.pointer, buffer, len(buffer))
+        return buffer.value.decode(errors="replace")
+
+
+def most_sequences() -> int:
+    """How many sequences llama.cpp keeps apart."""
+    most: int = c.llama_max_parallel_sequences()
+    return most
+
+
+def build() -> dict[str, str]:
+    """What of llama.cpp itself moves an answer's last digits."""
+    features: bytes = c.llama_print_system_info()
+    return {"llama_cpp_python": version("llama-cpp-python"), "system": features.decode().strip(" |")}

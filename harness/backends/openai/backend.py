@@ -1,0 +1,107 @@
+"""Answers of a model behind any server that speaks OpenAI's chat completions."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from harness.backends.base import Completion, Request
+from harness.backends.cards import Card
+from harness.backends.openai.http import Client
+from harness.backends.openai.shapes import Said, body, read
+from harness.backends.servers import Server
+from harness.core.errors import UserError, printable
+from harness.core.files import canonical_json
+
+_LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates: a server says when it was started
+
+
+def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
+    """Reach a card's server.
+
+    Raises:
+        UserError: nobody listens there, it refuses the key, or the key is none.
+    """
+    if card.server is None:
+        raise ValueError(f"card {card.name} has no server")
+    return OpenAIBackend(card, card.server, batch_size)
+
+
+class OpenAIBackend:
+    """A model behind a server. Requests of a batch are asked at the same time, each by itself."""
+
+    def __init__(self, card: Card, server: Server, batch_size: int) -> None:
+        self._card = card
+        self._server = server
+        self._batch_size = batch_size
+        self._client = Client(server, batch_size)
+        self._listed = asyncio.run(self._look())
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """One completion per request, in the same order.
+
+        Where requests are asked one at a time, `seconds` is the time from asking to the last byte, failed
+        attempts and the waits between them included; an answer that never came has spent its time, too. The
+        first of a call takes a connection, which the others go on with.
+        """
+        return asyncio.run(self._all(requests))
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        """What the server is sent for each request; it renders the messages itself."""
+        return [canonical_json(body(self._card, self._server, request)) for request in requests]
+
+    def identity(self) -> dict[str, Any]:
+        """The server and its model, by what it says of it. Weights that it changes unsaid are not seen."""
+        return {
+            "engine": "openai",
+            "server": self._server.kind,
+            "base_url": self._server.base_url,
+            "model": self._card.weights,
+            "listed": self._listed,
+        }
+
+    async def _all(self, requests: Sequence[Request]) -> list[Completion]:
+        together = min(self._batch_size, len(requests))
+        gate = asyncio.Semaphore(self._batch_size)
+
+        async def ask(request: Request) -> Completion:
+            async with gate:
+                return await self._answer(request, together)
+
+        async with self._client:
+            return await asyncio.gather(*map(ask, requests))
+
+    async def _answer(self, request: Request, together: int) -> Completion:
+        start_s = time.perf_counter()
+        reply = await self._client.post("/chat/completions", body(self._card, self._server, request))
+        seconds = time.perf_counter() - start_s
+        said = Said(error=reply.fault) if reply.fault else read(reply.payload, request)
+        return Completion(
+            request_id=request.id,
+            text=said.text,
+            prompt_tokens=said.prompt_tokens,
+            completion_tokens=said.completion_tokens,
+            finish_reason=said.finish_reason,
+            seconds=seconds if together == 1 else None,
+            batch_size=together,
+            error=said.error,
+            label_mass=said.label_mass,
+            retries=reply.retries,
+        )
+
+    async def _look(self) -> dict[str, Any] | None:
+        """What the server's list says of the model; None where it has no list, or the model is not on it."""
+        async with self._client:
+            reply = await self._client.get("/models")
+        if reply.status == 401:
+            raise UserError(
+                f"model {printable(self._card.name)!r}: its server refuses the key ({reply.fault}); "
+                f"set {self._server.key_env} in the environment"
+            )
+        data = reply.payload.get("data") if isinstance(reply.payload, dict) else None
+        models = [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
+        named = [entry for entry in models if entry.get("id") == self._card.weights]
+        # A server with one model answers to any name.
+        for entry in named or (models if len(models) == 1 else []):
+            return {k: v if type(v) is int else printable(v) for k in _LISTED if (v := entry.get(k))}
+        return None

@@ -1,0 +1,99 @@
+"""Counting tokens as a model counts them: with its own tokenizer."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from harness.backends.cards import Card
+from harness.core.errors import UserError, printable
+from harness.core.resources import find
+
+# Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
+QWEN2_SPLIT = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}"
+    r"| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+
+
+@lru_cache(maxsize=4)
+def tokenizer(source: Path) -> Any:
+    """A `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
+
+    Raises:
+        UserError: there is no tokenizer there, or not one of those.
+    """
+    from tokenizers import Tokenizer
+
+    file = source / "tokenizer.json" if source.is_dir() else source
+    if not file.is_file():
+        raise UserError(
+            f"no tokenizer at {printable(file)}; give a tokenizer.json, its folder, or a GGUF file"
+        )
+    try:
+        return _from_gguf(file) if file.suffix == ".gguf" else Tokenizer.from_file(str(file))
+    except UserError:
+        raise
+    except Exception as error:  # tokenizers and gguf raise bare Exceptions on a broken file
+        raise UserError(f"{printable(file)} is no readable tokenizer: {printable(error)}") from None
+
+
+def _from_gguf(file: Path) -> Any:
+    from gguf import GGUFReader
+    from tokenizers import AddedToken, models
+
+    reader = GGUFReader(file)
+
+    def texts(key: str) -> list[str]:
+        field = reader.fields[key]
+        return [bytes(field.parts[i]).decode("utf-8") for i in field.data]
+
+    (kind,) = texts("tokenizer.ggml.pre")
+    if kind != "qwen2":
+        raise UserError(f"{printable(file)} has the pre-tokeniser {printable(kind)}; only qwen2 can be read")
+    vocabulary = texts("tokenizer.ggml.tokens")
+    merges = [(left, right) for left, right in (p.split(" ") for p in texts("tokenizer.ggml.merges"))]
+    types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
+             for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
+    built = byte_level(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
+    # Control tokens, and words that a text holds whole, such as `<think>`.
+    added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
+    built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
+    return built
+
+
+def byte_level(model: Any) -> Any:
+    """A `tokenizers.Tokenizer` of a BPE model over bytes, which splits text as Qwen2 does."""
+    from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
+
+    built = Tokenizer(model)
+    built.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Split(Regex(QWEN2_SPLIT), "isolated"),
+            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
+        ]
+    )
+    built.decoder = decoders.ByteLevel()
+    return built
+
+
+def counter(
+    source: Path | None, card: Card | None = None
+) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
+    """A function that counts the tokens of chat messages' contents, the chat template's own left out.
+
+    Takes the tokenizer given, else the one that lies with the model's weights; None where there is neither.
+    """
+    if source is None and card and card.weights:
+        beside = find("models", card.weights)
+        source = beside if (beside / "tokenizer.json").is_file() else None
+    if source is None:
+        return None
+    loaded = tokenizer(source)
+    return lambda messages: sum(len(loaded.encode(m["content"]).ids) for m in messages)
+
+
+def spread_of(counts: Sequence[int]) -> dict[str, float]:
+    """`n`, `least`, `mean` and `most` of some counts of tokens."""
+    mean = round(sum(counts) / len(counts), 1)
+    return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

@@ -1,0 +1,179 @@
+"""Sequences that go forward together through a transformers model, cached keys and values in between.
+
+Sequences of different length are padded on the left of what is new, so pads lie between old tokens and new
+ones. A mask hides them and positions do not count them, which full attention cannot tell from no padding at
+all. Other kinds of layer can (a sliding window counts pads, a recurrent state reads them): a model that has
+one reads each sequence on its own.
+
+Importing this imports torch.
+"""
+
+from collections.abc import Sequence
+from inspect import signature
+from typing import Any
+
+import numpy as np
+import torch
+from transformers.cache_utils import DynamicCache, DynamicLayer
+
+from harness.backends.engine import Session
+from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
+from harness.core.arrays import Floats
+
+
+class Reader:
+    """A model that reads prompts.
+
+    Attributes:
+        together: whether sequences can be padded, and so read in one batch.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._prefixes = Prefixes()
+        self._failed = False
+        self._positions = "position_ids" in signature(model.forward).parameters
+        layers = self.cache().layers
+        self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
+
+    def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
+        """Read some prompts, none of them empty."""
+        if self._failed:  # for want of memory, perhaps; what the failed call held is gone by now
+            self._prefixes.clear()
+            if self._model.device.type == "cuda":
+                torch.cuda.empty_cache()
+        self._failed = True  # until all went well
+        session = self._read(prompts)
+        self._failed = False
+        return session
+
+    def _read(self, prompts: Sequence[Sequence[int]]) -> Session:
+        if not self.together:
+            return Apart([Rows(self, NOTHING, [prompt]) for prompt in prompts])
+        # Each prompt's last token is left to be read, for what comes after it.
+        shared = common([list(prompt[:-1]) for prompt in prompts])
+        # A prompt that is asked again, alone, is read again: else its time would be no answer's time.
+        prefix = self._prefixes.longest(shared, but=prompts[0] if len(prompts) == 1 else ())
+        if len(prompts) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
+            prefix = Prefix(shared, Rows(self, prefix, [shared]).layers())
+            self._prefixes.keep(prefix)
+        rows = Rows(self, prefix, prompts)
+        if len(prompts) == 1:  # what the next prompt will have in common with it is not known yet
+            self._prefixes.keep(Prefix(list(prompts[0]), rows.layers()))
+        return rows
+
+    def cache(self) -> DynamicCache:
+        """An empty cache of the model's layers."""
+        return DynamicCache(config=self._model.config)
+
+    def forward(self, cache: DynamicCache, ids: Any, mask: Any) -> Any:
+        """Logits behind the last column, (n, vocabulary).
+
+        Args:
+            cache: what was read so far; what is read now is added.
+            ids: tokens, (n, width), on the CPU.
+            mask: 1 where there is a token and 0 at a pad, (n, cached + width), on the CPU.
+        """
+        device = self._model.device
+        options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
+        if self._positions:
+            options["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)[:, -ids.shape[1] :].to(device)
+        try:
+            with torch.inference_mode():
+                return self._model(input_ids=ids.to(device), logits_to_keep=1, **options).logits[:, -1]
+        except Exception:
+            self._failed = True
+            raise
+
+
+class Rows:
+    """A `Session` of sequences in one batch."""
+
+    def __init__(self, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]]) -> None:
+        """Read prompts that all begin with `prefix` and are longer."""
+        n, known = len(prompts), len(prefix.ids)
+        self._reader = reader
+        self._cache = reader.cache()
+        for i, (keys, values) in enumerate(prefix.layers):
+            self._cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
+        self._mask = torch.ones(n, known, dtype=torch.long)
+        self._logits: Any = None
+        self.advance([prompt[known:] for prompt in prompts])
+
+    def layers(self) -> list[tuple[Any, Any]]:
+        """Each layer's keys and values so far, (n, heads, tokens, dim); never altered by going on."""
+        return [(layer.keys, layer.values) for layer in self._cache.layers]
+
+    def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        """Most likely next token of each sequence, of the tokens listed for it; the lowest of equals."""
+        found = []
+        for row, tokens in zip(self._logits, among, strict=True):
+            if tokens is None:
+                found.append(row.argmax())
+            else:
+                ids = torch.tensor(sorted(tokens), device=row.device)
+                found.append(ids[row[ids].argmax()])
+        chosen: list[int] = torch.stack(found).tolist()
+        return chosen
+
+    def log_probs(self, tokens: Sequence[int]) -> Floats:
+        """Natural log-probabilities of some tokens as the next one, (n, len)."""
+        logits = self._logits.float()
+        found: Floats = (logits[:, list(tokens)] - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
+        return found
+
+    def advance(self, chunks: Sequence[Sequence[int]]) -> None:
+        """Append tokens to each sequence."""
+        width = max(map(len, chunks))
+        if width == 0:
+            return
+        ids = torch.zeros(len(chunks), width, dtype=torch.long)  # masked where nothing is filled in
+        new = torch.zeros_like(ids)
+        for row, chunk in enumerate(chunks):
+            if chunk:
+                ids[row, width - len(chunk) :] = torch.tensor(chunk)
+                new[row, width - len(chunk) :] = 1
+        self._mask = torch.cat([self._mask, new], dim=1)
+        logits = self._reader.forward(self._cache, ids, self._mask)
+        moved = new[:, -1:].bool().to(logits.device)
+        self._logits = logits if self._logits is None else torch.where(moved, logits, self._logits)
+
+    def keep(self, places: Sequence[int]) -> None:
+        """Go on with these sequences only, in this order."""
+        rows = torch.tensor(places)
+        self._mask = self._mask[rows]
+        self._logits = self._logits[rows.to(self._logits.device)]
+        self._cache.batch_select_indices(rows.to(self._logits.device))
+
+    def close(self) -> None:
+        """Let go of the cache."""
+        self._cache = self._logits = None
+
+
+class Apart:
+    """A `Session` of sequences that are each read on their own."""
+
+    def __init__(self, sessions: Sequence[Session]) -> None:
+        self._sessions = sessions
+
+    def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        """Most likely next token of each sequence, of the tokens listed for it; the lowest of equals."""
+        return [s.argmax([tokens])[0] for s, tokens in zip(self._sessions, among, strict=True)]
+
+    def log_probs(self, tokens: Sequence[int]) -> Floats:
+        """Natural log-probabilities of some tokens as the next one, (n, len)."""
+        return np.concatenate([session.log_probs(tokens) for session in self._sessions])
+
+    def advance(self, chunks: Sequence[Sequence[int]]) -> None:
+        """Append tokens to each sequence."""
+        for session, chunk in zip(self._sessions, chunks, strict=True):
+            session.advance([chunk])
+
+    def keep(self, places: Sequence[int]) -> None:
+        """Go on with these sequences only, in this order."""
+        self._sessions = [self._sessions[place] for place in places]
+
+    def close(self) -> None:
+        """Let go of the caches."""
+        for session in self._sessions:
+            session.close()

@@ -1,0 +1,104 @@
+"""How intents become one policy. Vehicle 0 is the ego and is always heard.
+
+A new rule is one function of (p, weights) and one entry in `RULES`. `ego-prompt` is no rule: the ego's model
+is asked again, with the messages in its prompt (the paper's section III-C).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats
+
+
+def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
+    """Weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2); 0 for a helper not heard.
+
+    With no helper heard the ego's weight is exactly 1, which is the paper's fall-back to its own intent.
+
+    Args:
+        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
+        heard: which helpers' replies are fused, `(..., H)`.
+        min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle
+            in the zone would otherwise outvote everybody.
+    """
+    fused = np.insert(heard, 0, True, axis=-1)
+    closeness = np.where(fused, 1.0 / np.maximum(distance_m, min_distance_m), 0.0)
+    total: Floats = np.sum(closeness, axis=-1, keepdims=True)
+    return closeness / total
+
+
+def linear_pool(p: Floats, weights: Floats) -> Floats:
+    """Weighted mean of intents, `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
+
+    Args:
+        p: intents, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
+        weights: weight of each vehicle, `(..., 1+H)`, summing to 1.
+    """
+    row_weights = weights[..., None]
+    pooled: Floats = np.sum(row_weights * np.where(row_weights > 0, p, 0.0), axis=-2)
+    return pooled
+
+
+def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
+    """Weighted geometric mean of intents, `(..., A)` (the logarithmic opinion pool of Genest 1984).
+
+    A probability below `floor` counts as that much, so that one rounded 0 is no veto.
+    """
+    row_weights = weights[..., None]
+    logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
+    pooled = np.exp(np.sum(row_weights * logs, axis=-2))
+    return np.asarray(pooled / np.sum(pooled, axis=-1, keepdims=True))
+
+
+def median(p: Floats, weights: Floats) -> Floats:
+    """Weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
+
+    Where half of the weight lies exactly on either side, the mean of the two in the middle. All medians can
+    be 0, if every vehicle is sure of another action than the others; then the linear pool stands in.
+    """
+    values, below = _sorted(p, weights)
+    low = _pick(values, below >= 0.5 - 1e-12)
+    high = _pick(values, below > 0.5 + 1e-12)
+    return _scaled((low + high) / 2, p, weights)
+
+
+def trimmed_mean(p: Floats, weights: Floats) -> Floats:
+    """Weighted mean of each action's probability less the lowest and highest quarter of weight, `(..., A)`.
+
+    Scaled to sum to 1. Between the median, which trims all, and the linear pool, which trims nothing.
+    """
+    values, below = _sorted(p, weights)
+    inside = np.clip(below, 0.25, 0.75)
+    kept = np.diff(inside, axis=-2, prepend=0.25)
+    return _scaled(np.sum(kept * values, axis=-2) / 0.5, p, weights)
+
+
+def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Each action's probabilities in order, `(..., 1+H, A)`, and the weight up to and with each."""
+    heard = np.where(weights[..., None] > 0, p, np.inf)  # who is not heard comes last, with weight 0
+    order = np.argsort(heard, axis=-2, kind="stable")
+    below = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], p.shape), order, -2), axis=-2)
+    values = np.take_along_axis(heard, order, -2)
+    return np.where(np.isinf(values), 0.0, values), below
+
+
+def _pick(values: Floats, reached: Bools) -> Floats:
+    """The first value where `reached`, `(..., A)`."""
+    first = np.argmax(reached, axis=-2)[..., None, :]
+    return np.take_along_axis(values, first, -2)[..., 0, :]
+
+
+def _scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
+    total = np.sum(pooled, axis=-1, keepdims=True)
+    return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))
+
+
+RULES: dict[str, Callable[[Floats, Floats], Floats]] = {
+    "linear": linear_pool,
+    "log-pool": log_pool,
+    "median": median,
+    "trimmed-mean": trimmed_mean,
+}
+EGO_PROMPT = "ego-prompt"
+NAMES = (*RULES, EGO_PROMPT)

@@ -1,0 +1,195 @@
+"""Who is heard, and when: the timeline of one decision from seeing to the last reply, for any number at once.
+
+In seconds from the start of the decision:
+
+    0                     every vehicle sees the scene; the ego infers, and the helpers in parallel with it
+    infer_s[0]            the ego has its own intent. Sure enough, or nobody to ask: it acts now.
+                          Unsure: it broadcasts its request to the nearest helpers in its radius.
+                          Where helpers infer on demand, they see and begin only now
+    ready                 a helper has the request and its own intent, and its reply can leave:
+                          max(infer_s[0], infer_s[1+h]); on demand infer_s[0] + infer_s[1+h]
+    + slots               replies are on air, one after another or at once, as the profile says; a slot is
+                          nominal latency + payload / bandwidth + jitter, twice over a roadside edge
+    arrival_s[h]          the end of the helper's slot, if request and reply crossed; else inf
+    window_s              what has arrived by now is fused
+    exchange_s            the end of the last slot: the ego also waits out a lost or late reply
+
+The paper counts the whole exchange as the decision's latency even when it outlasts the window, and so
+does this. Everything here is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from harness.coordination.channel import (
+    NO_CHANNEL,
+    PROFILES,
+    Profile,
+    density_coupled_loss,
+    link_up,
+    reply_delay_s,
+)
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
+from harness.core.arrays import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Luck:
+    """The channel's draws in [0, 1); one operating point sees the same as another.
+
+    Attributes:
+        link: request and reply of each helper, `(..., H, 2)`. Equal for all steps of an episode under
+            block fading.
+        jitter: delay of each reply, `(..., H)`.
+    """
+
+    link: Floats
+    jitter: Floats
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """What was sent and heard in each decision. Times are seconds from the start of the decision.
+
+    Attributes:
+        own: the ego's intent after the fallback, `(..., A)`.
+        own_failed: the ego's answer was unusable and `own` is the fallback, `(...)`.
+        entropy_nats: entropy of `own`, `(...)`.
+        triggered: the entropy is above tau and the point has a channel, `(...)`.
+        asked: helpers asked, each a scheduled reply, `(..., H)`.
+        loss: probability that one crossing was lost, `(...)`; NaN without a channel.
+        delivered: asked, and request and reply crossed, `(..., H)`.
+        arrival_s: end of the reply, `(..., H)`; inf where lost or not asked.
+        on_time: arrived within the window, so fused, `(..., H)`.
+        exchange_s: end of the whole exchange, `(...)`.
+    """
+
+    own: Floats
+    own_failed: Bools
+    entropy_nats: Floats
+    triggered: Bools
+    asked: Bools
+    loss: Floats
+    delivered: Bools
+    arrival_s: Floats
+    on_time: Bools
+    exchange_s: Floats
+
+    @cached_property
+    def normalised_entropy(self) -> Floats:
+        """Entropy of `own` over ln A, `(...)`."""
+        return normalised_entropy(self.own)
+
+    @cached_property
+    def messages(self) -> Ints:
+        """Replies scheduled, `(...)`. As in the paper's count, the request is none."""
+        return np.asarray(np.sum(self.asked, axis=-1))
+
+    @cached_property
+    def lost(self) -> Ints:
+        """Of the messages, how many did not arrive, `(...)`."""
+        return np.asarray(np.sum(self.asked & ~self.delivered, axis=-1))
+
+    @cached_property
+    def late(self) -> Ints:
+        """Of the messages, how many arrived after the window, `(...)`."""
+        return np.asarray(np.sum(self.delivered & ~self.on_time, axis=-1))
+
+    @cached_property
+    def observed_loss(self) -> Floats:
+        """Share of the messages that did not arrive, `(...)`; NaN where there are none."""
+        return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
+
+
+def exchange(
+    point: OperatingPoint,
+    own: Floats,
+    helpers: Floats,
+    valid: Bools,
+    range_m: Floats,
+    payload_bits: Floats,
+    infer_s: Floats,
+    luck: Luck,
+) -> Exchange:
+    """Trigger and channel for decisions `(...)` with up to H helpers and A actions each.
+
+    Args:
+        point: the operating point.
+        own: the ego's intent, `(..., A)`; a row with a NaN is a failed answer.
+        helpers: helpers' intents, `(..., H, A)`.
+        valid: the helper exists and its answer parsed, `(..., H)`. Any other sends nothing, takes no
+            slot, and may hold NaN in every array.
+        range_m: distance to the ego, `(..., H)`.
+        payload_bits: size of the reply, `(..., H)`.
+        infer_s: seconds of inference, `(..., 1+H)`, the ego first.
+        luck: the channel's draws.
+    """
+    profile = NO_CHANNEL if point.profile is None else PROFILES[point.profile]
+    if point.profile is not None and point.latency_s is not None:
+        profile = replace(profile, latency_s=point.latency_s)
+    own_failed = np.any(np.isnan(own), axis=-1)
+    own = np.where(own_failed[..., None], fallback_intent(point.fallback, own.shape[-1]), own)
+    entropy = entropy_nats(own)
+    asks = (entropy > point.tau_nats) & (point.profile is not None)
+
+    in_radius = valid & (range_m <= point.radius_m)
+    asked = asks[..., None] & nearest(in_radius, range_m, point.max_helpers)
+    unsure = triggered(helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(valid)
+    loss = crossing_loss(point, profile, in_radius, unsure)
+    delivered = asked & link_up(luck.link, loss, point.roadside_edge)
+
+    request_s = infer_s[..., :1]
+    infers_s = infer_s[..., 1:]
+    ready_s = infers_s if point.on_demand else np.maximum(infers_s - request_s, 0.0)
+    delay_s = reply_delay_s(profile, asked, ready_s, range_m, payload_bits, luck.jitter, point.roadside_edge)
+    slot_end_s = request_s + delay_s
+    arrival_s = np.where(delivered, slot_end_s, np.inf)
+    ends_s = np.where(asked, slot_end_s, request_s)
+    return Exchange(
+        own=own,
+        own_failed=own_failed,
+        entropy_nats=entropy,
+        triggered=asks,
+        asked=asked,
+        loss=loss,
+        delivered=delivered,
+        arrival_s=arrival_s,
+        on_time=arrival_s <= point.window_s,
+        exchange_s=np.maximum(infer_s[..., 0], np.max(ends_s, axis=-1, initial=0.0)),
+    )
+
+
+def fallback_intent(fallback: str, n_actions: int) -> Floats:
+    """What a failed ego answer becomes, `(A,)`: `uniform`, or `brake`, sure of the first action."""
+    if fallback == "brake":
+        first: Floats = np.eye(1, n_actions)[0]
+        return first
+    return np.full(n_actions, 1.0 / n_actions)
+
+
+def nearest(candidates: Bools, range_m: Floats, most: int) -> Bools:
+    """The `most` nearest of the candidates, `(..., H)`; of equals, the earlier ones."""
+    if most >= candidates.shape[-1]:
+        return candidates
+    order = np.argsort(np.where(candidates, range_m, np.inf), axis=-1, kind="stable")
+    rank = np.argsort(order, axis=-1, kind="stable")
+    return candidates & (rank < most)
+
+
+def crossing_loss(point: OperatingPoint, profile: Profile, in_radius: Bools, unsure: Bools) -> Floats:
+    """Probability that one crossing is lost, `(...)`: the point's, the swarm's or the profile's.
+
+    Under density coupling every valid helper in the radius `(..., H)` is an active vehicle, asked or
+    not, and so is the ego. Where helpers open rounds of their own, those that are unsure `(..., H)` are
+    active beside the ego, and the loss is that of so many if it is the larger.
+    """
+    if point.profile is not None and point.density_coupled:
+        return density_coupled_loss(1 + np.sum(in_radius, axis=-1))
+    overridden = point.profile is not None and point.loss is not None
+    loss = np.full(in_radius.shape[:-1], point.loss if overridden else profile.loss)
+    if point.profile is not None and point.helper_rounds:
+        loss = np.maximum(loss, density_coupled_loss(1 + np.sum(in_radius & unsure, axis=-1)))
+    return loss

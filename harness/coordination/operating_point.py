@@ -1,0 +1,154 @@
+"""An operating point: everything a cooperative decision depends on, besides the scene and the model."""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from harness.coordination.channel import PROFILES
+from harness.coordination.consensus import EGO_PROMPT, NAMES
+from harness.core.errors import UserError, printable, unknown
+
+FALLBACKS = ("uniform", "brake")
+_LARGEST = sys.float_info.max
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Raises UserError for a value that is not allowed.
+
+    Attributes:
+        name: what reports call it.
+        profile: channel profile; None disables V2V.
+        tau_nats: the ego asks when its entropy is above this.
+        window_s: decision window, from the start of the decision; a later reply is not fused.
+        radius_m: the paper's R; helpers farther from the ego are not asked.
+        max_helpers: the cooperative neighbourhood; of more helpers the nearest are asked.
+        min_distance_m: lower bound of d in the paper's Eq. 2.
+        fallback: what a failed ego answer becomes: `uniform`, all actions alike, or `brake`, all mass on
+            the first action, which is the most conservative one.
+        consensus: consensus rule, or `ego-prompt`.
+        loss: probability that one crossing is lost, in place of the profile's; None keeps the profile's.
+        latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
+        density_coupled: loss follows the number of active vehicles, in place of the profile's.
+        helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
+        roadside_edge: replies travel over a roadside edge node as well (`channel.link_up`).
+        on_demand: a helper infers when it is asked, and not in parallel with the ego.
+    """
+
+    name: str
+    profile: str | None
+    tau_nats: float = 0.7
+    window_s: float = 0.2
+    radius_m: float = 100.0
+    max_helpers: int = 3
+    min_distance_m: float = 1.0
+    fallback: str = "uniform"
+    consensus: str = "linear"
+    loss: float | None = None
+    latency_s: float | None = None
+    density_coupled: bool = False
+    helper_rounds: bool = False
+    roadside_edge: bool = False
+    on_demand: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
+        if self.profile is not None and str(self.profile) not in PROFILES:
+            raise unknown("channel profile", str(self.profile), PROFILES, "; leave it out to disable V2V")
+        if self.fallback not in FALLBACKS:
+            raise unknown("fallback", str(self.fallback), FALLBACKS)
+        if str(self.consensus) not in NAMES:
+            raise unknown("consensus", str(self.consensus), NAMES)
+        self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
+        self._number("window_s", "seconds above 0")
+        self._number("radius_m", "metres above 0")
+        self._number("min_distance_m", "metres above 0")
+        if self.loss is not None:
+            self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
+        if self.latency_s is not None:
+            self._number("latency_s", "seconds, 0 or more", zero=True)
+        if type(self.max_helpers) is not int or self.max_helpers < 0:
+            raise self._wrong("max_helpers", "a whole number, 0 or more")
+        for flag in ("density_coupled", "helper_rounds", "roadside_edge", "on_demand"):
+            if type(getattr(self, flag)) is not bool:
+                raise self._wrong(flag, "true or false")
+        if self.density_coupled and self.loss is not None:
+            raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
+        """Operating point from a configuration's table; without a profile it has no V2V.
+
+        Raises UserError, for an unknown key too.
+        """
+        known = [field.name for field in fields(cls)]
+        for key in values:
+            if key not in known:
+                raise unknown("operating point setting", str(key), known)
+        if "name" not in values:
+            raise UserError('operating point without a name: add name = "..."')
+        return cls(**{"profile": None, **values})
+
+    @property
+    def asks_again(self) -> bool:
+        """Whether the ego's model merges the messages, and so is asked a second time."""
+        return self.profile is not None and self.consensus == EGO_PROMPT
+
+    def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
+        value = getattr(self, key)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
+            raise self._wrong(key, allowed)
+        if value == 0 and not zero:
+            raise self._wrong(key, allowed)
+        # A configuration's 1 and 1.0 are one point, with one digest.
+        object.__setattr__(self, key, float(value))
+
+    def _wrong(self, key: str, allowed: str) -> UserError:
+        value = printable(repr(getattr(self, key)))
+        return UserError(f"operating point {printable(self.name)!r}: {key} is {value}; it must be {allowed}")
+
+
+POINTS = {
+    point.name: point
+    for point in (
+        OperatingPoint("single-local", None),
+        OperatingPoint("v2x", "v2x"),
+        OperatingPoint("6g", "6g"),
+    )
+}
+
+
+def named_point(text: str) -> OperatingPoint:
+    """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
+
+    The text is its name. Raises UserError if there is no such point or setting, or a value is not allowed.
+    """
+    name, colon, settings = text.partition(":")
+    if name not in POINTS:
+        raise unknown("operating point", name, POINTS)
+    changed: dict[str, Any] = {}
+    for setting in settings.split(",") if colon else ():
+        key, _, value = setting.partition("=")
+        if key not in SETTINGS:
+            raise unknown(f"setting of operating point {name}", key, SETTINGS, f"; as in {name}:window_s=0.3")
+        if key in changed:
+            raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
+        changed[key] = _value(getattr(POINTS[name], key), value)
+    return replace(POINTS[name], name=text, **changed) if changed else POINTS[name]
+
+
+SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
+
+
+def _value(usual: object, text: str) -> object:
+    """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
+    if isinstance(usual, bool):
+        return {"true": True, "false": False}.get(text, text)
+    if isinstance(usual, str):
+        return text
+    try:
+        return int(text) if isinstance(usual, int) else float(text)
+    except ValueError:
+        return text

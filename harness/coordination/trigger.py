@@ -1,0 +1,22 @@
+"""When a vehicle is unsure enough to ask the others."""
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats
+
+
+def entropy_nats(p: Floats) -> Floats:
+    """Shannon entropy of intents `(..., A)`, in nats, with 0 log 0 = 0. Shape `(...)`."""
+    # No term of a distribution is positive; abs() also turns -0.0 into 0.0.
+    entropy: Floats = np.sum(np.abs(p * np.log(np.where(p > 0, p, 1.0))), axis=-1)
+    return entropy
+
+
+def normalised_entropy(p: Floats) -> Floats:
+    """Entropy of intents `(..., A)` over its largest value ln A: 0 sure, 1 uniform; 0 if A is 1."""
+    return entropy_nats(p) / (np.log(p.shape[-1]) if p.shape[-1] > 1 else 1.0)
+
+
+def triggered(p: Floats, tau_nats: float) -> Bools:
+    """Whether the entropy of intents `(..., A)` is above the threshold (paper Eq. 3, strictly above)."""
+    return entropy_nats(p) > tau_nats

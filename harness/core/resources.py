@@ -1,0 +1,51 @@
+"""Where prompts, model cards and datasets lie: in one's project, and beside them those that ship.
+
+What ships lies at the checkout's top level, or inside the wheel. A folder with a file `swarmdrive.toml` is a
+project; its own `prompts/`, `models/` and `datasets/` count where it is the current directory.
+"""
+
+import os
+from pathlib import Path
+
+from harness.core.errors import UserError, printable
+
+DATASET = "occluded-intersection-v1"  # the one that ships
+MARKER = "swarmdrive.toml"
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+def root() -> Path:
+    """Folder that holds the `prompts/`, `models/` and `datasets/` that ship."""
+    checkout = _PACKAGE.parent
+    return checkout if (checkout / "pyproject.toml").is_file() else _PACKAGE / "_data"
+
+
+def folder(kind: str) -> Path:
+    """Folder of one kind of resource that ships: `prompts`, `models` or `datasets`."""
+    return root() / kind
+
+
+def entries(kind: str, pattern: str) -> list[Path]:
+    """What there is of one kind, shipped and the project's, by a pattern below its folder."""
+    return sorted(path for where in _folders(kind) for path in where.glob(pattern))
+
+
+def find(kind: str, name: str) -> Path:
+    """Where a resource lies; if nowhere, where it would lie among those that ship.
+
+    Raises:
+        UserError: the project and the harness both have one of that name, which would then mean two things.
+    """
+    found = list(dict.fromkeys(where / name for where in _folders(kind)))  # one, if `name` is absolute
+    there = [path for path in found if os.path.exists(path)]
+    if len(there) > 1:
+        raise UserError(
+            f"{kind}/{printable(name)} is in this project and ships with the harness; give yours another name"
+        )
+    return there[0] if there else found[0]
+
+
+def _folders(kind: str) -> list[Path]:
+    project = Path.cwd()
+    return [folder(kind), *([project / kind] if (project / MARKER).is_file() else [])]

@@ -1,0 +1,182 @@
+"""What is evaluated, resolved and complete: enough to run it again."""
+
+import platform
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
+
+from harness import __version__
+from harness.backends.base import AnswerMode
+from harness.backends.cards import WEIGHTED, Card, load, names
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError, printable, unknown
+from harness.dataset.load import Dataset
+from harness.prompts.versions import Prompt
+
+FORMAT = "swarmdrive-run/1"
+Latency = Literal["card", "measured", "paper"]
+TAG_CHARACTERS = 40
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One evaluation.
+
+    Attributes:
+        card: the model.
+        prompt: the prompt version.
+        dataset: the scenes, already limited.
+        points: conditions, each an operating point.
+        seeds: seeds of the channel's luck.
+        limit: how many episodes of the dataset were taken; None for all.
+        thinking: whether the model is asked to think first.
+        answer: how answers are had: free `json`, `constrained` to the schema, or the `readout` of letters.
+        batch_size: most requests that go through the engine together.
+        device: engine's device, or None for its choice.
+        dtype: number format, or None for the card's.
+        latency: where inference times come from, or None for the card's choice.
+        tags: words to find the run by, which change nothing in it.
+    """
+
+    card: Card
+    prompt: Prompt
+    dataset: Dataset
+    points: tuple[OperatingPoint, ...]
+    seeds: tuple[int, ...]
+    limit: int | None = None
+    thinking: bool = False
+    answer: AnswerMode = "json"
+    batch_size: int = 8
+    device: str | None = None
+    dtype: str | None = None
+    latency: Latency | None = None
+    tags: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise UserError(
+                f"--seeds {list(self.seeds)}: give one or more different whole numbers, such as 0:5"
+            )
+        for tag in self.tags:
+            if not (0 < len(tag) <= TAG_CHARACTERS and tag.isprintable() and tag == tag.strip()):
+                raise UserError(
+                    f"--tag {printable(tag)!r}: give 1 to {TAG_CHARACTERS} printable characters, "
+                    "with no space at either end"
+                )
+        if self.batch_size < 1:
+            raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
+        served = self.card.engine == "openai" and self.card.thinking != "none"
+        if self.thinking and not (served or self.card.engine in (*WEIGHTED, "replay")):
+            raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
+        if self.card.thinking == "always":  # its answers hold a thought, asked for or not
+            object.__setattr__(self, "thinking", True)
+        if self.answer not in get_args(AnswerMode):
+            raise unknown("answer mode", self.answer, get_args(AnswerMode))
+        if self.answer != "json" and self.card.engine in ("proxy", "driver"):
+            raise UserError(
+                f"--answer {self.answer}: {printable(self.card.name)} is no language model; use json"
+            )
+        if self.answer != "json" and self.thinking:
+            raise UserError(
+                f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
+                "which only json leaves room for"
+            )
+        self._check_latency()
+        for point in self.points:
+            if point.asks_again and (self.card.engine in ("proxy", "driver") or self.answer == "readout"):
+                raise UserError(
+                    f"condition {printable(point.name)}: "
+                    + ("a readout gives no messages to merge; use --answer json or constrained"
+                       if self.answer == "readout"
+                       else f"{printable(self.card.name)} is no language model and cannot merge messages")
+                )  # fmt: skip
+        for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
+            if value is not None and self.card.engine not in WEIGHTED:
+                raise UserError(
+                    f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
+                    f"(engines {' and '.join(WEIGHTED)} have); leave it out"
+                )
+
+    def _check_latency(self) -> None:
+        shown, engine = f"--latency {printable(self.latency)}", self.card.engine
+        if self.latency is None:
+            return
+        if self.latency not in get_args(Latency):
+            raise unknown("--latency", self.latency, get_args(Latency))
+        if engine == "replay" and self.latency != "paper":
+            raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
+        if self.latency == "measured" and engine in ("proxy", "driver"):
+            raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
+        if self.latency == "card" and self.card.latency.inference_s is None:
+            raise UserError(
+                f"{shown}: the card of {printable(self.card.name)} declares no inference time; "
+                "use measured or paper, or add inference_s to the card"
+            )
+
+    def tagged(self, begun: Mapping[str, Any]) -> Self:
+        """This, with the tags that a run was begun with before its own."""
+        return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
+
+    def settings(self) -> dict[str, Any]:
+        """What a resumed run must have in common with the one it continues."""
+        return {
+            "model": asdict(self.card),
+            "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
+            "dataset": {
+                "name": self.dataset.name, "sha256": self.dataset.sha256, "scenes": len(self.dataset.scenes),
+                "episodes": len({s.record["episode"] for s in self.dataset.scenes}),
+            },
+            "actions": list(self.dataset.actions),
+            "conditions": [asdict(point) for point in self.points],
+            "seeds": list(self.seeds),
+            "limit": self.limit,
+            "thinking": self.thinking,
+            "answer": self.answer,
+            "batch_size": self.batch_size,
+            "dtype": self.dtype,
+            "latency_source": self.latency,
+        }  # fmt: skip
+
+    def command(self, out: Path) -> str:
+        """A command line that runs this again, quoted for a shell."""
+        options = [
+            ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
+            ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
+            *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
+            ("--batch-size", self.batch_size),
+            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype),
+            ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
+        ]  # fmt: skip
+        parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
+        return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])
+
+
+def model_argument(card: Card) -> str:
+    """What `--model` was given, or anything that resolves to the same card."""
+    if card.name.partition(":")[0] in names() and load(card.name) == card:
+        return card.name
+    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
+
+
+def versions(
+    packages: Sequence[str] = (
+        "numpy",
+        "scipy",
+        "jinja2",
+        "highway-env",
+        "torch",
+        "transformers",
+        "llama-cpp-python",
+    ),
+) -> Any:
+    """Versions of what a result may depend on, as far as it is installed."""
+    found = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,177 @@
+"""From a completion's text to an intent: one status for any text, and nothing mended in silence.
+
+The order is the rule: the thought is cut off before anything is looked for, valid JSON goes before mended
+JSON, and two answers that differ are no answer.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from harness.core import errors
+from harness.parsing import candidates, reasoning
+from harness.parsing.answer import Answer, read
+from harness.parsing.candidates import Candidate, whole
+from harness.parsing.mend import unreadable
+from harness.parsing.status import Failure, Repair, Status
+from harness.prompts.answer_schema import ROLES
+
+__all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
+
+_SAME = 1e-9  # two renderings of one distribution (0.5, 50%) differ by less
+_SPECIAL = re.compile(
+    r"<\|im_start\|>assistant|<start_of_turn>model|<\|start_header_id\|>assistant<\|end_header_id\|>"
+    r"|<[|｜][^<>{}\n]{1,40}[|｜]>|</?s>|<eos>|<bos>|<pad>|<unk>|<end_of_turn>|\[/?INST\]"
+)
+_INVISIBLE = re.compile(r"[\u200b-\u200f\u2060-\u2064\u202a-\u202e\ufeff\u00ad]|[^\S \t\r\n]")
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """What one completion says.
+
+    Attributes:
+        status: the one outcome.
+        repairs: what was mended, in the order of `Repair`; empty unless recovered.
+        intent: probabilities in the order of the actions, summing to 1; None if failed.
+        mass: the sum as the model wrote it; None where it wrote none (a recommendation, most failures).
+        message: a helper's evidence, risk, recommended_maneuver and confidence. For a distribution the
+            maneuver is the most probable action (the first of equals) and the confidence its probability.
+        reasoning: the thought, where there was one; all text if it was never closed.
+        detail: one sentence for people, safe to print.
+    """
+
+    status: Status
+    repairs: tuple[Repair, ...] = ()
+    intent: tuple[float, ...] | None = None
+    mass: float | None = None
+    message: dict[str, Any] | None = None
+    reasoning: str | None = None
+    detail: str = ""
+
+    @property
+    def verdict(self) -> Literal["strict", "recovered", "failed"]:
+        """The status in three classes."""
+        if self.status is Status.STRICT:
+            return "strict"
+        return "recovered" if self.status is Status.RECOVERED else "failed"
+
+
+def parse(
+    text: str,
+    *,
+    role: str,
+    actions: Sequence[str],
+    thinking: bool = False,
+    finish_reason: str = "stop",
+    error: str | None = None,
+) -> Parsed:
+    """Read one completion. Any text gives a `Parsed`; nothing in it can make this raise.
+
+    A closed thought is what a thinking model should give, and an empty one is what a template adds, so
+    neither is a repair. A closed thought with content from a model that was not asked to think is one.
+
+    Args:
+        text: the completion, untouched.
+        role: `ego` or `helper`.
+        actions: meta-action names, in the environment's order.
+        thinking: whether the text has to hold a closed thought: the model was asked to think, and the engine
+            did not take the thought out of the text itself.
+        finish_reason: the engine's; `length` means cut off by the token limit.
+        error: the engine's message if it failed.
+
+    Raises:
+        UserError: unknown role.
+    """
+    if role not in ROLES:
+        raise errors.unknown("role", role, ROLES)
+    if error is not None or finish_reason == "error":
+        message = errors.printable(error or "no message", 80)
+        return Parsed(Status.ENGINE_ERROR, detail=f"the engine failed: {message}")
+    actions = tuple(actions)
+    thought: str | None = None
+    try:
+        answer = None if thinking else _strict(text, role, actions)
+        if answer is None:
+            thought, rest = reasoning.split(text, thinking) if text.strip() else (None, "")
+            thought_leads = text.rstrip().endswith(rest.strip())
+            answer = _strict(rest, role, actions) if thought_leads else None
+            if answer is None:
+                answer = _recovered(rest, role, actions, finish_reason == "length")
+            if (thought and not thinking) or not thought_leads:
+                answer = answer.mended(Repair.THINK_BLOCK)
+    except Failure as failure:
+        if failure.status is Status.TRUNCATED_REASONING:
+            thought = text.strip()
+        return Parsed(failure.status, mass=failure.mass, reasoning=thought or None, detail=failure.detail)
+    repairs = tuple(repair for repair in Repair if repair in answer.repairs) if answer.repairs else ()
+    return Parsed(
+        Status.RECOVERED if repairs else Status.STRICT,
+        repairs,
+        answer.intent,
+        answer.mass,
+        answer.message,
+        thought or None,
+        f"read after {len(repairs)} repair(s): {', '.join(repairs)}" if repairs else "fits the schema",
+    )
+
+
+def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) -> list[tuple[int, int]]:
+    """Where in a completion its answers stand, for people to see: start and end of each, as `parse` reads it.
+
+    Empty where nothing was found, or where the text had to be rewritten before anything was.
+    """
+    try:
+        rest = reasoning.split(text, thinking)[1] if text.strip() else ""
+    except Failure:
+        return []
+    start = text.rfind(rest)
+    if start < 0:
+        return []
+    return [(start + a, start + b) for a, b in candidates.spans(rest, role, tuple(actions))]
+
+
+def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
+    """The answer if the text is nothing but that and needs no repair."""
+    candidate = whole(text, role, actions)
+    if candidate is None:
+        return None
+    try:
+        answer = read(candidate.members, candidate.repairs, role, actions)
+    except Failure:
+        return None
+    return None if answer.repairs else answer
+
+
+def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Answer:
+    text, special = _SPECIAL.subn(" ", text)
+    text, zero_width = _INVISIBLE.subn(lambda found: " " if found.group().isspace() else "", text)
+    if not text.strip():
+        raise Failure(Status.EMPTY, "there is no answer in the text")
+    answer = _choose(candidates.candidates(text, role, actions, cut), role, actions)
+    if special:
+        answer = answer.mended(Repair.SPECIAL_TOKENS)
+    return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
+
+
+def _choose(found: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
+    """The one answer among the candidates. An echo of the template beside it is no second answer."""
+    answers: list[Answer] = []
+    failures: list[Failure] = []
+    for candidate in found:
+        try:
+            answers.append(read(candidate.members, candidate.repairs, role, actions))
+        except Failure as failure:
+            failures.append(failure)
+    serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
+    if not answers:
+        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in found):
+            raise unreadable()  # what is wrong in a guessed object need not be wrong in the text
+        raise (serious or failures)[-1]
+    last = answers[-1]
+    same = all(abs(p - q) <= _SAME for one in answers for p, q in zip(one.intent, last.intent, strict=True))
+    if serious or not same:
+        count = len(answers) + len(serious)
+        raise Failure(Status.CONFLICTING_ANSWERS, f"{count} answers stand in the text and they differ")
+    return last.mended(Repair.REPEATED_ANSWER) if len(answers) > 1 else last

@@ -1,0 +1,65 @@
+"""What an answer looks like, as a JSON Schema made from the action names.
+
+The schema is published (to prompts, servers that constrain, readers of a dataset). A sum of one cannot be
+said in JSON Schema; `harness.parsing.parse` checks it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from harness.core import errors
+
+ROLES = ("ego", "helper")
+RISKS = ("low", "medium", "high")
+EVIDENCE_CHARS = 200
+
+
+def answer_schema(
+    role: str, actions: Sequence[str], scenario: str | None = None, form: str | None = None
+) -> dict[str, Any]:
+    """JSON Schema, draft 2020-12, of one role's answer.
+
+    A helper answers in one of two forms: a recommended maneuver with a confidence (prompt v1) or a
+    distribution (prompt v2).
+
+    Args:
+        role: `ego` or `helper`.
+        actions: meta-action names, in the environment's order.
+        scenario: named in the title only.
+        form: the one that a helper is asked for, `recommendation` or `distribution`; None allows both.
+
+    Raises:
+        UserError: unknown role.
+    """
+    probability = {"type": "number", "minimum": 0, "maximum": 1}
+    distribution = {"action_distribution": _closed(dict.fromkeys(actions, probability))}
+    report = {
+        "evidence": {"type": "string", "maxLength": EVIDENCE_CHARS},
+        "risk": _choice(RISKS),
+    }
+    recommendation = {"recommended_maneuver": _choice(actions), "confidence": probability}
+    title = f"{role} answer" + (f", {scenario}" if scenario else "")
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
+    if role == "ego":
+        return head | _closed(distribution)
+    if role == "helper":
+        forms = {
+            "recommendation": _closed(report | recommendation),
+            "distribution": _closed(report | distribution),
+        }
+        return head | ({"oneOf": list(forms.values())} if form is None else forms[form])
+    raise errors.unknown("role", role, ROLES)
+
+
+def _choice(names: Sequence[str]) -> dict[str, Any]:
+    # The type follows from the names, but some servers refuse a schema without it.
+    return {"type": "string", "enum": list(names)}
+
+
+def _closed(properties: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }

@@ -1,0 +1,35 @@
+"""The read-out: the model is asked for one letter, and the letters' probabilities are its answer.
+
+Letters, because labels may begin with the same token (`LANE_LEFT` and `LANE_RIGHT` share two in Qwen's
+vocabulary), so that the first token of a label says nothing of which one it is.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from harness.core.errors import UserError
+from harness.core.files import canonical_json
+from harness.core.rounding import rounded
+
+LETTERS = "ABCDEFGHIJ"
+
+
+def letters(actions: Sequence[str]) -> str:
+    """One letter an action, in order. Raises UserError for more actions than there are letters."""
+    if len(actions) > len(LETTERS):
+        raise UserError(f"--answer readout: {len(actions)} actions, and {len(LETTERS)} letters; use json")
+    return LETTERS[: len(actions)]
+
+
+def asked(messages: Sequence[Mapping[str, str]], actions: Sequence[str]) -> tuple[Mapping[str, str], ...]:
+    """The same chat, whose last message asks for one letter in the end."""
+    options = ", ".join(f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True))
+    *head, last = messages
+    return (*head, {**last, "content": f"{last['content']}\nAnswer with one letter: {options}."})
+
+
+def stated(actions: Sequence[str], shares: Sequence[float]) -> str:
+    """A read-out as an answer's text: the actions' shares, divided by their sum, in millionths."""
+    whole = math.fsum(shares)
+    p = rounded([share / whole for share in shares], parts=10**6)
+    return canonical_json({"action_distribution": dict(zip(actions, p, strict=True))})

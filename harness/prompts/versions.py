@@ -1,0 +1,232 @@
+"""Prompt versions: templates that turn a scene graph into chat messages.
+
+A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
+`user`) and `prompt.toml`. Released versions are pinned by digest in `prompts/released.toml`: a changed text
+is a new version.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from jinja2 import StrictUndefined, Template, TemplateSyntaxError
+from jinja2.runtime import LoopContext
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.resources import entries, find
+
+Graph = Mapping[str, Any]
+ROLES = ("ego", "helper")
+FILES = ("ego.j2", "helper.j2", "prompt.toml")
+ANSWERS = ("distribution", "recommendation")
+LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
+
+
+class Sandbox(ImmutableSandboxedEnvironment):
+    """What a template may do. `graph.ego` is the member of that name: no method of a mapping hides it."""
+
+    def getattr(self, obj: Any, attribute: str) -> Any:
+        """The member, or what the sandbox allows."""
+        # These are nearly all that a template reads, and plain data needs none of the sandbox's checks.
+        if type(obj) is dict and attribute in obj:
+            return obj[attribute]
+        if type(obj) is LoopContext and attribute in LOOP:
+            return getattr(obj, attribute)
+        return super().getattr(obj, attribute)
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """One version.
+
+    Attributes:
+        version: name of its folder.
+        sha256: digest of its files.
+        released: whether it is pinned; a draft may still change.
+        description: one line.
+        helper_answer: what a helper is asked for: `distribution`, or `recommendation` with a confidence.
+        max_objects: how many objects are listed, one fewer where messages are; those in conflict first, then
+            the nearest.
+        token_budget: least and most tokens a rendered prompt may have.
+        max_answer_tokens: most tokens an answer may have, by role.
+        changed: what is new in it.
+        known_failures: what it is known to provoke.
+        texts: template text by role.
+    """
+
+    version: str
+    sha256: str
+    released: bool
+    description: str
+    helper_answer: str
+    max_objects: int
+    token_budget: tuple[int, int]
+    max_answer_tokens: Mapping[str, int]
+    changed: str
+    known_failures: str
+    texts: Mapping[str, str]
+
+    @cached_property
+    def _templates(self) -> dict[str, Template]:
+        environment = Sandbox(undefined=StrictUndefined, keep_trailing_newline=False)
+        compiled = {}
+        for role, text in self.texts.items():
+            try:
+                compiled[role] = environment.from_string(text)
+            except TemplateSyntaxError as error:
+                raise UserError(
+                    f"prompt {self.version} {role}.j2 line {error.lineno} is no Jinja: "
+                    f"{printable(error.message)}"
+                ) from None
+        return compiled
+
+    def render(
+        self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]] = ()
+    ) -> tuple[dict[str, str], ...]:
+        """Chat messages for one viewer's scene graph; exactly what a model is sent.
+
+        Args:
+            graph: the viewer's scene graph; its `role` chooses the template.
+            actions: meta-action names.
+            messages: what helpers have sent, for the ego: `sender`, `evidence`, `risk`, `intent`,
+                `recommended_maneuver`, `confidence`.
+        """
+        objects = shown(graph, self.max_objects - bool(messages))
+        context = {
+            "graph": graph,
+            "actions": actions,
+            "objects": objects,
+            "more": len(graph["nodes"]) - len(objects),
+            "messages": messages,
+        }
+        template = self._templates[graph["role"]]
+        try:
+            shared = template.new_context(context)
+            return tuple(
+                {"role": part, "content": "".join(template.blocks[part](shared))}
+                for part in ("system", "user")
+            )
+        except Exception as error:  # a template is its author's program and may fail in any way
+            raise UserError(
+                f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
+                "it needs the blocks system and user, and may use graph, actions, objects, more, messages"
+            ) from None
+
+
+def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
+    """The objects a prompt lists: those in conflict with the ego first, then the nearest to the viewer."""
+    in_conflict = {c["with"] for c in graph["conflicts"]}
+
+    def order(node: Mapping[str, Any]) -> tuple[bool, float]:
+        return node["id"] not in in_conflict, node["forward_m"] ** 2 + node["left_m"] ** 2
+
+    return sorted(graph["nodes"], key=order)[:most]
+
+
+def names(where: Path | None = None) -> list[str]:
+    """Versions there are: those that ship and the project's, or those in one folder if it is given."""
+    files = where.glob("*/prompt.toml") if where else entries("prompts", "*/prompt.toml")
+    return sorted({file.parent.name for file in files})
+
+
+def load(version: str, where: Path | None = None) -> Prompt:
+    """A version by name.
+
+    Raises:
+        UserError: there is no such version, its files are wrong, or it was released and has changed.
+    """
+    if version not in names(where):
+        raise unknown("prompt", version, names(where))
+    base = _base(version, where)
+    texts = {name: _text(base / version / name) for name in FILES}
+    settings = _toml(texts["prompt.toml"], f"prompt {version} prompt.toml")
+    sha256 = digest(texts)
+    released = _released(base)
+    if version in released and released[version] != sha256:
+        raise UserError(
+            f"prompt {version} was released and its text has changed; restore it, or copy it to a new "
+            f"version (its digest is pinned in {printable(base / 'released.toml')})"
+        )
+    return Prompt(
+        version=version,
+        sha256=sha256,
+        released=version in released,
+        texts={"ego": texts["ego.j2"], "helper": texts["helper.j2"]},
+        **_checked(version, settings),
+    )
+
+
+def lock(version: str, where: Path | None = None) -> str:
+    """Release a version: pin its digest. Returns the digest."""
+    prompt = load(version, where)
+    base = _base(version, where)
+    pins = _released(base) | {version: prompt.sha256}
+    head = "# Digests of released prompt versions (`harness prompt lock`). A changed text is a new version.\n"
+    lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
+    write_whole(base / "released.toml", head + "".join(lines))
+    return prompt.sha256
+
+
+def _base(version: str, where: Path | None) -> Path:
+    """The folder of versions that has one."""
+    return where or find("prompts", version).parent
+
+
+def digest(texts: Mapping[str, str]) -> str:
+    """Digest of a version's files."""
+    return sha256_bytes("\0".join(f"{name}\0{texts[name]}" for name in FILES).encode())
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"prompt file {printable(file)} cannot be read: {printable(error)}") from None
+
+
+def _released(base: Path) -> dict[str, str]:
+    file = base / "released.toml"
+    return _toml(_text(file), f"prompt file {printable(file)}") if file.is_file() else {}
+
+
+def _toml(text: str, what: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{what} is no TOML: {printable(error)}") from None
+
+
+def _checked(version: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of prompt.toml, each of its kind and none unknown."""
+    kinds: dict[str, type] = {
+        "description": str, "helper_answer": str, "max_objects": int, "token_budget": list,
+        "max_answer_tokens": dict, "changed": str, "known_failures": str,
+    }  # fmt: skip
+    for key, value in settings.items():
+        if key not in kinds:
+            raise unknown(f"key in prompt {version} prompt.toml", key, kinds)
+        if type(value) is not kinds[key]:
+            raise UserError(
+                f"prompt {version} prompt.toml: {key} is {printable(value)}, wants a {kinds[key].__name__}"
+            )
+    missing = sorted(set(kinds) - set(settings))
+    if missing:
+        raise UserError(f"prompt {version} prompt.toml lacks {', '.join(missing)}")
+    if settings["helper_answer"] not in ANSWERS:
+        raise unknown(f"helper_answer in prompt {version} prompt.toml", settings["helper_answer"], ANSWERS)
+    if set(settings["max_answer_tokens"]) != set(ROLES):
+        raise UserError(f"prompt {version} prompt.toml: max_answer_tokens wants exactly ego and helper")
+    budget = settings["token_budget"]
+    for n in (settings["max_objects"], *budget, *settings["max_answer_tokens"].values()):
+        if type(n) is not int or n < 1:
+            raise UserError(
+                f"prompt {version} prompt.toml: {printable(n)} where a whole number of 1 or more belongs"
+            )
+    if len(budget) != 2 or budget[0] > budget[1]:
+        raise UserError(f"prompt {version} prompt.toml: token_budget is {budget}, wants [least, most]")
+    return {**settings, "token_budget": tuple(budget)}

@@ -1,0 +1,101 @@
+"""Gates: a difference that is not to be had, as typed after --fail-if."""
+
+import math
+import operator
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from harness.core.errors import UserError, printable, unknown
+from harness.report.compare.difference import Comparison
+from harness.report.compare.table import METRICS
+
+OPERATORS: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+}  # fmt: skip
+# A condition may have colons in its name, and a metric has none.
+_GATE = re.compile(
+    r"(?:(?P<condition>.+):)?\s*(?P<metric>\w+)(?:\.(?P<end>\w+))?\s*(?P<op>[<>]=?)\s*(?P<number>\S+)\s*"
+)
+ENDS = ("low", "high")
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A gate. It fails where the difference B - A, or an end of its interval, is so.
+
+    Attributes:
+        text: as it was typed.
+        condition: the only one it looks at; None for all.
+        metric: its name.
+        end: `low` or `high` end of the interval; `value` for the difference itself.
+        op: one of `OPERATORS`.
+        number: in the metric's own unit, shares from 0 to 1.
+    """
+
+    text: str
+    condition: str | None
+    metric: str
+    end: str
+    op: str
+    number: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a gate: the conditions in which it failed, with the value that failed it."""
+
+    gate: str
+    failed: tuple[tuple[str, float], ...]
+
+
+def gate(text: str) -> Gate:
+    """A gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
+
+    Raises:
+        UserError: it cannot be read, or names no metric that is compared.
+    """
+    found = _GATE.fullmatch(text)
+    try:
+        number = float(found["number"]) if found else math.nan
+    except ValueError:
+        number = math.nan
+    if not found or not math.isfinite(number):
+        raise UserError(
+            f"--fail-if {printable(text)!r} cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER "
+            f"with OP one of {' '.join(OPERATORS)}, such as '6g:success_rate < -0.01'"
+        )
+    if found["metric"] not in METRICS:
+        raise unknown("metric of --fail-if", found["metric"], METRICS)
+    if found["end"] not in (None, *ENDS):
+        raise unknown(f"end of {found['metric']}'s interval in --fail-if", found["end"], ENDS)
+    condition = found["condition"]
+    return Gate(
+        text, condition and condition.strip(), found["metric"], found["end"] or "value", found["op"], number
+    )
+
+
+def judge(gate: Gate, found: Comparison) -> Verdict:
+    """Hold a gate against a comparison.
+
+    Raises:
+        UserError: its condition is not compared, or the difference is not known there.
+    """
+    names = found.pair.conditions
+    if gate.condition is not None and gate.condition not in names:
+        raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, names)
+    failed = []
+    for condition in found.conditions:
+        if gate.condition in (None, condition.condition):
+            changes = [d.change for d in condition.differences if d.metric == gate.metric]
+            value = float(getattr(changes[0], gate.end)) if changes else math.nan
+            if math.isnan(value):
+                # A gate that passes because nothing is known would guard nothing.
+                raise UserError(
+                    f"--fail-if {printable(gate.text)!r}: {printable(condition.condition)} has no such "
+                    f"number in these runs; name a condition or a metric that has, or compare more episodes"
+                )
+            # Means over seeds carry rounding errors, which decide no gate.
+            if OPERATORS[gate.op](round(value, 9), gate.number):
+                failed.append((condition.condition, value))
+    return Verdict(gate.text, tuple(failed))

@@ -1,0 +1,104 @@
+"""A comparison in words and numbers, as its table, its Markdown and its page all say them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from harness.core.errors import printable
+from harness.core.paired import RESAMPLES, RESAMPLING_SEED
+from harness.report.compare.difference import AnswersTurned, Comparison, Difference, InCondition, Turned
+from harness.report.compare.gate import Verdict
+from harness.report.compare.pair import Pair, Side
+from harness.report.words import unit
+
+
+@dataclass(frozen=True)
+class Line:
+    """A difference as text: the metric with its unit, both means, B - A and its interval."""
+
+    metric: str
+    a: str
+    b: str
+    change: str
+    interval: str
+
+
+def line(d: Difference) -> Line:
+    """A difference as text; shares in percent."""
+    factor, suffix, digits = unit(d.metric)
+
+    def signed(value: float) -> str:
+        # 0.0 is added so that there is no -0.0.
+        return "–" if value != value else f"{round(value * factor, digits) + 0.0:+.{digits}f}"
+
+    e = d.change
+    return Line(
+        f"{d.metric}{' %' if suffix == ' %' else ''}", f"{d.a * factor:.{digits}f}",
+        f"{d.b * factor:.{digits}f}", signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
+    )  # fmt: skip
+
+
+def who(side: Side) -> str:
+    """Model, prompt and answer mode of a run."""
+    config = side.run.config
+    return f"{config['model']['name']} · prompt {config['prompt']['version']} · {side.run.answer}"
+
+
+def paired(pair: Pair) -> str:
+    """What is paired, and what only one of the runs has."""
+    said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
+    for name, side in (("A", pair.a), ("B", pair.b)):
+        conditions = [c for c in side.run.conditions if c not in pair.conditions]
+        episodes = len(side.episodes) - len(pair.episodes)
+        if conditions:
+            said += f"; only {name} has {', '.join(conditions)}"
+        if episodes:
+            said += f"; only {name} has {episodes} more episodes"
+    return said
+
+
+def differing(found: Comparison) -> str:
+    """What kinds of settings the runs differ in."""
+    kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in found.settings))
+    return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
+
+
+def success(c: InCondition, pair: Pair) -> str:
+    """How many successes were gained and lost, and what the test says."""
+    gained, lost = (sum(len(t.seeds) for t in turned) for turned in (c.gained, c.lost))
+    of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
+    said = f"success: {gained} gained, {lost} lost of {of}"
+    if c.test is None:
+        return said
+    if c.test.p_value is not None:
+        return f"{said}; McNemar's exact test over episodes p = {c.test.p_value:.3g}"
+    ends = " to ".join(f"{100 * (end or 0.0):+.1f}" for end in (c.test.low, c.test.high))
+    how = f"bootstrap over episodes ({RESAMPLES} resamples, seed {RESAMPLING_SEED})"
+    return f"{said}; {how} {ends} points, 95 %"
+
+
+def turned(some: Sequence[Turned], pair: Pair, most: int) -> str:
+    """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
+    said = []
+    for t in some[:most]:
+        how = t.a if t.b == "success" else t.b
+        seeds = "" if len(t.seeds) == len(pair.seeds) else f" (seeds {', '.join(map(str, t.seeds))})"
+        said.append(f"{t.episode} {how}{seeds}")
+    return ", ".join(said + more(len(some), most))
+
+
+def more(n: int, most: int) -> list[str]:
+    """`n more`, where a list is cut."""
+    return [f"{n - most} more"] if n > most else []
+
+
+def answers_turned(t: AnswersTurned, found: Comparison) -> str:
+    """How many answers of a role changed their verdict."""
+    return f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}"
+
+
+def judged(verdict: Verdict) -> str:
+    """What became of a gate."""
+    gate = printable(verdict.gate)
+    if not verdict.failed:
+        return f"passed: {gate}"
+    return f"FAILED: {gate} in " + ", ".join(f"{name} ({value:+.4g})" for name, value in verdict.failed)

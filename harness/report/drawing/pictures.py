@@ -1,0 +1,86 @@
+"""What pictures share: the look, colours that the colour-blind can tell apart, the same bytes every time."""
+
+import base64
+import io
+import warnings
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from harness.core.errors import unknown
+from harness.core.files import write_whole
+
+Format = Literal["svg", "pdf", "png"]
+FORMATS: tuple[Format, ...] = ("svg", "pdf", "png")
+
+# Okabe and Ito 2008.
+BLUE, SKY, GREEN, ORANGE, VERMILLION, PURPLE = (
+    "#0072B2",
+    "#56B4E9",
+    "#009E73",
+    "#E69F00",
+    "#D55E00",
+    "#CC79A7",
+)
+INK, GREY, PALE = "#222222", "#777777", "#DDDDDD"
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)  # of series, in their order
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.0,
+    "pdf.fonttype": 42,  # text stays text, as journals ask
+    "hatch.linewidth": 0.7,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "swarmdrive",
+    "text.color": INK,
+    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
+}
+
+styled = matplotlib.rc_context(STYLE)  # decorator: what is drawn inside has the look
+
+
+@styled
+def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -> None:
+    """Write a figure; the same figure gives the same bytes.
+
+    Args:
+        figure: what was drawn under `styled`.
+        out: file to replace, or a binary stream.
+        format: `svg` and `pdf` keep text as text; `png`.
+        dpi: pixels an inch of a PNG.
+
+    Raises:
+        UserError: unknown format.
+    """
+    if format not in FORMATS:
+        raise unknown("picture format", format, FORMATS)
+    data = io.BytesIO()
+    with warnings.catch_warnings():
+        # A name in a script that the measuring font lacks is still text in the SVG.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        # `savefig` would draw everything twice, the first time to find what sticks out, which is not asked.
+        if format == "svg":
+            nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+            FigureCanvasSVG(figure).print_svg(data, metadata=nothing)  # type: ignore[no-untyped-call]
+        elif format == "pdf":
+            nothing = dict.fromkeys(("CreationDate", "Producer", "Creator"))
+            FigureCanvasPdf(figure).print_pdf(data, metadata=nothing)  # type: ignore[no-untyped-call]
+        else:
+            figure.set_dpi(dpi)
+            FigureCanvasAgg(figure).print_png(data, metadata={"Software": None})  # type: ignore[no-untyped-call]
+    if isinstance(out, Path):
+        write_whole(out, data.getvalue())
+    else:
+        out.write(data.getvalue())
+
+
+def uri(svg: bytes) -> str:
+    """A picture as what an `img` of a page that stands alone takes."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()

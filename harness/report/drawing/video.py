@@ -1,0 +1,98 @@
+"""A driven episode from above, as a moving picture.
+
+Thinking is shown slowly: a still a frame of 20 ms while a decision is open, else ten a second, all for the
+same time. So messages can be seen to travel.
+"""
+
+import io
+from collections.abc import Callable, Iterable, Iterator
+from importlib.util import find_spec
+from itertools import chain, repeat
+from pathlib import Path
+
+from PIL import Image
+
+from harness.core.errors import UserError, printable
+from harness.core.files import replacing, write_whole
+from harness.evaluate.replay import Played, stills
+from harness.report.drawing.pictures import styled
+from harness.report.drawing.still import Canvas, Pixels
+from harness.world.perception.graph import scene_graph
+from harness.world.state import WorldState
+
+STILL_MS, LAST_MS = 100, 2500
+COLOURS = 64  # of a GIF
+
+
+def formats() -> list[str]:
+    """Ends of the files that can be written here, the best one last."""
+    return [".gif", ".mp4"] if find_spec("imageio_ffmpeg") else [".gif"]
+
+
+@styled
+def write_video(played: Played, out: Path, progress: Callable[[int], None]) -> None:
+    """Draw an episode into a `.gif` or an `.mp4`; `progress` is called for each still.
+
+    Raises:
+        UserError: the file's name ends otherwise, or an .mp4 cannot be written here.
+    """
+    check(out)
+    (_mp4 if out.suffix == ".mp4" else _gif)(_pictures(played, progress), out)
+
+
+def check(out: Path) -> None:
+    """Raise UserError if no video can be written to this file."""
+    shown = f"--out {printable(out)}"
+    if out.suffix not in (".gif", ".mp4"):
+        raise UserError(f"{shown}: end it in .gif or .mp4")
+    if out.suffix not in formats():
+        raise UserError(
+            f"{shown}: .mp4 needs imageio-ffmpeg; pip install 'swarmdrive-harness[video]', or end it in .gif"
+        )
+    if out.is_dir():
+        raise UserError(f"{shown} is a folder; name a file in it")
+
+
+def _gif(pictures: Iterable[Pixels], out: Path) -> None:
+    first, *others = (
+        Image.fromarray(p).quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        for p in pictures
+    )
+    durations = [STILL_MS] * len(others) + [LAST_MS]
+    data = io.BytesIO()
+    first.save(data, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
+    write_whole(out, data.getvalue())
+
+
+def _mp4(pictures: Iterator[Pixels], out: Path) -> None:
+    from imageio_ffmpeg import write_frames
+
+    first = next(pictures)
+    with replacing(out) as part:
+        file = write_frames(
+            str(part.resolve()), first.shape[1::-1], fps=1000 / STILL_MS, codec="libx264", quality=None,
+            macro_block_size=2, ffmpeg_log_level="error",
+            output_params=["-crf", "20", "-movflags", "+faststart", "-f", "mp4"],
+        )  # fmt: skip
+        file.send(None)
+        last = first
+        for last in chain([first], pictures):
+            file.send(last)
+        for picture in repeat(last, LAST_MS // STILL_MS - 1):
+            file.send(picture)
+        file.close()
+
+
+def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixels]:
+    canvas: Canvas | None = None
+    moment: WorldState | None = None
+    seen: dict[str, list[str]] = {}
+    for still in stills(played, progress):
+        canvas = canvas or Canvas(played, still.state.buildings)
+        if still.seen != moment:
+            moment = still.seen
+            seen = {
+                v.id: [node["id"] for node in scene_graph(moment, v.id)["nodes"]]
+                for v in (moment.ego, *moment.helpers)
+            }
+        yield canvas.picture(still, seen)

@@ -1,0 +1,195 @@
+"""The pages of `harness view`: what each address answers, and what it may not.
+
+Nobody who sends a request can name a file. A run is looked up in the listing of the folder, a picture among
+the files of its study; both are compared as text, so `..`, absolute and encoded paths name nothing. What is
+then opened must lie in the folder itself (`folder.py`). What a run says it was made of, its
+prompt and its dataset, is read as by `harness report`: shown only if it has the digest that the run noted.
+
+Other sites get nothing: names other than this machine's are refused, which ends DNS rebinding, and no page
+may be framed, embedded or posted to. The list runs no script. Pages of runs were written by whoever made the
+run, so they are kept apart from it and from each other: `sandbox` gives them an origin of their own, from
+which they can read nothing here, and they may load nothing. Their inline scripts may run as far as their own
+policy lets them, and save files if they are clicked. Browsers show no page that is both in a sandbox and
+`same-origin` with its opener, so these are not.
+"""
+
+import asyncio
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from threading import Thread
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from harness.core.errors import UserError, printable
+from harness.report.view import pages
+from harness.report.view.folder import PICTURES, own_file, pictures, whole
+from harness.runs.listing import Listed, runs
+
+HOSTS = ("127.0.0.1", "localhost")
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'self'; img-src 'self' data:; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+OF_RUNS = {  # in the place of those above, for what a run's folder holds
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
+    "sandbox allow-scripts allow-downloads",
+    "Cross-Origin-Opener-Policy": "unsafe-none",
+}
+
+
+def app(folder: Path) -> ASGIApp:
+    """The application for one folder of runs."""
+    view = View(folder)
+    routes = {
+        "/": view.index, "/style.css": view.style, "/run": view.run, "/picture": view.picture,
+        "/compare": view.compare, "/report": view.report,
+    }  # fmt: skip
+    return _Guarded(
+        Starlette(
+            routes=[Route(path, page, methods=["GET"]) for path, page in routes.items()],
+            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False)],
+            exception_handlers={UserError: view.wrong, HTTPException: view.wrong, Exception: view.bug},
+        )
+    )
+
+
+class _Guarded:
+    """Gives every answer, errors included, `HEADERS` where it has none of its own."""
+
+    def __init__(self, within: ASGIApp) -> None:
+        self.within = within
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.within(scope, receive, sent)
+
+
+class View:
+    """One folder of runs. What reads files runs in threads; pages that take seconds are made one by one."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._drawing = asyncio.Lock()  # Matplotlib draws for one at a time
+
+    def index(self, request: Request) -> Response:
+        """The list of runs, filtered by `q` and sorted by `sort`."""
+        query = request.query_params
+        return HTMLResponse(pages.listed(self.folder, query.get("q", ""), query.get("sort", "")))
+
+    def style(self, request: Request) -> Response:
+        """The style of the list; reports have their own within."""
+        return Response(pages.style(), media_type="text/css")
+
+    async def run(self, request: Request) -> Response:
+        """The page of one run or study."""
+        [one] = await run_in_threadpool(self._found, [request.query_params.get("path", "")])
+        if one.state != "finished":
+            raise UserError(
+                f"{printable(one.name)} is {one.state} ({printable(one.why)}); it has no page yet"
+            )
+        if one.kind not in pages.RUNS:
+            return await run_in_threadpool(self._study, one)
+        written, made = (own_file(self.folder, one.name, name) for name in ("report.html", "run.json"))
+        if written and made and written.stat().st_mtime >= made.stat().st_mtime:
+            return FileResponse(written, headers=OF_RUNS)
+        return await self._drawn(partial(pages.report, self._whole([one])))
+
+    def picture(self, request: Request) -> Response:
+        """A picture of a study."""
+        [one] = self._found([request.query_params.get("path", "")])
+        name = request.query_params.get("name", "")
+        file = own_file(self.folder, one.name, name) if name in pictures(self.folder, one.name) else None
+        if file is None:
+            raise HTTPException(404, f"{printable(one.name)} has no picture {printable(name)}; see its page")
+        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",
+                  "Cross-Origin-Opener-Policy": "unsafe-none"}  # fmt: skip
+        return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
+
+    async def compare(self, request: Request) -> Response:
+        """Two runs held against each other; the one that was begun first is A."""
+        picked = await run_in_threadpool(self._picked, request)
+        if len(picked) != 2:
+            raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
+        return await self._drawn(partial(pages.compared, *self._whole(sorted(picked, key=lambda o: o.date))))
+
+    async def report(self, request: Request) -> Response:
+        """The report of all runs that are picked."""
+        picked = await run_in_threadpool(self._picked, request)
+        if not picked:
+            raise UserError("no run is picked; pick one or more for a report")
+        return await self._drawn(partial(pages.report, self._whole(picked)))
+
+    def wrong(self, request: Request, error: Exception) -> Response:
+        """A page of one line about a request that cannot be answered."""
+        status, said = (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
+        headers = error.headers if isinstance(error, HTTPException) else None
+        return HTMLResponse(pages.wrong(str(said)), status, headers)
+
+    def bug(self, request: Request, error: Exception) -> Response:
+        """The same for a bug, of which the terminal has the traceback."""
+        traceback.print_exception(error)
+        return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
+
+    def _found(self, names: Sequence[str]) -> Sequence[Listed]:
+        by_name = {one.name: one for one in runs(self.folder)}
+        for name in names:
+            if name not in by_name:
+                raise HTTPException(
+                    404, f"no run {printable(name)!r} in {printable(self.folder)}; see the list"
+                )
+        return [by_name[name] for name in names]
+
+    def _picked(self, request: Request) -> Sequence[Listed]:
+        found = self._found(list(dict.fromkeys(request.query_params.getlist("path"))))
+        for one in found:
+            if one.state != "finished" or one.kind not in pages.RUNS:
+                raise UserError(f"{printable(one.name)} is no finished run of a model; pick others")
+        return found
+
+    def _whole(self, picked: Sequence[Listed]) -> Sequence[Path]:
+        return [whole(self.folder, one.name) for one in picked]
+
+    def _study(self, one: Listed) -> Response:
+        page = own_file(self.folder, one.name, "index.html")
+        if page:
+            return FileResponse(page, headers=OF_RUNS)
+        return HTMLResponse(pages.study(one, pictures(self.folder, one.name)))
+
+    async def _drawn(self, page: Callable[[], str]) -> Response:
+        made: Future[str] = Future()
+        made.set_running_or_notify_cancel()
+
+        def make() -> None:
+            try:
+                made.set_result(page())
+            except BaseException as error:
+                made.set_exception(error)
+
+        async with self._drawing:
+            # No pool: Ctrl-C would wait for the threads of one.
+            Thread(target=make, daemon=True).start()
+            return HTMLResponse(await asyncio.wrap_future(made), headers=OF_RUNS)

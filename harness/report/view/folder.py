@@ -1,0 +1,45 @@
+"""What may be read: regular files that lie in the folder, links followed, and in no hidden folder of it."""
+
+import os
+import stat
+from pathlib import Path
+
+from harness.core.errors import UserError, printable
+
+PICTURES = {".svg": "image/svg+xml", ".png": "image/png"}
+READ = ("run.json", "summary.csv", "rows.jsonl", "episodes.csv")  # what a page of a run is made from
+
+
+def own_file(root: Path, run: str, name: str) -> Path | None:
+    """A file of a listed run's folder by its real path; None if it has none, or that may not be read."""
+    base = os.path.realpath(root)
+    file = Path(os.path.realpath(os.path.join(base, run, name)))
+    if not file.is_relative_to(base) or any(part.startswith(".") for part in file.relative_to(base).parts):
+        return None
+    try:
+        return file if stat.S_ISREG(file.stat().st_mode) else None
+    except OSError:
+        return None
+
+
+def whole(root: Path, run: str) -> Path:
+    """The folder of a listed run, every file of which may be read.
+
+    Raises:
+        UserError: one is missing, no file or a link that leads out.
+    """
+    for name in READ:
+        if own_file(root, run, name) is None:
+            raise UserError(f"{printable(run)} has no {name} of its own; make the run again")
+    return root / run
+
+
+def pictures(root: Path, run: str) -> list[str]:
+    """Names of a listed study's pictures; of one in several formats the one that scales."""
+    names = sorted(os.listdir(root / run))
+    scaled = {Path(name).stem for name in names if name.endswith(".svg")}
+    return [
+        name for name in names
+        if Path(name).suffix in PICTURES and (name.endswith(".svg") or Path(name).stem not in scaled)
+        and name.isprintable() and own_file(root, run, name)
+    ]  # fmt: skip

@@ -1,0 +1,94 @@
+"""The pages as text. Whatever a run says of itself is hostile: the report's templates escape it all."""
+
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from harness.report.compare import page as comparison
+from harness.report.compare.difference import compare
+from harness.report.compare.pair import pair
+from harness.report.page import environment, render
+from harness.report.runs import gather
+from harness.runs.listing import Listed, runs
+
+RUNS = ("eval", "drive")
+TEMPLATES = Path(__file__).parent / "templates"
+LISTED_OF_EACH = 10  # episodes and requests, in a comparison
+NEWEST = "-date"
+COLUMNS: dict[str, Callable[[Listed], Any]] = {
+    "name": lambda one: one.name,
+    "kind": lambda one: one.kind,
+    "model": lambda one: one.model,
+    "prompt": lambda one: one.prompt,
+    "success": lambda one: one.success,
+    "date": lambda one: one.date,
+}
+
+
+def report(folders: Sequence[Path]) -> str:
+    """The report of one run or several."""
+    return render(gather(folders))
+
+
+def compared(a: Path, b: Path) -> str:
+    """Run B held against run A."""
+    return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH)
+
+
+def listed(folder: Path, words: str, order: str) -> str:
+    """The runs that have all of these words somewhere, sorted by a column; `-` before it turns it around."""
+    every = runs(folder)
+    order = order if order.removeprefix("-") in COLUMNS else NEWEST
+    shown = sort([one for one in every if _has(one, words)], order)
+    links = {
+        column: urlencode({"sort": _next(column, order), **({"q": words} if words else {})})
+        for column in COLUMNS
+    }
+    return _page(
+        "list.html.j2", folder=str(folder), every=len(every), runs=shown, words=words, order=order,
+        links=links, kinds=RUNS,
+    )  # fmt: skip
+
+
+def sort(found: Sequence[Listed], order: str) -> list[Listed]:
+    """Sorted by a column, those that have nothing there last."""
+    of = COLUMNS[order.removeprefix("-")]
+    known = [one for one in found if of(one) is not None]
+    return [
+        *sorted(known, key=of, reverse=order.startswith("-")),
+        *(one for one in found if of(one) is None),
+    ]
+
+
+def study(one: Listed, pictures: Sequence[str]) -> str:
+    """The pictures of a study that has no page of its own."""
+    return _page("study.html.j2", one=one, pictures=pictures)
+
+
+def wrong(said: str) -> str:
+    """One line about a request that cannot be answered."""
+    return _page("wrong.html.j2", said=said)
+
+
+def style() -> str:
+    """The report's style, and the list's own."""
+    report_style = files("harness.report") / "templates" / "style.css"
+    return report_style.read_text(encoding="utf-8") + (TEMPLATES / "list.css").read_text(encoding="utf-8")
+
+
+def _page(template: str, **values: Any) -> str:
+    return environment(TEMPLATES).get_template(template).render(**values)
+
+
+def _has(one: Listed, words: str) -> bool:
+    said = (one.name, one.kind, one.state, one.model, one.prompt, one.answer, one.condition, *one.tags)
+    text = " ".join(part for part in said if part is not None).casefold()
+    return all(word in text for word in words.casefold().split())
+
+
+def _next(column: str, order: str) -> str:
+    """What a click on a column's head asks for: numbers and dates begin with the greatest."""
+    first = f"-{column}" if column in ("success", "date") else column
+    return (column if first.startswith("-") else f"-{column}") if order == first else first

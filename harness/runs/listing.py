@@ -1,0 +1,174 @@
+"""The runs and studies in a folder, from their manifests and summaries alone."""
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from harness.core.errors import UserError, printable
+from harness.evaluate.evaluate import CONFIG, WORK
+from harness.evaluate.live_spec import FORMAT as DRIVE
+from harness.evaluate.spec import FORMAT as EVAL
+
+DEPTH = 2  # a sweep lies in its run's folder, and a driven study's run in the study's
+KINDS = {EVAL: "eval", DRIVE: "drive"}
+STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
+_BROKEN = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+    csv.Error,
+)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One run or study.
+
+    Attributes:
+        name: its folder, from the folder that is listed.
+        kind: `eval`, `drive`, `sweep` or `study`; `run` where a broken one does not say.
+        state: `finished`, `unfinished` or `broken`.
+        date: when it was begun; of a study and a broken run, when it was last written.
+        why: of an unfinished one, the option that goes on with it; of a broken one, the file at fault.
+        model: name of its card; of a sweep, its sources.
+        prompt: version.
+        answer: answer mode.
+        tags: words that it was given to be found by.
+        condition: the one of the highest success rate; the first of several.
+        success: that rate, 0 to 1, over episodes.
+        low: lower end of its 95 % interval; None where the data cannot bound it.
+        high: upper end.
+    """
+
+    name: str
+    kind: str
+    state: Literal["finished", "unfinished", "broken"]
+    date: datetime
+    why: str | None = None
+    model: str | None = None
+    prompt: str | None = None
+    answer: str | None = None
+    tags: tuple[str, ...] = ()
+    condition: str | None = None
+    success: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+def runs(folder: Path) -> list[Listed]:
+    """What lies in a folder, newest first. Nothing outside it is read: a link that leads out is passed over.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    if not os.path.isdir(folder):
+        raise UserError(
+            f"{printable(folder)} is no folder; give one that holds runs, or make a run with `harness eval`"
+        )
+    root = os.path.realpath(folder)
+    return sorted(_below(root, root, 0), key=lambda one: (-one.date.timestamp(), one.name))
+
+
+def _below(path: str, root: str, depth: int) -> Iterator[Listed]:
+    found = _one(path, root)
+    if found:
+        yield replace(found, name=os.path.relpath(path, root))
+    if depth < DEPTH:
+        for name in sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else ():
+            inner = os.path.join(path, name)
+            if not name.startswith(".") and os.path.isdir(inner) and _within(inner, root):
+                yield from _below(inner, root, depth + 1)
+
+
+def _within(path: str, root: str) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(root)
+
+
+def _one(path: str, root: str) -> Listed | None:
+    """What a folder is; None if it is neither a run nor a study."""
+
+    def has(*names: str) -> bool:
+        file = os.path.join(path, *names)
+        return os.path.isfile(file) and _within(file, root)
+
+    written = datetime.fromtimestamp(os.stat(path).st_mtime, UTC)
+    if has("run.json"):
+        return _finished(path, has("summary.csv"), written)
+    if has(WORK, CONFIG):
+        try:
+            begun = _json(path, WORK, CONFIG)
+            made = Listed("", _kind(begun["settings"]), "unfinished", _date(begun["created"]), "--resume")
+            return _described(made, {**begun["settings"], "tags": begun.get("tags", ())})
+        except _BROKEN:
+            return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
+    for name, kind in STUDIES.items():
+        if has(name):
+            written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
+            try:
+                sources = _json(path, name)["sources"] if kind == "sweep" else ()
+                model = ", ".join(str(source["name"]) for source in sources if "name" in source)
+                return Listed("", kind, "finished", written, model=model or None)
+            except _BROKEN:
+                return Listed("", kind, "broken", written, name)
+    if has("rows.jsonl") or has("summary.csv"):  # the manifest is written last
+        return Listed("", "run", "broken", written, "run.json")
+    return None
+
+
+def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
+    made = Listed("", "run", "broken", written, "run.json")
+    try:
+        config = _json(path, "run.json")
+        made = replace(made, kind=KINDS[config["format"]], date=_date(config["created"]))
+        made = replace(_described(made, config), why="summary.csv")
+        if not has_summary:
+            return made
+        with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
+            # A summary may have a thousand rows, and a folder a thousand summaries.
+            head, *told = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
+        which = ("success_rate", "episodes")
+        rows = [row for row in csv.DictReader([head, *told]) if (row["metric"], row["interval"]) == which]
+        best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
+        value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
+        return replace(
+            made, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
+        )
+    except _BROKEN:
+        return made
+
+
+def _kind(settings: dict[str, Any]) -> str:
+    return "drive" if "scenario" in settings else "eval"
+
+
+def _described(made: Listed, config: dict[str, Any]) -> Listed:
+    return replace(
+        made,
+        model=str(config["model"]["name"]),
+        prompt=str(config["prompt"]["version"]),
+        answer=str(config.get("answer", "json")),  # runs of older versions name none, and had one
+        tags=tuple(map(str, config.get("tags", ()))),
+    )
+
+
+def _json(*parts: str) -> Any:
+    return json.loads(Path(*parts).read_text(encoding="utf-8"))
+
+
+def _date(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)
+
+
+def _number(text: str) -> float | None:
+    value = float(text or "nan")
+    return value if math.isfinite(value) else None

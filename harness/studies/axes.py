@@ -1,0 +1,96 @@
+"""What can be swept: one setting of the operating point, or the number of vehicles."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from harness.coordination.consensus import NAMES, RULES
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError, printable, unknown
+
+MOST_POINTS = 1000
+
+Value = float | str
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that varies.
+
+    Attributes:
+        name: what `--over` calls it.
+        label: what an axis of a figure says, with its unit.
+        field: the operating point's setting; None for the number of vehicles.
+        scale: what a value is multiplied by to be that setting.
+        usual: the grid if none is given.
+    """
+
+    name: str
+    label: str
+    field: str | None
+    scale: float
+    usual: str
+
+    def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
+        """The operating point with this setting. Raises UserError where it is not allowed."""
+        if self.field is None:
+            return point
+        setting = value if isinstance(value, str) else value * self.scale
+        # A given loss stands in place of one that follows the number of vehicles.
+        freed = replace(point, density_coupled=False) if self.field == "loss" else point
+        return replace(freed, **{self.field: setting})  # type: ignore[arg-type]
+
+
+AXES = {
+    axis.name: axis
+    for axis in (
+        Axis("tau", "entropy threshold τ, nats", "tau_nats", 1.0, "0.3:1.05:0.05"),
+        Axis("loss", "loss of one crossing, %", "loss", 0.01, "0:50:5"),
+        Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
+        Axis("latency", "nominal latency of the channel, ms", "latency_s", 1e-3, "0,5,10,25,50,100"),
+        Axis("window", "decision window, ms", "window_s", 1e-3, "150:400:25"),
+        Axis("consensus", "consensus", "consensus", 1.0, ",".join(RULES)),
+    )
+}
+
+
+def axis_of(name: str) -> Axis:
+    """An axis by name. Raises UserError if there is none."""
+    if name not in AXES:
+        raise unknown("--over", name, AXES)
+    return AXES[name]
+
+
+def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
+    """Values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
+
+    Raises:
+        UserError: it is none, or too long.
+    """
+    parts = [part.strip() for part in (text or axis.usual).split(",")]
+    if axis.name == "consensus":
+        for part in parts:
+            if part not in NAMES:
+                raise unknown("--grid", part, NAMES)
+        return tuple(dict.fromkeys(parts))
+    found = [value for part in parts for value in _values(axis, part)]
+    if len(found) > MOST_POINTS:
+        raise UserError(f"--grid {printable(text)}: {len(found)} points; give {MOST_POINTS} or fewer")
+    if axis.field is None and any(value != int(value) or value < 1 for value in found):
+        raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
+    return tuple(dict.fromkeys(found))
+
+
+def _values(axis: Axis, part: str) -> Sequence[float]:
+    try:
+        numbers = [float(x) for x in part.split(":")]
+        low, high, step = [*numbers, 1.0][:3] if len(numbers) > 1 else (*numbers, *numbers, 1.0)
+        steps = (high - low) / step
+        if len(numbers) > 3 or not 0 <= steps <= MOST_POINTS or not np.isfinite(numbers).all() or step <= 0:
+            raise ValueError
+    except (ValueError, ZeroDivisionError):
+        raise UserError(
+            f"--grid {printable(part)}: give numbers such as {axis.usual}, a list or from:to:step"
+        ) from None
+    return [round(low + i * step, 10) for i in range(int(steps + 1e-9) + 1)]

@@ -1,0 +1,140 @@
+"""Frozen against closed: how far the success that frozen scenes tell is that of driving.
+
+Runs on frozen scenes and live runs of the same model, prompt and answer mode are held against each other
+episode by episode: the same layout, condition and seed of the channel's luck.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.core.statistics import episode_interval
+from harness.evaluate.live_spec import FORMAT as DRIVEN
+from harness.evaluate.spec import FORMAT as FROZEN
+from harness.evaluate.success import table
+from harness.runs.folder import dataset_of, read
+from harness.runs.summary import over_episodes
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WHO = ("model", "prompt", "answer")
+KEY = (*WHO, "condition", "seed", "layout_seed")
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """What the comparison says.
+
+    Attributes:
+        table: a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
+            minus closed, paired by episode) and `agreement` (share of episodes and seeds with the same
+            result), each with `_low` and `_high`, and `n` episodes; shares from 0 to 1.
+        episodes: a row an episode, condition and seed, with the result and the failure of both.
+        rank: Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make
+            no difference to a model count once. NaN for fewer than 3 rows, or where all are alike.
+        ranked: how many rows that is over.
+    """
+
+    table: "pd.DataFrame"
+    episodes: "pd.DataFrame"
+    rank: float
+    ranked: int
+
+
+def fidelity(runs: Sequence[Path]) -> Fidelity:
+    """Hold runs on frozen scenes against live runs.
+
+    Raises:
+        UserError: a folder is no run, or no frozen run has anything in common with a live one.
+    """
+    import pandas as pd
+
+    told: dict[str, list[pd.DataFrame]] = {FROZEN: [], DRIVEN: []}
+    for run in runs:
+        kind, episodes = _episodes(run)
+        told[kind].append(episodes)
+    for kind, name in ((FROZEN, "frozen scenes (harness eval)"), (DRIVEN, "live episodes (harness drive)")):
+        if not told[kind]:
+            raise UserError(f"no run on {name} among {len(runs)} folders; give at least one of each kind")
+    frozen, closed = (pd.concat(told[kind], ignore_index=True) for kind in (FROZEN, DRIVEN))
+    for each in (frozen, closed):
+        if each.duplicated(list(KEY)).any():
+            raise UserError("two of the runs have the same episodes; give one run of each model and prompt")
+    both = frozen.merge(closed, on=list(KEY), suffixes=("_frozen", "_closed"))
+    if both.empty:
+        raise UserError(
+            "the runs have no episode in common; give runs of the same model, prompt and answer mode, with "
+            "the same conditions, seeds and layouts (harness drive --first-seed)"
+        )
+    rows = pd.DataFrame(_rows(both))
+    return Fidelity(rows, both, *_rank(rows))
+
+
+def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
+    from scipy.stats import spearmanr
+
+    distinct = rows.drop_duplicates([*WHO, "frozen", "closed"])
+    if len(distinct) < 3 or distinct.frozen.nunique() == 1 or distinct.closed.nunique() == 1:
+        return np.nan, len(distinct)
+    return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
+
+
+def _episodes(run: Path) -> "tuple[str, pd.DataFrame]":
+    """The kind of a run, and the result of each of its episodes."""
+    import pandas as pd
+
+    try:
+        config: dict[str, Any] = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        kind = config["format"]
+        text = dict.fromkeys((*WHO, "condition", "failure"), str)
+        episodes = pd.read_csv(run / "episodes.csv", dtype=text, keep_default_na=False)
+        if kind == FROZEN:
+            laid = table(dataset_of(read(run)))
+            seeds = dict(zip(laid.episodes.tolist(), laid.seeds.tolist(), strict=True))
+            episodes["layout_seed"] = episodes["episode"].map(seeds)
+        elif kind != DRIVEN:
+            raise ValueError(f"format {kind}")
+        return kind, episodes[[*KEY, "success", "failure"]].astype({"success": bool})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{printable(run)} is no finished run ({printable(error)}); give folders made by harness eval "
+            "and harness drive"
+        ) from None
+
+
+def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
+    for place, group in both.groupby([*WHO, "condition"], sort=False):
+        wide = group.pivot(index="seed", columns="layout_seed", values=["success_frozen", "success_closed"])
+        frozen, closed = (wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed"))
+        told = {
+            "frozen": over_episodes("success_rate", frozen),
+            "closed": over_episodes("success_rate", closed),
+            "difference": episode_interval((frozen - closed).mean(axis=0)),
+            "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
+        }
+        yield {
+            **dict(zip((*WHO, "condition"), place, strict=True)),
+            **{
+                f"{name}{end}": value for name, e in told.items()
+                for end, value in (("", e.value), ("_low", e.low), ("_high", e.high))
+            },
+            "n": group.layout_seed.nunique(),
+        }  # fmt: skip
+
+
+def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
+    """How episodes ended that did so otherwise: a row a model, condition and two endings, with a count."""
+    ends = both.assign(
+        frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
+        closed_end=both.failure_closed.where(~both.success_closed, "success"),
+    )
+    other = ends[ends.success_frozen != ends.success_closed]
+    places = [*WHO, "condition", "frozen_end", "closed_end"]
+    counts = other.groupby(places, sort=False).size().rename("count").reset_index()
+    return counts.sort_values("count", ascending=False, kind="stable")

@@ -1,0 +1,101 @@
+"""Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
+
+import csv
+from collections.abc import Mapping
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from harness.studies.calibrated import FITTED_ON
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# metric of the paper's numbers: our metric, what ours is multiplied by, and how far it may be off
+METRICS = {
+    "success": ("success_rate", 100.0, 1.0),
+    "trigger_rate": ("trigger_rate", 100.0, 3.0),
+    "effective_loss": ("effective_loss", 100.0, 0.3),
+    "latency": ("latency_proxy_ms", 1.0, 0.01),  # of the paper's value
+    "messages_per_episode": ("messages_per_episode", 1.0, 0.5),
+}
+CONDITIONS = {"single_local": "single-local", "swarm_v2x": "v2x", "swarm_6g": "6g"}
+BELOW, FROM = "below_", "from_"
+
+ASSUMED = {
+    "core": "5 seeds x 1 500 episodes; the paper may mean 1 500 in all",
+    "size": "N counts the ego; N = 5 to 7 are not in the paper; loss follows 0.6 + 3 (N - 2) %",
+    "loss": "one crossing's; request and reply both cross",
+    "tau": "entropies in nats over three actions; grid 0.3 to 1.05 in steps of 0.05, the paper states none",
+    "A4": "the paper's window is 200 ms and its mean 218.9 ms: counted to the end of the exchange",
+    "A6": "no roadside edge: the paper calls it optional",
+}
+
+
+def paper_numbers() -> list[dict[str, str]]:
+    """The rows of `paper_numbers.csv`, taken from the paper's text and figures."""
+    text = (files("harness.studies") / "paper_numbers.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
+
+
+def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
+    """A row for each number of the paper.
+
+    Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`,
+    `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's range), `allowed`, `verdict`,
+    `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points,
+    ours is one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it is
+    not but the interval reaches what is, `misses` where it does not, or `cited`.
+    """
+    import pandas as pd
+
+    fitted = {row for rows in FITTED_ON.values() for row in rows}
+    found: list[dict[str, Any]] = []
+    for row in paper_numbers():
+        low = float(row["paper_value"] or row["paper_low"])
+        high = float(row["paper_value"] or row["paper_high"])
+        named = ("id", "panel", "condition", "variable", "value", "metric", "unit")
+        place: dict[str, Any] = {k: row[k] for k in named}
+        place |= {"paper_low": low, "paper_high": high}
+        assumed = ASSUMED.get(row["id"], ASSUMED.get(row["panel"], ""))
+        if row["condition"] not in CONDITIONS:
+            found.append({**place, "verdict": "cited", "kind": "cited", "assumed": row["note"]})
+            continue
+        metric, scale, allowed = METRICS[row["metric"]]
+        allowed *= low if row["metric"] == "latency" else 1.0
+        for ours in _ours(summary, row, metric):
+            mean, ci_low, ci_high = (float(ours[k]) * scale for k in ("mean", "ci_low", "ci_high"))
+            difference = mean - min(max(mean, low), high)
+            found.append({
+                **place, "value": "" if ours["value"] is None else ours["value"],
+                "ours": mean, "ci_low": ci_low, "ci_high": ci_high, "difference": difference,
+                "allowed": allowed,
+                "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
+                "kind": "fitted" if row["id"] in fitted else "predicted", "assumed": assumed,
+            })  # fmt: skip
+    return pd.DataFrame(found)
+
+
+def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
+    """Of a mean with its interval, where `least` to `most` is allowed."""
+    if least <= mean <= most:
+        return "within"
+    return "unclear" if ci_low <= most and ci_high >= least else "misses"
+
+
+def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
+    """Our rows for one of the paper's: one, or those of the grid points that it speaks of."""
+    s = summary[
+        (summary.panel == row["panel"])
+        & (summary.condition == CONDITIONS[row["condition"]])
+        & (summary.metric == metric)
+        & (summary.interval == "seed means")
+    ]
+    value = row["value"]
+    if value.startswith(BELOW):
+        s = s[s.value.astype(float) < float(value.removeprefix(BELOW)) - 1e-9]
+    elif value.startswith(FROM):
+        s = s[s.value.astype(float) >= float(value.removeprefix(FROM)) - 1e-9]
+    elif value:
+        at = float(value) * (100 if row["variable"] == "loss" else 1)
+        s = s[abs(s.value.astype(float) - at) < 1e-9]
+    return [{str(k): v for k, v in one.items()} for one in s.to_dict("records")]

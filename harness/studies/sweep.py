@@ -1,0 +1,112 @@
+"""`harness sweep`: stored answers at every point of a grid."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.evaluate.spec import versions
+from harness.studies import figures
+from harness.studies.axes import AXES, Axis, Value, grid
+from harness.studies.episode_tables import joined, write_table
+from harness.studies.play import Source, play
+from harness.studies.setting import CORE, Setting, described
+from harness.studies.stored import Stored
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT = "swarmdrive-sweep/1"
+
+
+def settings(
+    sources: Sequence[Stored], axis: Axis, values: Sequence[Value], conditions: Sequence[str]
+) -> tuple[Setting, ...]:
+    """The grid points of one axis, for each condition.
+
+    Raises:
+        UserError: no such condition, one without a channel, or more vehicles than there are.
+    """
+    vehicles = min(source.vehicles for source in sources)
+    if axis.field is None and max(map(float, values)) > vehicles:
+        raise UserError(
+            f"--grid: {max(map(float, values)):g} vehicles; the run's scenes have {vehicles} at most"
+        )
+    return tuple(
+        Setting(name, axis.at(point, v), vehicles if axis.field else int(v), axis.name, v)
+        for name, point in ((name, point_of(sources, name)) for name in conditions)
+        for v in values
+    )
+
+
+def point_of(sources: Sequence[Stored], name: str) -> OperatingPoint:
+    """The runs' operating point of that name, or one of the paper's, or a change of one of those."""
+    theirs = {source.points[name] for source in sources if name in source.points}
+    if len(theirs) > 1:
+        raise UserError(f"--condition {printable(name)} is not the same in all runs; sweep them one by one")
+    point = theirs.pop() if theirs else named_point(name)
+    if point.profile is None:
+        raise UserError(f"--condition {printable(name)} has no channel; nothing of it can be varied")
+    return point
+
+
+def usual(sources: Sequence[Stored], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
+    """The paper's panels for runs: their own conditions, swarm size under density-coupled loss, loss, tau."""
+    vehicles = min(source.vehicles for source in sources)
+    own = {name: point for source in sources for name, point in source.points.items()}
+    sizes = settings(sources, AXES["size"], grid(AXES["size"], f"1:{vehicles}"), conditions)
+    return {
+        "core": tuple(Setting(name, point, vehicles) for name, point in own.items()),
+        "size": tuple(replace(s, point=replace(s.point, density_coupled=True, loss=None)) for s in sizes),
+        **{name: settings(sources, AXES[name], grid(AXES[name]), conditions) for name in ("loss", "tau")},
+    }
+
+
+def run_sweep(
+    sources: Sequence[Source], panels: Mapping[str, Sequence[Setting]], seeds: Sequence[int], out: Path,
+    progress: Callable[[int], None],
+) -> "pd.DataFrame":  # fmt: skip
+    """Play every source at every grid point; points and sources are paired by common random numbers.
+
+    Writes `conditions` and `episodes` as CSV and JSON Lines, `sweep.json`, and the panels as SVG, PDF and
+    PNG: `sweep` along the axes, and a source's operating points, where they are among the panels.
+
+    Returns:
+        The summary: a row a source, grid point and metric.
+    """
+    import pandas as pd
+
+    played = {
+        name: [
+            play(source, name, able, seeds, progress)
+            for source in sources
+            # Who has no model cannot ask it again.
+            if (able := [s for s in points if isinstance(source, Stored) or not s.point.asks_again])
+        ]
+        for name, points in panels.items()
+    }
+    along = [
+        pd.concat([p.summary for p in made], ignore_index=True)
+        for name, made in played.items() if name != CORE
+    ]  # fmt: skip
+    summary = pd.concat([p.summary for made in played.values() for p in made], ignore_index=True)
+    episodes = joined([p.episodes for made in played.values() for p in made])
+    out.mkdir(parents=True, exist_ok=True)
+    figures.save_all(figures.along(along), out / "sweep")
+    for n, p in enumerate(played.get(CORE, ()), 1):
+        figures.save_all(figures.composite_a(p.summary), out / f"operating-points-{n}")
+    write_table(summary, out / "conditions")
+    write_table(episodes, out / "episodes")
+    manifest = {
+        "format": FORMAT,
+        "sources": [source.manifest() for source in sources],
+        "seeds": list(seeds),
+        "panels": described(panels),
+        "versions": versions(),
+    }
+    write_whole(out / "sweep.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    return summary

@@ -1,0 +1,66 @@
+"""What a distilled model learns to write: a given distribution, in the form that its prompt asks for."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.files import canonical_json
+from harness.core.rounding import rounded
+from harness.prompts.versions import Prompt
+
+PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
+HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
+
+
+def evidence(view: Mapping[str, Any]) -> str:
+    """What a viewer reports: who comes closest to the ego where their paths cross, or what it cannot see.
+
+    The gap is by how many seconds that vehicle is later there than the ego.
+    """
+    gaps = [(_gap_s(c), c) for c in view["conflicts"]]
+    moving = [(gap, c) for gap, c in gaps if gap is not None]
+    if moving:
+        gap, first = min(moving, key=lambda pair: abs(pair[0]))
+        return f"{first['with']} from {first['sector']}, gap {gap:+.1f} s"
+    if gaps:
+        return f"{gaps[0][1]['with']} from {gaps[0][1]['sector']}, one of us stands"
+    hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
+    return f"nothing crosses, hidden {' '.join(hidden) or 'none'}"
+
+
+def _gap_s(conflict: Mapping[str, Any]) -> float | None:
+    ours, theirs = conflict["ego"]["time_s"], conflict["other"]["time_s"]
+    return None if ours is None or theirs is None else float(theirs - ours)
+
+
+def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> dict[str, Any]:
+    """A helper's message that states an intent, with what any prompt may show of it."""
+    stated = rounded(intent.tolist(), PARTS)
+    best = int(np.argmax(intent))
+    braking = stated[0]  # meta-actions come in the environment's order, the most careful first
+    return {
+        "evidence": evidence(view),
+        "risk": "high" if braking > HIGH else "medium" if braking > MEDIUM else "low",
+        "intent": tuple(stated),
+        "recommended_maneuver": actions[best],
+        "confidence": stated[best],
+    }
+
+
+def answer(
+    prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False
+) -> str:
+    """The answer that states an intent; `bare` without free text, as a constrained answer has to begin."""
+    said = message(view, intent, actions)
+    numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
+    body = f'"action_distribution":{{{numbers}}}'
+    if view["role"] == "helper":
+        if prompt.helper_answer == "recommendation":
+            best = said["recommended_maneuver"]
+            body = f'"recommended_maneuver":"{best}","confidence":{said["confidence"]:.2f}'
+        reported = "" if bare else said["evidence"]
+        body = f'"evidence":{canonical_json(reported)},"risk":"{said["risk"]}",{body}'
+    reasons_first = prompt.helper_answer == "recommendation" and not bare
+    return f"{said['evidence']}. {{{body}}}" if reasons_first else f"{{{body}}}"

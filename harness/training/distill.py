@@ -1,0 +1,96 @@
+"""From a frozen dataset to a small model, in stages that a kill does not undo."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+import transformers
+
+from harness.core.errors import UserError, printable
+from harness.core.files import canonical_json, write_whole
+from harness.dataset.load import Dataset
+from harness.prompts.versions import Prompt
+from harness.training.card import model_card
+from harness.training.gguf_export import export
+from harness.training.student import Progress, Student
+from harness.training.text import save_tokenizer
+from harness.training.train import STAGES, Plan
+
+
+def distill(
+    dataset: Dataset,
+    prompts: Sequence[Prompt],
+    plan: Plan,
+    out: Path,
+    progress: Progress,
+    device: str,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Train a model on a dataset and write checkpoint, tokenizer, GGUF file and model card to `out`.
+
+    Stages that an earlier, killed call finished are taken over, and one it had begun goes on.
+
+    Args:
+        dataset: what it learns from.
+        prompts: versions that it learns to read.
+        plan: how long.
+        out: folder to make; its name is the model's.
+        progress: called with the stage, the sequences seen in it and the loss.
+        device: `cpu` or `cuda`.
+        threads: on a CPU; None is PyTorch's choice.
+
+    Returns:
+        What the model card states: data, plan, curves, and the KL of the read-out on held-out episodes.
+
+    Raises:
+        UserError: the folder holds something else.
+    """
+    if threads:
+        torch.set_num_threads(threads)
+    work = _begin(out, {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)})
+    student = Student(dataset, prompts, plan, work, device)
+    curves = {name: student.stage(name, progress) for name in STAGES}
+    facts = {
+        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest["seed"],
+                    "episodes": dataset.manifest["episodes"], "scenes": len(dataset.scenes)},
+        "prompts": {p.version: p.sha256 for p in prompts},
+        "plan": asdict(plan),
+        "parameters": sum(p.numel() for p in student.model.parameters()),
+        "vocabulary": student.tokenizer.get_vocab_size(),
+        "held_out": student.held_out_kl(),
+        "curves": curves,
+    }  # fmt: skip
+    student.model.eval()
+    transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
+    student.model.save_pretrained(out)
+    save_tokenizer(student.tokenizer, out)
+    export(out, out / f"{out.absolute().name}-f16.gguf")
+    write_whole(out / "README.md", model_card(out.absolute().name, facts))
+    write_whole(out / "training.json", json.dumps(facts, indent=1) + "\n")
+    shutil.rmtree(work)
+    return facts
+
+
+def _begin(out: Path, settings: dict[str, Any]) -> Path:
+    """The working folder, new or the one that a killed call with the same settings left."""
+    shown, work = printable(out), out / ".work"
+    kept = work / "settings.json"
+    if kept.is_file():
+        if json.loads(kept.read_text()) != json.loads(canonical_json(settings)):
+            raise UserError(
+                f"--out {shown} was begun with another dataset, prompt, seed or samples; repeat those, "
+                "or delete it"
+            )
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"--out {shown} exists; choose a new folder")
+    try:
+        write_whole(kept, canonical_json(settings))
+    except OSError as error:
+        raise UserError(
+            f"--out {shown} cannot be written ({error.strerror}); choose another folder"
+        ) from None
+    return work

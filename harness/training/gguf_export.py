@@ -1,0 +1,144 @@
+"""A saved Qwen3 checkpoint as one GGUF file, which llama.cpp reads."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.core.files import replacing
+from harness.training.saved_qwen3 import Saved, numbers, read, rope
+
+_ENDS = {"model.embed_tokens": "token_embd", "model.norm": "output_norm", "lm_head": "output"}
+_BLOCK = {
+    "input_layernorm": "attn_norm",
+    "self_attn.q_proj": "attn_q",
+    "self_attn.k_proj": "attn_k",
+    "self_attn.v_proj": "attn_v",
+    "self_attn.o_proj": "attn_output",
+    "self_attn.q_norm": "attn_q_norm",
+    "self_attn.k_norm": "attn_k_norm",
+    "post_attention_layernorm": "ffn_norm",
+    "mlp.gate_proj": "ffn_gate",
+    "mlp.up_proj": "ffn_up",
+    "mlp.down_proj": "ffn_down",
+}
+
+
+def export(checkpoint: Path, out: Path, dtype: Literal["F16", "F32"] = "F16") -> None:
+    """Write a `Qwen3ForCausalLM` folder as a GGUF file, whole or not at all.
+
+    Args:
+        checkpoint: folder with config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json
+            and a chat template.
+        out: the file to write; replaced if it exists.
+        dtype: number format of the matrices; vectors are always F32.
+
+    Raises:
+        UserError: another architecture or tokenizer, or files that are not whole.
+    """
+    shown = f"checkpoint {printable(checkpoint)}"
+    try:
+        saved = read(checkpoint, shown)
+        with replacing(out) as part:
+            _write(part, checkpoint, saved, dtype, shown)
+    except UserError:
+        raise
+    except Exception as error:  # a broken file surfaces as any of a dozen exception types
+        reason = printable(f"{type(error).__name__}: {error}", 200)
+        raise UserError(f"{shown} cannot be exported: {reason}; save or copy it again") from error
+
+
+def _write(part: Path, checkpoint: Path, saved: Saved, dtype: Literal["F16", "F32"], shown: str) -> None:
+    from gguf import GGUFWriter
+
+    writer = GGUFWriter(part, "qwen3")
+    try:
+        _describe(writer, checkpoint.resolve().name, saved, dtype, shown)
+        # Told first and written one by one: no more than one matrix is in memory.
+        tensors = list(_tensors(checkpoint, saved.config, dtype, shown))
+        for name, tensor, kind in tensors:
+            size = int(np.prod(tensor.shape)) * kind.itemsize
+            writer.add_tensor_info(name, tensor.shape, kind, size)
+        writer.write_header_to_file()
+        writer.write_kv_data_to_file()
+        writer.write_ti_data_to_file()
+        for name, tensor, kind in tensors:
+            with np.errstate(over="ignore"):
+                converted = numbers(tensor).astype(kind)
+            if not np.isfinite(converted).all():
+                raise UserError(f"{shown}: {name} has numbers past the range of {dtype}; export it as F32")
+            writer.write_tensor_data(converted)
+    finally:
+        writer.close()
+
+
+def _describe(writer: Any, name: str, saved: Saved, dtype: Literal["F16", "F32"], shown: str) -> None:
+    from gguf import LlamaFileType
+
+    config, tokenizer = saved.config, saved.tokenizer
+    writer.add_name(name)
+    writer.add_file_type(LlamaFileType.MOSTLY_F16 if dtype == "F16" else LlamaFileType.ALL_F32)
+    writer.add_vocab_size(config["vocab_size"])
+    writer.add_context_length(config["max_position_embeddings"])
+    writer.add_embedding_length(config["hidden_size"])
+    writer.add_block_count(config["num_hidden_layers"])
+    writer.add_feed_forward_length(config["intermediate_size"])
+    writer.add_head_count(config["num_attention_heads"])
+    writer.add_head_count_kv(config["num_key_value_heads"])
+    writer.add_key_length(config["head_dim"])
+    writer.add_value_length(config["head_dim"])
+    writer.add_layer_norm_rms_eps(config["rms_norm_eps"])
+    writer.add_rope_freq_base(rope(config)["rope_theta"])
+    tokens, types = _vocabulary(tokenizer, config["vocab_size"], shown)
+    writer.add_tokenizer_model("gpt2")
+    writer.add_tokenizer_pre("qwen2")
+    writer.add_token_list(tokens)
+    writer.add_token_types(types)
+    # Pairs in newer files, "left right" in older ones.
+    merges = tokenizer["model"]["merges"]
+    writer.add_token_merges([m if isinstance(m, str) else " ".join(m) for m in merges])
+    listed = config["eos_token_id"]
+    eos = listed[0] if isinstance(listed, list) else listed
+    pad = eos if config.get("pad_token_id") is None else config["pad_token_id"]
+    bos = pad if config.get("bos_token_id") is None else config["bos_token_id"]
+    writer.add_eos_token_id(eos)
+    writer.add_pad_token_id(pad)
+    writer.add_bos_token_id(bos)  # unsaid, it would be GPT-2's
+    writer.add_add_bos_token(False)
+    writer.add_chat_template(saved.template)
+
+
+def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[list[str], list[int]]:
+    """Texts and types of all tokens, by id; rows of the embedding without a token are unused."""
+    from gguf import TokenType
+
+    known = {i: (text, TokenType.NORMAL) for text, i in tokenizer["model"]["vocab"].items()}
+    for token in tokenizer["added_tokens"]:
+        kind = TokenType.CONTROL if token["special"] else TokenType.USER_DEFINED
+        known[token["id"]] = (token["content"], kind)
+    if max(known) >= rows:
+        raise UserError(f"{shown}: its tokenizer has {max(known) + 1} tokens and the model only {rows}")
+    tokens = [known.get(i, (f"[PAD{i}]", TokenType.UNUSED)) for i in range(rows)]
+    return [text for text, _ in tokens], [int(kind) for _, kind in tokens]
+
+
+def _tensors(
+    checkpoint: Path, config: Mapping[str, Any], dtype: Literal["F16", "F32"], shown: str
+) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
+    """Name in the GGUF, place in the checkpoint and number format of each tensor."""
+    from gguf.utility import SafetensorsLocal
+
+    names = dict(_ENDS)
+    if config["tie_word_embeddings"]:  # llama.cpp then takes the embedding for it
+        del names["lm_head"]
+    for i in range(config["num_hidden_layers"]):
+        names |= {f"model.layers.{i}.{theirs}": f"blk.{i}.{ours}" for theirs, ours in _BLOCK.items()}
+    tensors = SafetensorsLocal(checkpoint / "model.safetensors").tensors
+    for theirs, ours in names.items():
+        tensor = tensors.get(f"{theirs}.weight")
+        if tensor is None:
+            raise UserError(f"{shown} lacks {theirs}.weight; save or copy it again")
+        full = dtype == "F32" or len(tensor.shape) == 1
+        yield f"{ours}.weight", tensor, np.dtype(np.float32 if full else np.float16)

@@ -1,0 +1,160 @@
+"""Parity: one model through two engines. The same prompts, held against each other token by token.
+
+transformers in float32 is the reference. llama.cpp is held to it twice: with the very same float32 weights,
+exported on the spot, and with the GGUF file that the model's card names.
+"""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.backends.base import Backend, Request
+from harness.backends.cards import Card
+from harness.backends.language_model import LanguageModel
+from harness.backends.llama_cpp import backend as llama_backend
+from harness.backends.llama_cpp.backend import LlamaBackend
+from harness.backends.transformers import checkpoint
+from harness.backends.transformers import engine as transformers_engine
+from harness.core.arrays import Floats
+from harness.parsing.parse import parse
+from harness.training.gguf_export import export
+
+LEAST_TEXTS, MOST_READOUT = 0.98, 0.02
+MOST_LOGIT = {"F32": 1e-3, "F16": 0.1}  # other formats are measured, and held to nothing
+SHOWN = 5  # differences of a kind that are named
+BATCH = 8
+PASSES = 5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing compared.
+
+    Attributes:
+        what: what was compared.
+        measured: the figure.
+        allowed: its limit; None where there is none.
+        holds: whether it is within.
+        n: prompts.
+        differences: the first prompts that differ, and how.
+    """
+
+    what: str
+    measured: float
+    allowed: float | None
+    holds: bool
+    n: int
+    differences: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What one engine made of the prompts.
+
+    Attributes:
+        tokens: token ids of each json prompt.
+        logits: log-probabilities of the whole vocabulary after each, (n, V).
+        texts: greedy answers.
+        readouts: distributions read out, (n, A).
+    """
+
+    tokens: list[list[int]]
+    logits: Floats
+    texts: list[str]
+    readouts: Floats
+
+
+def compare(
+    reference: Card, gguf: Card, asked: Sequence[Request], letters: Sequence[Request],
+    progress: Callable[[int], None],
+) -> list[Finding]:  # fmt: skip
+    """Hold a GGUF card's model against a checkpoint card's.
+
+    Args:
+        reference: a card on transformers.
+        gguf: a card on llama-cpp.
+        asked: requests for JSON.
+        letters: requests for a read-out.
+        progress: called with 1 after each of `PASSES` passes over the prompts.
+
+    Raises:
+        UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
+    """
+    where = checkpoint.find(reference)
+    rows = checkpoint.vocabulary(where)
+    plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
+    known = _hear(plain(batch_size=1), asked, letters, rows)
+    progress(1)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "f32.gguf"
+        export(where, file, "F32")
+        same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None)
+        exact = partial(llama_backend.open, same, device="cpu")
+        shipped = partial(llama_backend.open, gguf, device="cpu")
+        found = []
+        for label, through in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
+            found += _findings(label, asked, known, _hear(through(batch_size=1), asked, letters, rows))
+            progress(1)
+        found.append(_company("transformers", plain, asked, known.texts))
+        progress(1)
+        found.append(_company("llama.cpp F32", exact, asked, None))
+        progress(1)
+    return found
+
+
+def _hear(
+    backend: LanguageModel | LlamaBackend, asked: Sequence[Request], letters: Sequence[Request], rows: int
+) -> Heard:
+    tokens = [backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in asked]
+    logits = np.concatenate([backend.next_log_probs([ids], rows) for ids in tokens])
+    read = [
+        parse(c.text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
+        for r, c in zip(letters, backend.complete(letters), strict=True)
+    ]
+    return Heard(tokens, logits, _texts(backend, asked), np.array(read))
+
+
+def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
+    return [c.text if c.error is None else f"error: {c.error}" for c in backend.complete(asked)]
+
+
+def _findings(label: str, asked: Sequence[Request], one: Heard, other: Heard) -> list[Finding]:
+    ids = [r.id for r in asked]
+    logit = np.abs(one.logits - other.logits).max(axis=1)
+    read = np.abs(one.readouts - other.readouts).max(axis=1)
+    return [
+        _equal(f"{label}: token ids equal", 1.0, ids, one.tokens, other.tokens),
+        _near(f"{label}: largest difference of a logit", MOST_LOGIT.get(label), ids, logit),
+        _equal(f"{label}: greedy text equal", LEAST_TEXTS, ids, one.texts, other.texts),
+        _near(f"{label}: largest difference of a read-out", MOST_READOUT, ids, read),
+    ]
+
+
+def _company(
+    label: str, opened: Callable[..., Backend], asked: Sequence[Request], alone: list[str] | None
+) -> Finding:
+    """Batches in reverse order, against one at a time."""
+    alone = alone or _texts(opened(batch_size=1), asked)
+    together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
+    return _equal(
+        f"{label}: text equal in reversed batches of {BATCH}", 1.0, [r.id for r in asked], alone, together
+    )
+
+
+def _equal(what: str, least: float, ids: Sequence[str], one: Sequence[Any], other: Sequence[Any]) -> Finding:
+    unlike = [f"{i}: {a!r} / {b!r}" for i, a, b in zip(ids, one, other, strict=True) if a != b]
+    share = 1 - len(unlike) / len(ids)
+    return Finding(what, share, least, share >= least, len(ids), tuple(unlike[:SHOWN]))
+
+
+def _near(what: str, most: float | None, ids: Sequence[str], values: Floats) -> Finding:
+    worst = [i for i in np.argsort(-values)[:SHOWN] if most is not None and not values[i] <= most]
+    return Finding(
+        what, float(values.max()), most, most is None or bool(values.max() <= most), len(ids),
+        tuple(f"{ids[i]}: {values[i]:.2g}" for i in worst),
+    )  # fmt: skip

@@ -1,0 +1,101 @@
+"""A saved Qwen3 checkpoint, read from its files without torch or transformers.
+
+What llama.cpp would take otherwise than the checkpoint means it, without a word, is refused: another
+pre-tokeniser, another rope, a bias.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.backends.tokens import QWEN2_SPLIT
+from harness.core.errors import UserError, printable
+
+# Where a file may say otherwise, and llama.cpp would not hear it. Its Unicode normalisation is none; NFC is
+# what Qwen's tokenizer does, and nothing to text that is composed already.
+_ONE_VALUE = {"attention_bias": False, "use_sliding_window": False, "hidden_act": "silu"}
+_NORMALIZERS = (None, {"type": "NFC"})
+_SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_SPLIT}, "behavior": "Isolated", "invert": False}
+_BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
+
+
+class Saved(NamedTuple):
+    """What its small files say."""
+
+    config: dict[str, Any]
+    tokenizer: dict[str, Any]
+    template: str
+
+
+def read(checkpoint: Path, shown: str) -> Saved:
+    """The small files of a checkpoint.
+
+    Raises:
+        UserError: one is not there, or says what no GGUF can.
+    """
+    texts = {
+        name: (checkpoint / name).read_text(encoding="utf-8")
+        for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja")
+        if (checkpoint / name).is_file()
+    }
+    for name in ("config.json", "tokenizer.json", "model.safetensors"):
+        if not (checkpoint / name).is_file():
+            raise UserError(f"{shown} has no {name}; give the folder of a saved model with its tokenizer")
+    config, tokenizer = json.loads(texts["config.json"]), json.loads(texts["tokenizer.json"])
+    template = texts.get("chat_template.jinja") or json.loads(texts.get("tokenizer_config.json", "{}")).get(
+        "chat_template"
+    )
+    if not isinstance(template, str):
+        raise UserError(f"{shown} has no chat template; put a chat_template.jinja beside its config.json")
+    if config["architectures"] != ["Qwen3ForCausalLM"]:
+        given = printable(config["architectures"])
+        raise UserError(f"{shown} is a {given}; only Qwen3ForCausalLM can be exported")
+    for key, value in _ONE_VALUE.items():
+        if config.get(key, value) != value:
+            raise UserError(f"{shown}: {key} = {printable(config[key])}; only {value} can be exported")
+    scaling = rope(config).get("rope_type", "default")
+    if scaling != "default" or config.get("rope_scaling"):
+        raise UserError(f"{shown} scales its rope ({printable(scaling)}); only the default can be exported")
+    _check_tokenizer(tokenizer, shown)
+    return Saved(config, tokenizer, template)
+
+
+def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Rope parameters, in a table of their own since transformers 5."""
+    found: Mapping[str, Any] = config.get("rope_parameters") or config
+    return found
+
+
+def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
+    model, pre = tokenizer["model"], tokenizer["pre_tokenizer"] or {}
+    steps = [
+        {key: step.get(key) for key in wanted}
+        for step, wanted in zip(pre.get("pretokenizers", ()), (_SPLIT, _BYTES), strict=False)
+    ]
+    odd = [t["content"] for t in tokenizer["added_tokens"] if t["lstrip"] or t["rstrip"] or t["single_word"]]
+    if model["type"] != "BPE" or model.get("ignore_merges") or model.get("byte_fallback"):
+        what = "is no plain BPE"
+    elif steps != [_SPLIT, _BYTES] or len(pre["pretokenizers"]) != len(steps):
+        what = "splits text otherwise than Qwen2's"
+    elif tokenizer["normalizer"] not in _NORMALIZERS:
+        what = "normalises text otherwise than Qwen2's"
+    elif odd:
+        what = f"takes spaces or whole words with {printable(odd[0])}"
+    else:
+        return
+    raise UserError(f"{shown}: its tokenizer {what}; llama.cpp would silently read other tokens")
+
+
+def numbers(tensor: Any) -> NDArray[np.float32]:
+    """A tensor of `gguf.utility.SafetensorsLocal` as float32, read only now."""
+    data = tensor.mmap_bytes()
+    if tensor.dtype == "BF16":  # which numpy has not; its bits are float32's upper half
+        found = (data.view("<u2").astype(np.uint32) << 16).view(np.float32)
+    else:
+        found = data.view({"F32": "<f4", "F16": "<f2"}[tensor.dtype]).astype(np.float32)
+    shaped: NDArray[np.float32] = found.reshape(tensor.shape)
+    return shaped

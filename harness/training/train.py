@@ -1,0 +1,239 @@
+"""Training in four stages, each from the weights of the one before.
+
+1. `excerpts`: prompts that show nothing but the conflicts, so that reading the numbers is learnt on short
+   sequences. The read-out (one letter) is fitted to the outcome table's soft label by KL, and a report in
+   words follows it, which names the gap between two arrivals.
+2. `alone`: the same with whole prompts, of every viewer.
+3. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 2 is rehearsed.
+4. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
+   their mode, not their mean.
+
+All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
+numbers in it has to come from somewhere. A batch shares its system message, which is computed once.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from harness.core.arrays import Floats
+from harness.training.muon import Muon
+
+STAGES = ("excerpts", "alone", "messages", "answers")
+PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
+TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
+LOG_STEPS = 50  # the loss is averaged over so many steps
+KEEP_S = 60.0  # a killed run loses at most so much
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One sequence.
+
+    Attributes:
+        ids: token ids, the shared beginning included.
+        shared: how many of them are the system message, equal in all samples of a `kind`.
+        kind: names that system message.
+        answer_at: where the answer starts.
+        target: what the read-out there should be, (A,); None where the answer is a text from its first token.
+    """
+
+    ids: NDArray[np.int32]
+    shared: int
+    kind: str
+    answer_at: int
+    target: Floats | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How long and how fast.
+
+    Attributes:
+        samples: sequences per stage, by name.
+        batch: sequences a step.
+        muon_lr: learning rate of the matrices (Muon).
+        adam_lr: learning rate of embeddings and norms (AdamW).
+        seed: of the weights and of the order.
+    """
+
+    samples: dict[str, int]
+    batch: int = 16
+    muon_lr: float = 3e-3
+    adam_lr: float = 3e-3
+    seed: int = 0
+
+
+def optimizers(model: Any, plan: Plan) -> list[Any]:
+    """Muon for the matrices of the blocks, AdamW for the rest."""
+    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
+    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
+    return [
+        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
+        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
+    ]
+
+
+def run_stage(
+    model: Any, samples: Sequence[Sample], letters: Sequence[int], count: int, plan: Plan,
+    progress: Callable[[int, float], None], going: Path,
+) -> list[tuple[int, float]]:  # fmt: skip
+    """Train on `count` sequences drawn from `samples`, going on from the checkpoint `going` if there is one.
+
+    Returns:
+        (sequences seen, mean loss since the last) along the way.
+    """
+    device = next(model.parameters()).device
+    opts = optimizers(model, plan)
+    base = [[group["lr"] for group in opt.param_groups] for opt in opts]
+    batches = _batches(samples, count, plan)
+    start, curve = 0, []
+    if going.is_file():
+        state = torch.load(going, weights_only=True)
+        model.load_state_dict(state["model"])
+        for opt, kept in zip(opts, state["opts"], strict=True):
+            opt.load_state_dict(kept)
+        start, curve = state["step"], [tuple(point) for point in state["curve"]]
+    letter_ids = torch.tensor(letters, device=device)
+    model.train()
+    losses: list[float] = []
+    kept_s = time.monotonic()
+    for step in range(start, len(batches)):
+        scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
+        for opt, rates in zip(opts, base, strict=True):
+            for group, rate in zip(opt.param_groups, rates, strict=True):
+                group["lr"] = rate * scale
+        loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        for opt in opts:
+            opt.step()
+            opt.zero_grad(set_to_none=True)
+        losses.append(float(loss.detach()))
+        if (step + 1) % LOG_STEPS == 0 or step + 1 == len(batches):
+            curve.append(((step + 1) * plan.batch, float(np.mean(losses))))
+            progress(*curve[-1])
+            losses = []
+            if time.monotonic() - kept_s > KEEP_S:
+                kept_s = time.monotonic()
+                save(
+                    {"model": model.state_dict(), "opts": [o.state_dict() for o in opts], "step": step + 1,
+                     "curve": curve}, going,
+                )  # fmt: skip
+    return curve
+
+
+def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.int64]:
+    """Places of the samples of each step, (steps, batch): of one kind and of like length, in random order."""
+    rng = np.random.default_rng(plan.seed)
+    epochs = math.ceil(count / len(samples))
+    order = np.concatenate([rng.permutation(len(samples)) for _ in range(epochs)])[:count]
+    kinds = np.array([samples[i].kind for i in order])
+    lengths = np.array([len(samples[i].ids) for i in order])
+    found = []
+    for kind in sorted(set(kinds)):
+        of_kind = order[kinds == kind]
+        size = lengths[kinds == kind]
+        window = plan.batch * 32
+        for start in range(0, len(of_kind), window):
+            part = of_kind[start : start + window]
+            part = part[np.argsort(size[start : start + window], kind="stable")]
+            short = -len(part) % plan.batch
+            part = np.concatenate([part, part[rng.integers(0, len(part), short)]])
+            found.append(part.reshape(-1, plan.batch))
+    batches = np.concatenate(found)
+    return batches[rng.permutation(len(batches))][: max(1, count // plan.batch)]
+
+
+def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
+    """States after the shared beginning, (n, longest rest, hidden); padding on the right is not seen."""
+    from transformers import DynamicCache
+
+    device = next(model.parameters()).device
+    shared = batch[0].shared
+    cache = DynamicCache(config=model.config)
+    first = torch.from_numpy(batch[0].ids[None, :shared].astype(np.int64)).to(device)
+    model.model(first, past_key_values=cache, use_cache=True)
+    cache.batch_repeat_interleave(len(batch))
+    rest = _padded([s.ids[shared:] for s in batch]).to(device)
+    return model.model(rest, past_key_values=cache, use_cache=True).last_hidden_state
+
+
+def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
+    """KL of the read-out to its target (nats), plus cross-entropy of the answer's tokens, each a mean."""
+    hidden = hidden_states(model, batch)
+    weight, device, shared = model.model.embed_tokens.weight, hidden.device, batch[0].shared
+    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch)
+    targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
+    if targets:
+        reading = list(targets)
+        at = torch.tensor([batch[i].answer_at - shared - 1 for i in reading], device=device)
+        logits = hidden[torch.tensor(reading, device=device), at] @ weight.T
+        target = torch.from_numpy(np.stack(list(targets.values()))).to(logits)
+        kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
+        # Beside the letters nothing should be likely where a letter is asked for.
+        outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
+        total = total + (kl + 0.1 * outside.mean()) * len(reading) / len(batch)
+    said = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
+    writing = [(i, start, end) for i, start, end in said if start < end]
+    if writing:
+        rows = np.concatenate([np.full(end - start, i) for i, start, end in writing])
+        columns = np.concatenate([np.arange(start, end) for _, start, end in writing])
+        ids = np.concatenate([batch[i].ids[start:end] for i, start, end in writing]).astype(np.int64)
+        logits = hidden[torch.from_numpy(rows), torch.from_numpy(columns - shared - 1)] @ weight.T
+        text = F.cross_entropy(logits, torch.from_numpy(ids).to(device))
+        total = total + TEXT_WEIGHT * text * len(writing) / len(batch)
+    return total
+
+
+def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample]) -> Any:
+    """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers."""
+    shared = batch[0].shared
+    ids = _padded([s.ids[shared:] for s in batch]).to(hidden.device)
+    places = torch.arange(ids.shape[1])
+    ends = torch.tensor([s.answer_at - shared for s in batch])
+    there = (places[None, 1:] < ends[:, None]).to(hidden.device)
+    return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
+
+
+def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> Floats:
+    """Distribution over the letters after each prompt, (n, A)."""
+    model.eval()
+    device = next(model.parameters()).device
+    weight = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
+    found = np.zeros((len(samples), len(letters)))
+    order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
+    start = 0
+    while start < len(order):
+        kind = samples[order[start]].kind
+        some = [i for i in order[start : start + batch] if samples[i].kind == kind]
+        start += len(some)
+        with torch.no_grad():
+            asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
+            hidden = hidden_states(model, asked)
+        last = torch.tensor([samples[i].answer_at - samples[i].shared - 1 for i in some], device=device)
+        logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
+        found[some] = torch.softmax(logits.detach().float(), -1).cpu().numpy()
+    return found
+
+
+def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
+    ids = np.zeros((len(rows), max(map(len, rows))), dtype=np.int64)
+    for row, values in zip(ids, rows, strict=True):
+        row[: len(values)] = values
+    return torch.from_numpy(ids)
+
+
+def save(state: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint, whole or not at all."""
+    part = path.with_suffix(".part")
+    torch.save(state, part)
+    part.replace(path)

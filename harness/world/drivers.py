@@ -1,0 +1,28 @@
+"""Reference drivers: baselines that need no model and stand beside every model.
+
+`cruise` keeps going, `brake` always brakes, `local-view` plans with what the ego's sensors know and
+`full-view` plans with everything in view.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from harness.world.planner import plan
+
+DRIVERS = ("cruise", "brake", "local-view", "full-view")
+PRIVILEGED = "full-view"  # the only one that may read the truth
+
+Graph = Mapping[str, Any]
+
+
+def choose(driver: str, graph: Graph, truth: Graph | None, actions: tuple[str, ...]) -> str:
+    """The driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
+    if driver == "cruise":
+        return "IDLE"
+    if driver == "brake":
+        return "SLOWER"
+    if driver == "local-view":
+        return plan(graph, actions)
+    if truth is None:
+        raise ValueError(f"driver {driver!r} reads the truth and was given none")
+    return plan(truth, actions)

@@ -1,0 +1,96 @@
+"""How an episode ends, and who was to blame for a collision."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from shapely import Polygon
+from shapely.ops import nearest_points
+
+from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.state import VehicleState
+
+Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]
+
+ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
+
+# Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
+PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
+            "own": {"straight": 1, "left": 0}, "oncoming": {"straight": 1, "left": 0}}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the ego.
+
+    Attributes:
+        result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
+            intersection), `late` (cleared it too long after the full-view driver) or `off_road`;
+            `running` while undecided.
+        time_s: when it was decided; None while running.
+        partner: id of the vehicle the ego collided with.
+        striker: whose front hit: `ego`, `other`, `both` or `neither` (a side swipe).
+        fault: who should have given way by right of way, or drove into the other's back: `ego` or `other`.
+        least_gap_m: smallest distance so far between the ego's outline and any other vehicle's.
+        other_crashes: vehicles that crashed without the ego.
+    """
+
+    result: Result = "running"
+    time_s: float | None = None
+    partner: str | None = None
+    striker: str | None = None
+    fault: str | None = None
+    least_gap_m: float = 1000.0
+    other_crashes: int = 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is decided."""
+        return self.result != "running"
+
+    @property
+    def success(self) -> bool:
+        """Cleared the intersection without a collision and without a forced failure."""
+        return self.result == "cleared"
+
+    def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
+        """The same outcome, `late` where the ego cleared too long after the full-view `reference`."""
+        if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
+            return self
+        late = self.time_s - reference.time_s > parameters.delay_allowance_s + ROUNDING_S
+        return replace(self, result="late") if late else self
+
+    def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
+        """The same episode, decided."""
+        gap = 0.0 if result == "collision" else self.least_gap_m
+        return replace(self, result=result, time_s=time_s, least_gap_m=gap, **how)  # type: ignore[arg-type]
+
+
+def outline(v: VehicleState) -> Polygon:
+    """A vehicle's rectangle as a shapely polygon, metres."""
+    return Polygon(v.corners())
+
+
+def striker(ego: VehicleState, other: VehicleState) -> str:
+    """Whose front bumper was at the point of contact."""
+    contact = nearest_points(outline(ego), outline(other))[0]
+    overlap = outline(ego).intersection(outline(other))
+    if not overlap.is_empty:
+        contact = overlap.centroid
+    fronts = []
+    for v in (ego, other):
+        ahead = (contact.x - v.x_m) * np.cos(v.heading_rad) + (contact.y - v.y_m) * np.sin(v.heading_rad)
+        fronts.append(bool(ahead > v.length_m / 2 - 1.0))
+    return {(True, False): "ego", (False, True): "other", (True, True): "both", (False, False): "neither"}[
+        fronts[0], fronts[1]
+    ]
+
+
+def fault(ego: VehicleState, other: VehicleState) -> str:
+    """Who should have given way: the one behind in a rear-end collision, else the one with less priority."""
+    if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
+        dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
+        ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)
+        return "ego" if ahead > 0 else "other"
+    mine, its = PRIORITY[ego.approach][ego.route], PRIORITY[other.approach][other.route]
+    return "ego" if mine < its else "other"

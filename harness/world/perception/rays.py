@@ -1,0 +1,82 @@
+"""Ray casting: what a vehicle has a line of sight to, past buildings and other vehicles."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.core.arrays import Floats
+from harness.world.state import VehicleState, WorldState
+
+RAYS = 1440  # a quarter of a degree apart
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One full turn of rays from a vehicle's centre.
+
+    Attributes:
+        bearing_rad: (RAYS,) direction in the world frame.
+        range_m: (RAYS,) distance to the first surface; inf where there is none.
+        hits: id of a vehicle or building to the indices of the rays that end on it.
+    """
+
+    bearing_rad: Floats
+    range_m: Floats
+    hits: dict[str, NDArray[np.intp]]
+
+
+def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats]:
+    """Ids and corners (n, 4, 2) of everything that stops a ray, the viewer itself left out."""
+    solid = [v for v in state.vehicles if v.id != viewer.id]
+    ids = [v.id for v in solid] + [b.id for b in state.buildings]
+    return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
+
+
+def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Where rays first meet a surface.
+
+    Args:
+        origin: (2,) m.
+        targets: (r, 2) direction vectors; a ray parameter of 1 is their length.
+        corners: (n, 4, 2) m.
+
+    Returns:
+        Ray parameter (r,), inf where nothing is met, and index (r,) of the object that is met first.
+    """
+    start = corners.reshape(-1, 2) - origin
+    along = np.roll(corners, -1, axis=1).reshape(-1, 2) - origin - start
+    # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
+    determinant = targets[:, :1] * along[:, 1] - targets[:, 1:] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / determinant
+        u = (start[:, 0] * targets[:, 1:] - start[:, 1] * targets[:, :1]) / determinant
+    t = np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf)
+    edge = t.argmin(axis=1)
+    return t[np.arange(len(t)), edge], edge // 4
+
+
+def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
+    """Cast rays all round a vehicle."""
+    bearing, rays = _all_round()
+    ids, corners = surfaces(state, viewer)
+    distance, met = first_hits(np.array([viewer.x_m, viewer.y_m]), rays, corners)
+    reached = np.isfinite(distance)
+    hits = {name: np.flatnonzero(reached & (met == n)) for n, name in enumerate(ids)}
+    return Sweep(bearing, distance, {name: rays for name, rays in hits.items() if len(rays)})
+
+
+@lru_cache(maxsize=1)
+def _all_round() -> tuple[Floats, Floats]:
+    """Bearings (RAYS,) and their directions (RAYS, 2). Shared: not to be written to."""
+    bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
+    return bearing, np.column_stack([np.cos(bearing), np.sin(bearing)])
+
+
+def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
+    """For each of the points (k, 2) the id of what stands in its line of sight, None where it is seen."""
+    ids, corners = surfaces(state, viewer)
+    origin = np.array([viewer.x_m, viewer.y_m])
+    distance, met = first_hits(origin, points - origin, corners)
+    return [ids[m] if d < 1 else None for d, m in zip(distance, met, strict=True)]

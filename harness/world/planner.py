@@ -1,0 +1,107 @@
+"""The reference planner behind `local-view` and `full-view`: looks ahead along the ego's path.
+
+It knows what a scene graph says, and nothing else. It plays every sequence of meta-actions over the next
+decisions, then FASTER, against the conflicts of the graph at constant speed, and takes the first action of
+the sequence that clears the conflict points soonest without meeting anyone. It does not guess at what it
+cannot see, which is what makes occlusion cost something.
+"""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.world.road import crossings, paths
+from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.state import SIZES_M
+
+HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
+LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
+MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
+RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC)
+STEP_S = 0.1
+# A car is covered by three discs on its long axis: a third of its length apart, reaching its corners.
+DISCS_M = np.array([-1.0, 0.0, 1.0]) * SIZES_M["car"][0] / 3
+DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
+
+
+def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
+    """The planner's meta-action for a scene graph."""
+    left = parameters.decisions - graph["step"]
+    ego = graph["ego"]
+    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
+    gap = np.full(len(sequences), np.inf)
+    for conflict in graph["conflicts"]:
+        gap = np.minimum(gap, least_gap(travelled, conflict))
+    # The goal lies well behind the conflict points, so that a late burst of speed counts too.
+    to_go = graph["ego"]["zone_m"] + 15.0
+    arrival = (travelled < to_go).sum(axis=1) * STEP_S - 1e-3 * travelled[:, -1]
+    safe = gap > 0
+    score = np.where(safe, -arrival, -1e3 + np.minimum(gap, 0.0))
+    best = np.flatnonzero(score >= score.max() - 1e-9)
+    # Among equals the calmest: IDLE before FASTER before SLOWER, compared decision by decision.
+    calm = {"IDLE": 0, "FASTER": 1, "SLOWER": 2}
+    return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
+
+
+# Every viewer of a scene is told the ego's speed, so they share one set of rollouts.
+@lru_cache(maxsize=64)
+def _all_rollouts(
+    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+) -> tuple[list[tuple[str, ...]], Floats]:
+    """Every sequence that is played through, and its rollout. Shared: not to be written to."""
+    sequences = list(product(actions, repeat=min(HORIZON, left)))
+    travelled = rollouts(sequences, speed_mps, target_mps, left, parameters)
+    travelled.flags.writeable = False
+    return sequences, travelled
+
+
+def rollouts(
+    sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
+) -> Floats:
+    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
+
+    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
+    present speed, IDLE keeps the target. `left` is how many decisions there still are.
+    """
+    levels = np.array(parameters.target_speeds_mps)
+    steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
+    shift = {"FASTER": 1, "SLOWER": -1, "IDLE": 0}
+    moves = np.array([[shift[a] for a in s] for s in sequences])
+    speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
+    travelled = np.empty((len(sequences), steps))
+    gone = np.zeros(len(sequences))
+    spacing = levels[-1] / (len(levels) - 1)
+    for k in range(steps):
+        n = k // every
+        if k % every == 0 and n < left:
+            move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
+            level = np.clip(np.round(speed / spacing).astype(int) + move, 0, len(levels) - 1)
+            target = np.where(move == 0, target, levels[level])
+        change = np.clip(
+            (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2
+        )
+        gone = gone + speed * STEP_S
+        speed = np.maximum(speed + change * STEP_S, 0.0)
+        travelled[:, k] = gone
+    return travelled
+
+
+def least_gap(travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
+    """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
+    key = (conflict["sector"], conflict["route"])
+    mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]
+    time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
+    ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
+    other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
+    # The ego's path is a line of constant x, so its discs differ in y alone.
+    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])[..., None] + DISCS_M
+    heading = its.headings_rad[np.searchsorted(its.arc_m, other_arc).clip(0, len(its.arc_m) - 1)]
+    other_x = np.interp(other_arc, its.arc_m, its.points[:, 0])[:, None] + np.cos(heading)[:, None] * DISCS_M
+    other_y = np.interp(other_arc, its.arc_m, its.points[:, 1])[:, None] + np.sin(heading)[:, None] * DISCS_M
+    squared = (crossing.x_m - other_x[:, None, :]) ** 2 + (ego_y[..., None] - other_y[:, None, :]) ** 2
+    nearest = np.sqrt(squared.min(axis=(1, 2, 3)))
+    return np.asarray(nearest - 2 * DISC_RADIUS_M - MARGIN_M)

@@ -1,0 +1,174 @@
+"""Scenario `occluded-intersection`: who stands where at the start of an episode.
+
+The ego comes from the south at 14 m/s and goes straight. Buildings on the four corners hide the crossing
+road. At most one vehicle is dangerous: timed to meet a cruising ego at the conflict point, from the left,
+from the right, or oncoming and turning left across the ego's path right behind a truck that hides it.
+Three helpers have just left the junction on the three other arms and see what comes towards it there.
+Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core import noise as luck
+from harness.world.road import SECTORS, crossings, paths
+from harness.world.state import Building, Kind, Part
+
+NAME = "occluded-intersection"
+ACTIONS = ("SLOWER", "IDLE", "FASTER")  # the environment's own names and order; a test holds them together
+BUILDING_END_M = 70.0  # outer walls, from the centre lines
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Every dial of the scenario. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        target_speeds_mps: what SLOWER, IDLE and FASTER step through.
+        ego_speed_mps: speed at the start.
+        ego_start_m: distance from the start to the centroid of the conflict zone.
+        braking_mps2: hardest braking.
+        acceleration_mps2: hardest acceleration.
+        decisions: decisions an episode.
+        decision_period_s: seconds between two decisions.
+        simulation_hz: frames a second.
+        time_limit_s: an ego that has not cleared the intersection by then never will.
+        delay_allowance_s: how much later than the full-view driver an ego may clear the intersection. A
+            needless SLOWER costs about 0.65 s: one is forgiven, two are not.
+        cleared_m: arc length behind the junction's exit at which the ego's centre has cleared it.
+        danger_share: probability that an episode holds a danger.
+        sector_shares: probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33).
+        danger_offset_s: when the danger reaches the conflict point, after a cruising ego would.
+        crossing_speed_mps: speed of a danger from the left or right.
+        turning_speed_mps: speed of an oncoming danger, and of the truck in front of it.
+        corner_m: distance of a building's walls from the centre lines.
+        truck_share: probability of an oncoming truck where it is not part of the danger.
+        late_share: probability of a harmless car that crosses long after.
+        late_speed_mps: its speed.
+        late_offset_s: when that car reaches the conflict point, after a cruising ego would.
+        helper_start_m: how far behind the junction helpers are at the start.
+        helper_speed_mps: speed at which they leave.
+    """
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
+    ego_speed_mps: float = 14.0
+    ego_start_m: tuple[float, float] = (61.0, 69.0)
+    braking_mps2: float = 8.0
+    acceleration_mps2: float = 3.0
+    decisions: int = 6
+    decision_period_s: float = 1.0
+    simulation_hz: int = 50
+    time_limit_s: float = 10.0
+    delay_allowance_s: float = 1.0
+    cleared_m: float = 2.5
+    danger_share: float = 0.75
+    sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
+    danger_offset_s: tuple[float, float] = (-0.4, 1.2)
+    crossing_speed_mps: tuple[float, float] = (9.0, 13.0)
+    turning_speed_mps: tuple[float, float] = (7.5, 8.5)
+    corner_m: tuple[float, float] = (8.0, 18.0)
+    truck_share: float = 0.5
+    late_share: float = 0.4
+    late_speed_mps: tuple[float, float] = (7.0, 9.0)
+    late_offset_s: tuple[float, float] = (5.0, 8.0)
+    helper_start_m: tuple[float, float] = (2.0, 8.0)
+    helper_speed_mps: tuple[float, float] = (4.0, 7.0)
+
+
+@dataclass(frozen=True)
+class Spawn:
+    """One vehicle at the start: where on which path, how fast, and its id."""
+
+    id: str
+    kind: Kind
+    part: Part
+    approach: str
+    route: str
+    arc_m: float
+    speed_mps: float
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The start of one episode.
+
+    Attributes:
+        spawns: vehicles in spawn order, the ego first, then the helpers.
+        buildings: one a corner.
+        danger: sector the danger comes from, or None.
+        danger_id: the dangerous vehicle, or None.
+    """
+
+    spawns: tuple[Spawn, ...]
+    buildings: tuple[Building, ...]
+    danger: str | None
+    danger_id: str | None
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's luck."""
+    p = parameters
+
+    def draw(what: str) -> float:
+        return float(luck.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    danger = None
+    if draw("danger") < p.danger_share:
+        drawn = int(np.searchsorted(np.cumsum(p.sector_shares)[:2], draw("sector")))
+        danger = SECTORS[drawn]
+
+    start = between("ego_start", p.ego_start_m)
+    # The centroid of the conflict zone lies 1.46 m before the ego's farthest conflict point.
+    ego_arc = crossings()["right", "straight"].ego_arc_m - 1.46 - start
+    offset = between("danger_offset", p.danger_offset_s)
+
+    def timed(approach: str, route: str, speed: float, late: float) -> float:
+        """Arc length from which a vehicle is at the conflict point `late` s after a cruising ego."""
+        at = crossings()[approach, route]
+        return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
+
+    turning = between("turning_speed", p.turning_speed_mps)
+    turner_arc = timed("oncoming", "left", turning, offset if danger == "oncoming" else 0.0)
+    others: dict[str, tuple[Kind, str, str, float, float]] = {}
+    if danger in ("left", "right"):
+        speed = between("crossing_speed", p.crossing_speed_mps)
+        others["danger"] = ("car", danger, "straight", timed(danger, "straight", speed, offset), speed)
+    if danger == "oncoming":
+        others["danger"] = ("car", "oncoming", "left", turner_arc, turning)
+    if danger == "oncoming" or draw("truck") < p.truck_share:
+        # A crossing danger would meet a truck that is early: there it comes far enough behind.
+        behind = 45.0 if danger in ("left", "right") else 0.0
+        others["truck"] = ("truck", "oncoming", "straight", turner_arc + 10.5 - behind, turning)
+    if draw("late") < p.late_share:
+        arm = ("left", "right")[int(draw("late_arm") < 0.5)]
+        speed = between("late_speed", p.late_speed_mps)
+        arc = timed(arm, "straight", speed, between("late_offset", p.late_offset_s))
+        others["late"] = ("car", arm, "straight", arc, speed)
+
+    spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
+    for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
+        arc = paths()[approach, "straight"].junction_m[1]
+        arc += between(f"helper_start_{exit_name}", p.helper_start_m)
+        if exit_name == "ahead":
+            arc += 4.0  # stays clear of the ego that follows it out of the junction
+        speed = between(f"helper_speed_{exit_name}", p.helper_speed_mps)
+        spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
+
+    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
+    numbers = luck.generator(NAME, seed, "ids").permutation(3)
+    roles = ("danger", "truck", "late")
+    ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
+    for name in sorted(others, key=ids.__getitem__):
+        kind, approach, route, arc, speed = others[name]
+        spawns.append(Spawn(ids[name], kind, "other", approach, route, arc, speed))
+
+    buildings = []
+    for n, (east, south) in enumerate(((-1, 1), (1, 1), (-1, -1), (1, -1))):
+        xs = sorted((east * between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
+        ys = sorted((south * between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
+        buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
+    return Layout(tuple(spawns), tuple(buildings), danger, ids["danger"] if danger else None)

@@ -1,0 +1,253 @@
+"""The occluded intersection inside highway-env: its vehicles and its environment. The only importer.
+
+Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits.
+
+What highway-env computes in every frame is computed here to the same last bit for less: its own NumPy
+functions in its own order, with Python's comparisons in place of `np.clip` and `np.linalg.norm`, whose calls
+cost more than all of its arithmetic. A test drives both side by side.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from highway_env import utils
+from highway_env.envs.intersection_env import IntersectionEnv
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+from harness.world.road import APPROACHES, Path, paths
+from harness.world.scenarios.occluded_intersection import Layout, Parameters, Spawn, layout
+from harness.world.state import SIZES_M, VehicleState
+
+NODES = {approach: n for n, approach in enumerate(APPROACHES)}
+
+
+NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highway-env finds no collision
+
+
+FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
+
+
+class _Road(Road):  # type: ignore[misc]
+    """Looks closer only at vehicles that are near enough to touch within the frame."""
+
+    def step(self, dt: float) -> None:
+        """`Road.step`; the scenario has no objects that are no vehicles."""
+        for vehicle in self.vehicles:
+            vehicle.step(dt)
+        placed = [(v, *v.position.tolist(), v.diagonal / 2) for v in self.vehicles]
+        for (v, x, y, reach), (other, other_x, other_y, other_reach) in combinations(placed, 2):
+            within = reach + other_reach + v.speed * dt + NEAR_M
+            dx, dy = other_x - x, other_y - y
+            if dx * dx + dy * dy < within * within and not _apart(v, other, dx, dy, dt):
+                v.handle_collisions(other, dt)
+
+
+def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> bool:
+    """Whether an axis of either vehicle keeps their outlines farther apart than both can move in `dt`."""
+    (cos, sin), (other_cos, other_sin) = v.direction.tolist(), other.direction.tolist()
+    dot, cross = abs(cos * other_cos + sin * other_sin), abs(cos * other_sin - sin * other_cos)
+    moves = (abs(v.speed) + abs(other.speed)) * dt + NEAR_M
+    for a, b, c, s in ((v, other, cos, sin), (other, v, other_cos, other_sin)):
+        along = abs(dx_m * c + dy_m * s) - (a.LENGTH + b.LENGTH * dot + b.WIDTH * cross) / 2
+        across = abs(dy_m * c - dx_m * s) - (a.WIDTH + b.LENGTH * cross + b.WIDTH * dot) / 2
+        if along > moves or across > moves:
+            return True
+    return False
+
+
+class _OnRoute:
+    """A vehicle knows its lane from its route; highway-env's search over all lanes is not needed."""
+
+    spawn: Spawn
+    towards: tuple[float, Any] = (np.nan, None)  # a heading and its direction
+
+    def on_state_update(self: Any) -> None:
+        self.lane_index = self.target_lane_index
+        self.lane = self.road.network.get_lane(self.lane_index)
+
+    def act(self: Any, action: str | None = None) -> None:
+        """Steer and keep the target speed; a meta-action is highway-env's own affair."""
+        if action is not None:
+            super().act(action)  # type: ignore[misc]
+            return
+        lane = self.road.network.get_lane(self.target_lane_index)
+        along, lateral = lane.local_coordinates(self.position)
+        if along > lane.length - lane.VEHICLE_LENGTH / 2:
+            self.follow_road()
+            lane = self.road.network.get_lane(self.target_lane_index)
+            along, lateral = lane.local_coordinates(self.position)
+        self.action = {
+            "steering": self._steering(lane, along, lateral),
+            "acceleration": self.speed_control(self.target_speed),
+        }
+
+    def _steering(self: Any, lane: Any, along: float, lateral: float) -> float:
+        """`ControlledVehicle.steering_control`, where the vehicle's place in its lane is known."""
+        speed = utils.not_zero(self.speed)
+        ahead = lane.heading_at(along + self.speed * self.TAU_PURSUIT)
+        turn = -self.KP_LATERAL * lateral / speed
+        if turn:  # the functions of 0 are 0
+            turn = _within(np.pi / 4, np.arcsin(_within(1.0, turn)))
+        rate = self.KP_HEADING * utils.wrap_to_pi(ahead + turn - self.heading)
+        slip = self.LENGTH / 2 / speed * rate
+        if slip:
+            slip = np.arctan(2 * np.tan(np.arcsin(_within(1.0, slip))))
+        return float(_within(self.MAX_STEERING_ANGLE, slip))
+
+    def step(self: Any, dt: float) -> None:
+        """`Vehicle.step`, which most vehicles take straight on and in the direction of the frame before."""
+        if self.action["steering"] or self.impact is not None or self.crashed or abs(self.speed) > FAST_MPS:
+            super().step(dt)  # type: ignore[misc]
+            return
+        if self.heading != self.towards[0]:
+            self.towards = self.heading, self.direction
+        self.position += self.speed * self.towards[1] * dt
+        self.speed += self.action["acceleration"] * dt
+        self.on_state_update()
+
+
+def _within(limit: float, value: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
+    """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane."""
+
+    braking_mps2 = 4.0
+    standoff_m = 2.0
+
+    def speed_control(self, target_speed: float) -> float:
+        """Acceleration in m/s²: brakes once the room left calls for its braking; never speeds up."""
+        for other in self.road.vehicles:
+            if other.lane_index == self.lane_index and self.speed > other.speed:
+                ahead = float(np.dot(other.position - self.position, self.direction))
+                room = ahead - (self.LENGTH + other.LENGTH) / 2 - self.standoff_m
+                if ahead > 0 and (self.speed - other.speed) ** 2 > 2 * self.braking_mps2 * room:
+                    return -2 * self.braking_mps2
+        return 0.0
+
+
+class Truck(Traffic):
+    """Long and wide enough to hide a car behind it."""
+
+    LENGTH, WIDTH = SIZES_M["truck"]
+
+
+class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
+    """Follows a target speed within physical limits (highway-env's own controller brakes without bound)."""
+
+    limits_mps2 = (-8.0, 3.0)
+
+    def speed_control(self, target_speed: float) -> float:
+        """Acceleration in m/s²."""
+        least, most = self.limits_mps2
+        return float(min(max(super().speed_control(target_speed), least), most))
+
+
+class OccludedIntersectionEnv(IntersectionEnv):  # type: ignore[misc]
+    """highway-env's intersection with the scenario's vehicles, and no rule that makes anyone yield."""
+
+    parameters = Parameters()
+    layout: Layout
+    road: Road
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """IntersectionEnv's configuration with the scenario's speeds and frequencies."""
+        p = cls.parameters
+        config: dict[str, Any] = super().default_config()
+        utils.update_config(
+            config,
+            {
+                "action": {
+                    "type": "DiscreteMetaAction",
+                    "longitudinal": True,
+                    "lateral": False,
+                    "target_speeds": list(p.target_speeds_mps),
+                },
+                "simulation_frequency": p.simulation_hz,
+                "policy_frequency": round(1 / p.decision_period_s),
+                "duration": p.time_limit_s,
+                "spawn_probability": 0.0,
+                "scaling": 4.0,
+                "episode_seed": 0,
+            },
+        )
+        config["observation"] = {"type": "AttributesObservation", "attributes": []}  # nobody looks at it
+        return config
+
+    def _make_road(self) -> None:
+        self.road = _Road(network=network(), np_random=self.np_random)
+
+    def _make_vehicles(self, n_vehicles: int = 0) -> None:
+        p = self.parameters
+        self.layout = layout(self.config["episode_seed"], p)
+        for spawn in self.layout.spawns:
+            self.road.vehicles.append(_spawned(self.road, spawn, p))
+        self.controlled_vehicles = self.road.vehicles[:1]
+
+
+@lru_cache(maxsize=1)
+def network() -> RoadNetwork:
+    """highway-env's intersection. Every episode's is the same one, and nobody writes to it."""
+    env = OccludedIntersectionEnv.__new__(OccludedIntersectionEnv)
+    env.config = OccludedIntersectionEnv.default_config()
+    IntersectionEnv._make_road(env)
+    return env.road.network
+
+
+def _spawned(road: Road, spawn: Spawn, p: Parameters) -> ControlledVehicle:
+    path = paths()[spawn.approach, spawn.route]
+    section = int(np.searchsorted(path.junction_m, spawn.arc_m, side="right"))
+    lane = road.network.get_lane(_lanes(path)[section])
+    arc_in_lane = spawn.arc_m - (0.0, *path.junction_m)[section]
+    return vehicle_on(road, spawn, p, section, lane.position(arc_in_lane, 0.0), lane.heading_at(arc_in_lane))
+
+
+def vehicle_on(
+    road: Road, spawn: Spawn, p: Parameters, section: int, position: Sequence[float], heading: float
+) -> ControlledVehicle:
+    """A vehicle on the given section of its route: approach, junction or exit."""
+    route = _lanes(paths()[spawn.approach, spawn.route])
+    arguments = {
+        "heading": heading,
+        "speed": spawn.speed_mps,
+        "target_lane_index": route[section],
+        "route": route,
+    }
+    vehicle: ControlledVehicle
+    if spawn.part == "ego":
+        vehicle = Ego(None, position, target_speeds=p.target_speeds_mps, **arguments)
+        vehicle.limits_mps2 = (-p.braking_mps2, p.acceleration_mps2)
+    else:
+        vehicle = (Truck if spawn.kind == "truck" else Traffic)(None, position, **arguments)
+    vehicle.road = road  # only now: a vehicle that is made on a road first searches all of its lanes
+    vehicle.spawn = spawn
+    vehicle.on_state_update()
+    return vehicle
+
+
+def spawn_of(v: VehicleState) -> Spawn:
+    """A vehicle in the midst of an episode, as if it began there."""
+    arc = paths()[v.approach, v.route].project(v.x_m, v.y_m)[0]
+    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps)
+
+
+def _lanes(path: Path) -> list[tuple[str, str, int]]:
+    start = NODES[path.approach]
+    end = (start + (2 if path.route == "straight" else 1)) % 4
+    return [(f"o{start}", f"ir{start}", 0), (f"ir{start}", f"il{end}", 0), (f"il{end}", f"o{end}", 0)]
+
+
+def state_of(v: ControlledVehicle) -> VehicleState:
+    """A vehicle as the rest of the program knows it."""
+    s = v.spawn
+    return VehicleState(
+        s.id, s.kind, s.part, float(v.position[0]), float(v.position[1]), float(v.heading), float(v.speed),
+        s.approach, s.route, bool(v.crashed),
+    )  # fmt: skip

@@ -1,0 +1,147 @@
+"""The nouns of a scene: vehicles, buildings, and the state of the whole world at one moment."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.core.arrays import Floats
+
+Kind = Literal["car", "truck"]
+Part = Literal["ego", "helper", "other"]
+
+SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "truck": (10.0, 2.6)}  # length, width
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """One vehicle at one moment, in the frame of `harness.world.road`.
+
+    Attributes:
+        id: `v1`, `v2`, … by spawn order; the ego is `v1`.
+        kind: what it looks like; fixes its size.
+        part: `ego`, `helper` (takes part in cooperation) or `other`.
+        x_m: position of the centre, m to the east.
+        y_m: position of the centre, m to the south.
+        heading_rad: from +x towards +y.
+        speed_mps: speed along the heading.
+        approach: arm it started on.
+        route: `straight` or `left`.
+        crashed: whether it has collided.
+    """
+
+    id: str
+    kind: Kind
+    part: Part
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    approach: str
+    route: str
+    crashed: bool = False
+
+    @property
+    def length_m(self) -> float:
+        """Bumper to bumper."""
+        return SIZES_M[self.kind][0]
+
+    @property
+    def width_m(self) -> float:
+        """Side to side."""
+        return SIZES_M[self.kind][1]
+
+    def corners(self) -> NDArray[np.float64]:
+        """(4, 2) m, front left first, then clockwise as seen from above. Shared: not to be written to."""
+        return _corners(self)
+
+
+@lru_cache(maxsize=256)  # every viewer of a scene looks at the same vehicles
+def _corners(v: VehicleState) -> Floats:
+    return rectangle(v.x_m, v.y_m, v.heading_rad, v.length_m, v.width_m)
+
+
+def rectangle(
+    x_m: float | Floats,
+    y_m: float | Floats,
+    heading_rad: float | Floats,
+    length_m: float | Floats,
+    width_m: float | Floats,
+) -> Floats:
+    """(..., 4, 2) m corners of rectangles (...): front left first, then clockwise as seen from above."""
+    cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
+    along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
+    right = np.multiply.outer(width_m, [-1.0, 1.0, 1.0, -1.0]) / 2
+    x, y = np.asarray(x_m)[..., None], np.asarray(y_m)[..., None]
+    return np.stack([x + along * cos - right * sin, y + along * sin + right * cos], axis=-1)
+
+
+@dataclass(frozen=True)
+class Building:
+    """An axis-parallel box that blocks sight; its walls in metres."""
+
+    id: str
+    west_m: float
+    north_m: float
+    east_m: float
+    south_m: float
+
+    def corners(self) -> NDArray[np.float64]:
+        """(4, 2) m, north-west first, then clockwise as seen from above."""
+        w, n, e, s = self.west_m, self.north_m, self.east_m, self.south_m
+        return np.array([[w, n], [e, n], [e, s], [w, s]])
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """Everything that is there, seen or not.
+
+    Attributes:
+        scenario: name of the scenario.
+        episode_seed: seed of the episode's layout.
+        step: index of the decision about to be taken; equals the number of actions taken so far.
+        time_s: simulated time since the start of the episode.
+        target_speed_mps: what the ego's speed controller aims at.
+        vehicles: in spawn order, the ego first.
+        buildings: what stands at the corners.
+    """
+
+    scenario: str
+    episode_seed: int
+    step: int
+    time_s: float
+    target_speed_mps: float
+    vehicles: tuple[VehicleState, ...]
+    buildings: tuple[Building, ...]
+
+    @property
+    def ego(self) -> VehicleState:
+        """The vehicle whose decision it is."""
+        return self.vehicles[0]
+
+    @property
+    def helpers(self) -> tuple[VehicleState, ...]:
+        """Vehicles that may be asked, in spawn order."""
+        return tuple(v for v in self.vehicles if v.part == "helper")
+
+    def vehicle(self, vehicle_id: str) -> VehicleState:
+        """The vehicle of that id. Raises KeyError."""
+        for v in self.vehicles:
+            if v.id == vehicle_id:
+                return v
+        raise KeyError(vehicle_id)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "WorldState":
+        """Inverse of `to_dict`."""
+        fields = dict(data)
+        fields["vehicles"] = tuple(VehicleState(**v) for v in data["vehicles"])
+        fields["buildings"] = tuple(Building(**b) for b in data["buildings"])
+        return cls(**fields)

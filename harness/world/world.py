@@ -1,0 +1,198 @@
+"""The live world: one episode in the simulator, from its start to its outcome.
+
+Frames are stepped here rather than by `env.step`, so that an episode ends in the frame in which it is
+decided.
+"""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import shapely
+
+from harness.core.arrays import Floats
+from harness.world.outcome import Outcome, fault, outline, striker
+from harness.world.road import JUNCTION_M
+from harness.world.scenarios.occluded_intersection import NAME as NAME
+from harness.world.simulator import OccludedIntersectionEnv, spawn_of, state_of, vehicle_on
+from harness.world.state import WorldState, rectangle
+
+Snapshot = Mapping[str, Any]
+HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
+
+
+@dataclass
+class World:
+    """One live episode.
+
+    Attributes:
+        env: the highway-env environment.
+        seed: seed of the episode's layout.
+        step: decisions taken so far.
+        frame: frames simulated so far.
+        outcome: what has happened so far; its `ended` says whether the episode is decided.
+        hard_brakings: how often the ego has begun to brake harder than HARD_BRAKING_MPS2.
+        braking_hard: whether it did so in the last frame.
+    """
+
+    env: OccludedIntersectionEnv
+    seed: int
+    step: int = 0
+    frame: int = 0
+    outcome: Outcome = field(default_factory=Outcome)
+    hard_brakings: int = 0
+    braking_hard: bool = False
+
+    @classmethod
+    def start(cls, seed: int) -> "World":
+        """The first moment of an episode."""
+        env = OccludedIntersectionEnv(config={"episode_seed": seed})
+        return cls(env, seed)
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions by name, in the environment's order."""
+        return tuple(self.env.action_type.actions[n] for n in sorted(self.env.action_type.actions))
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time, counted in frames (highway-env's own clock drifts)."""
+        return self.frame / self.env.parameters.simulation_hz
+
+    def branch(self) -> "World":
+        """A copy that goes its own way."""
+        shared = (self.env.road.network, self.env.layout)  # nobody writes to them
+        return copy.deepcopy(self, {id(thing): thing for thing in shared})
+
+    def snapshot(self) -> Snapshot:
+        """What `thaw` needs besides `state()` to go on exactly as this world would."""
+        vehicles = self.env.road.vehicles
+        sections = [v.route.index(v.target_lane_index) for v in vehicles]
+        return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
+
+    @classmethod
+    def thaw(cls, state: WorldState, snapshot: Snapshot) -> "World":
+        """The world that `state` and `snapshot` were taken from, before its episode was decided."""
+        env = OccludedIntersectionEnv(config={"episode_seed": state.episode_seed})
+        vehicles = []
+        for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
+            vehicle = vehicle_on(
+                env.road, spawn_of(v), env.parameters, section, (v.x_m, v.y_m), v.heading_rad
+            )
+            vehicle.crashed = v.crashed
+            vehicles.append(vehicle)
+        ego = vehicles[0]
+        ego.speed_index = snapshot["speed_index"]
+        ego.target_speed = ego.index_to_speed(ego.speed_index)
+        env.layout = replace(env.layout, buildings=state.buildings)
+        env.road.vehicles = vehicles
+        env.controlled_vehicles = vehicles[:1]
+        env.define_spaces()  # binds the action type to the ego
+        if snapshot["frame"]:
+            # What touches is pushed apart in the next frame: highway-env's last act in every frame.
+            for n, vehicle in enumerate(vehicles):
+                for other in vehicles[n + 1 :]:
+                    vehicle.handle_collisions(other, 1 / env.parameters.simulation_hz)
+        return cls(env, state.episode_seed, state.step, snapshot["frame"])
+
+    def state(self) -> WorldState:
+        """What is where, now."""
+        layout = self.env.layout
+        ego = self.env.road.vehicles[0]
+        return WorldState(
+            NAME, self.seed, self.step, self.time_s, float(ego.target_speed),
+            tuple(state_of(v) for v in self.env.road.vehicles), layout.buildings,
+        )  # fmt: skip
+
+    def act(self, action: str) -> None:
+        """Take a decision by name and live through the time until the next one is due.
+
+        After the scenario's last decision the action is held until the episode is decided.
+        """
+        p = self.env.parameters
+        self.take(action)
+        self.step += 1
+        last = self.step >= p.decisions
+        until_s = p.time_limit_s if last else self.step * p.decision_period_s
+        self.advance(round(until_s * p.simulation_hz))
+
+    def take(self, action: str) -> None:
+        """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
+        self.env.action_type.act(self.env.action_type.actions_indexes[action])
+
+    @property
+    def speed_index(self) -> int:
+        """Which of the scenario's target speeds the ego aims at."""
+        return int(self.env.road.vehicles[0].speed_index)
+
+    def speed_index_after(self, action: str) -> int:
+        """Which target speed the ego would aim at if it took an action now."""
+        ego = self.env.road.vehicles[0]
+        kept = dict(vars(ego))
+        self.take(action)
+        found = self.speed_index
+        vars(ego).update(kept)
+        return found
+
+    def advance(self, until_frame: int) -> None:
+        """Live on until so many frames are simulated or the episode is decided."""
+        vehicles = self.env.road.vehicles
+        poses, speeds = [], [float(vehicles[0].speed)]
+        while self.frame < until_frame and not self.outcome.ended:
+            self._step()
+            poses.append([(*v.position.tolist(), float(v.heading)) for v in vehicles])
+            speeds.append(float(vehicles[0].speed))
+        if poses:
+            least_m = least_gap_m(np.array(poses), vehicles, self.outcome.least_gap_m)
+            self.outcome = replace(self.outcome, least_gap_m=least_m)
+            hard = -np.diff(speeds) * self.env.parameters.simulation_hz > HARD_BRAKING_MPS2
+            self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
+            self.braking_hard = bool(hard[-1])
+
+    def _step(self) -> None:
+        p, road = self.env.parameters, self.env.road
+        standing = {v.spawn.id for v in road.vehicles if v.crashed}
+        road.act()
+        road.step(1 / p.simulation_hz)
+        self.frame += 1
+        ego, others = road.vehicles[0], road.vehicles[1:]
+        crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
+        if ego.crashed:
+            mine = state_of(ego)
+            partner = min(map(state_of, others), key=lambda v: float(outline(mine).distance(outline(v))))
+            crashed.discard(partner.id)
+            how = {"partner": partner.id, "striker": striker(mine, partner), "fault": fault(mine, partner)}
+            self.outcome = self.outcome.ending("collision", self.time_s, **how)
+        elif not ego.on_road:
+            self.outcome = self.outcome.ending("off_road", self.time_s)
+        elif JUNCTION_M + p.cleared_m <= -ego.position[1]:
+            self.outcome = self.outcome.ending("cleared", self.time_s)
+        elif self.frame >= round(p.time_limit_s * p.simulation_hz):
+            self.outcome = self.outcome.ending("time_out", self.time_s)
+        if crashed:
+            self.outcome = replace(self.outcome, other_crashes=self.outcome.other_crashes + len(crashed))
+
+
+def least_gap_m(poses: Floats, vehicles: Sequence[Any], least_m: float) -> float:
+    """The smaller of `least_m` and the least gap between the ego's outline and another's.
+
+    Args:
+        poses: (frames, vehicles, 3), x, y and heading; the ego first.
+        vehicles: whose poses they are.
+        least_m: the least gap before these frames.
+    """
+    sizes = np.array([(v.LENGTH, v.WIDTH) for v in vehicles])
+    centres_m = np.hypot(*np.moveaxis(poses[:, 1:, :2] - poses[:, :1, :2], -1, 0))
+    # Two centres are at least both half widths apart from touching, and at most both half diagonals.
+    farthest_m = np.hypot(*sizes.T)
+    most_m = centres_m - (sizes[0, 1] + sizes[1:, 1]) / 2
+    close = centres_m - (farthest_m[0] + farthest_m[1:]) / 2 <= min(
+        least_m, float(most_m.min(initial=np.inf))
+    )
+    frames, others = np.nonzero(close)
+    mine = rectangle(*poses[frames, 0].T, *sizes[:1].T)
+    its = rectangle(*poses[frames, 1 + others].T, *sizes[1 + others].T)
+    gaps_m = shapely.distance(shapely.polygons(mine), shapely.polygons(its))
+    return min(least_m, float(gaps_m.min(initial=np.inf)))
