@@ -1,0 +1,146 @@
+"""All that the golden runs know of the program: how a command is typed, and how a run's folder is read.
+
+What comes out has a form of its own, so that the goldens outlive every module's name and the folder's format:
+only this file is mended when those change. A table is a list of rows, a row a mapping of columns to text.
+"""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.cli import main
+
+Row = dict[str, str]
+Table = list[Row]
+
+# How a run came by its answers is not what it says: seconds are the machine's, batches the engine's.
+NOT_HELD = ("seconds", "batch_size")
+SETTINGS = (
+    "actions", "conditions", "seeds", "answer", "thinking", "latency", "delay_allowance_s", "late_against",
+    "engine_errors",
+)  # fmt: skip
+
+
+def typed(*arguments: str | Path) -> None:
+    """The command as typed, in the current folder. Raises AssertionError unless it ends well."""
+    command = ["harness", *map(str, arguments)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert not ended.value.code, f"`{' '.join(command)}` ended with {ended.value.code}"
+
+
+def tables_of(run: Path) -> dict[str, Table]:
+    """What a finished run holds beside its `summary.csv` and `episodes.csv`, each table in the order of keys.
+
+    Returns:
+        `settings`: name, value, of the manifest's that decide or count something.
+        `scenes`: a decision point, under a name of our own (`_numbered`); of a frozen run also what each
+            action would lead to.
+        `answers`: an answer, with what was read in it; its `id` is viewer, or ego and who was heard.
+        `decisions`: a decision point, condition and seed.
+        `messages`: the same and a helper that was asked.
+    """
+    manifest = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    lines = (run / "rows.jsonl").read_text(encoding="utf-8").splitlines()
+    scenes = _numbered(map(json.loads, lines))
+    actions = manifest["actions"]
+    held = {name: manifest[name] for name in SETTINGS if name in manifest}
+    return {
+        "settings": [{"name": name, "value": text(value)} for name, value in _flat(held, "")],
+        "scenes": [_cells(_scene(scene, actions)) for scene in scenes],
+        "answers": [_cells(row) for scene in scenes for row in _answers(scene, actions)],
+        "decisions": [_cells(_decision(scene, made, actions)) for scene, made in _made(scenes)],
+        "messages": [
+            _cells({**_key(scene, made), **message})
+            for scene, made in _made(scenes)
+            for message in sorted(made["messages"], key=lambda message: message["from"])
+        ],
+    }
+
+
+def text(value: Any) -> str:
+    """A cell: nothing where nothing is known, JSON for what has parts."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+
+
+def _numbered(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Decision points in order, each named by episode, step and a number.
+
+    The number tells apart the worlds into which an episode's conditions and seeds have parted, in the order
+    of the first condition and seed in each, whatever the program calls them.
+    """
+
+    def place(scene: Mapping[str, Any]) -> tuple[Any, ...]:
+        return scene["episode"], scene["step"], min((m["condition"], m["seed"]) for m in scene["decisions"])
+
+    counts: Counter[tuple[int, int]] = Counter()
+    named = []
+    for scene in sorted(scenes, key=place):
+        at = scene["episode"], scene["step"]
+        named.append({**scene, "scene": f"{at[0]}/{at[1]}/{counts[at]}"})
+        counts[at] += 1
+    return named
+
+
+def _cells(row: Mapping[str, Any]) -> Row:
+    return {name: text(value) for name, value in row.items()}
+
+
+def _flat(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Leaves of a nested value, each with its path; a list of plain values is a leaf."""
+    parts: Any = None
+    if isinstance(value, dict):
+        parts = value.items()
+    elif isinstance(value, list) and any(isinstance(part, dict) for part in value):
+        parts = enumerate(value)
+    if parts is None:
+        yield name, value
+        return
+    for key, part in parts:
+        yield from _flat(part, f"{name}.{key}" if name else str(key))
+
+
+def _by_action(name: str, values: Any, actions: list[str]) -> dict[str, Any]:
+    """A column an action; empty where there are no values."""
+    return {f"{name}.{a}": v for a, v in zip(actions, values or [None] * len(actions), strict=True)}
+
+
+def _scene(scene: Mapping[str, Any], actions: list[str]) -> dict[str, Any]:
+    row = {name: scene[name] for name in ("scene", "episode", "step", "danger")}
+    for name in ("safe", "delay_s"):
+        if name in scene:
+            row |= _by_action(name, scene[name], actions)
+    return row
+
+
+def _answers(scene: Mapping[str, Any], actions: list[str]) -> Iterator[dict[str, Any]]:
+    said = {**scene["answers"], **scene.get("merged", {})}
+    for who, answer in sorted(said.items()):
+        held = {name: value for name, value in sorted(answer.items()) if name not in (*NOT_HELD, "intent")}
+        intent = _by_action("intent", answer["intent"], actions)
+        yield {"scene": scene["scene"], "id": who, **intent, **held}
+
+
+def _made(scenes: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    for scene in scenes:
+        for made in sorted(scene["decisions"], key=lambda made: (made["condition"], made["seed"])):
+            yield scene, made
+
+
+def _key(scene: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
+    return {"scene": scene["scene"], "condition": made["condition"], "seed": made["seed"]}
+
+
+def _decision(scene: Mapping[str, Any], made: Mapping[str, Any], actions: list[str]) -> dict[str, Any]:
+    key = _key(scene, made)
+    rest = {n: v for n, v in sorted(made.items()) if n not in (*key, "messages", "fused")}
+    return {**key, **rest, **_by_action("fused", made["fused"], actions)}
