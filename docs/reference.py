@@ -25,7 +25,8 @@ line on stderr and exit code 2.
 
 def pages() -> list[Path]:
     """The documents whose commands are run, in the order in which examples are looked for."""
-    return [DOCS.parent / "README.md", *sorted(page for page in DOCS.rglob("*.md") if page != PAGE)]
+    top = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]
+    return [*top, *sorted(page for page in DOCS.rglob("*.md") if page != PAGE)]
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:

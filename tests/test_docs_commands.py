@@ -59,6 +59,7 @@ OTHER_PROGRAMS = {
     "make": "CI runs it",
     "source": "the tests are in an environment already",
     "pip": "as above",
+    "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
 
