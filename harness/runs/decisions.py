@@ -1,0 +1,187 @@
+"""The table of decisions: a row a decision point, condition and seed. The file `decisions.parquet`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.files import replacing
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LABEL, WHOLE, FLAG, NUMBER = pa.dictionary(pa.int32(), pa.string()), pa.int64(), pa.bool_(), pa.float64()
+# Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
+COLUMNS = {
+    "scene": LABEL, "episode": WHOLE, "step": WHOLE, "danger": LABEL, "condition": LABEL, "seed": WHOLE,
+    "action": LABEL, "messages": WHOLE, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
+    "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
+    "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
+    "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
+}  # fmt: skip
+# A column an action: the policy, and what each action would lead to.
+OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
+# A column a message's place, from 1: who was asked, and what became of the reply.
+OF_MESSAGES = {"helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER}
+DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
+    "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
+    "arrival_ms": 3, "weight": 6,
+}  # fmt: skip
+
+
+def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
+    """Names and types of the columns, in the order of the file."""
+    return pa.schema([
+        *COLUMNS.items(),
+        *((f"{name}_{action}", kind) for name, kind in OF_ACTIONS.items() for action in actions),
+        *((f"{name}_{n}", kind) for n in range(1, helpers + 1) for name, kind in OF_MESSAGES.items()),
+    ])  # fmt: skip
+
+
+def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
+    """Columns of values (n, A)."""
+    return {f"{name}_{action}": values[:, place] for place, action in enumerate(actions)}
+
+
+def by_message(name: str, values: Any) -> dict[str, Any]:
+    """Columns of values (n, H)."""
+    return {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Names (n,), each kept once: `names[code]`, none where a code is negative."""
+
+    codes: Ints
+    names: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Decisions as columns (n,).
+
+    Attributes:
+        table: the columns of `schema`.
+        actions: meta-actions, in the order of every distribution.
+        helpers: most helpers that a decision point has.
+    """
+
+    table: pa.Table
+    actions: tuple[str, ...]
+    helpers: int
+    _arrays: dict[str, Floats] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
+        """From arrays and `Labels` (n,) by name; a column that is not given is unknown."""
+        n = len(columns["seed"])
+        arrays = {
+            one.name: _array(columns[one.name], one.type) if one.name in columns else pa.nulls(n, one.type)
+            for one in schema(actions, helpers)
+        }
+        return cls(pa.table(arrays), tuple(actions), helpers)
+
+    @classmethod
+    def concat(cls, parts: Sequence["Decisions"]) -> "Decisions":
+        """Decisions of the same actions, one after the other."""
+        actions, helpers = parts[0].actions, max(part.helpers for part in parts)
+        tables = pa.concat_tables([part.table for part in parts], promote_options="default")
+        return cls(tables.select(schema(actions, helpers).names).unify_dictionaries(), actions, helpers)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Numbers or flags (n,) as floats; NaN where unknown."""
+        if name not in self._arrays:
+            column = self.table[name].cast(NUMBER).combine_chunks()
+            self._arrays[name] = column.to_numpy(zero_copy_only=False)
+        return self._arrays[name]
+
+    def whole(self, name: str) -> Ints:
+        """Whole numbers (n,)."""
+        return cast(Ints, self.table[name].to_numpy())
+
+    def flags(self, name: str) -> Bools:
+        """Whether it is known to be so, (n,)."""
+        return self[name] == 1.0
+
+    def of_actions(self, name: str) -> Floats:
+        """A distribution, or what each action would lead to: (n, A)."""
+        return np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
+
+    def of_messages(self, name: str) -> Floats:
+        """Numbers or flags of messages, (n, H); NaN where nobody was asked."""
+        columns = [self[f"{name}_{place}"] for place in range(1, self.helpers + 1)]
+        return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
+
+    def codes(self, name: str, names: Sequence[str]) -> Ints:
+        """Position of each label among `names`, (n,); -1 where there is none. ValueError for any other."""
+        column = self.table[name].combine_chunks()
+        position = {label: place for place, label in enumerate(names)}
+        own = column.dictionary.to_pylist()
+        if others := [label for label in own if label not in position]:
+            raise ValueError(f"{name} {others[0]!r}")
+        lookup = np.array([*(position[label] for label in own), -1])
+        return cast(Ints, lookup[column.indices.fill_null(len(own)).to_numpy(zero_copy_only=False)])
+
+    def labels(self, name: str) -> list[str | None]:
+        """Labels (n,)."""
+        return cast("list[str | None]", self.table[name].to_pylist())
+
+    def take(self, which: Any) -> "Decisions":
+        """Some of the decisions, by their positions."""
+        return Decisions(self.table.take(pa.array(which)), self.actions, self.helpers)
+
+    def replace(self, **columns: Any) -> "Decisions":
+        """The same with other arrays (n,) in some columns."""
+        table = self.table
+        for name, values in columns.items():
+            place = table.schema.get_field_index(name)
+            table = table.set_column(place, name, _array(values, table.schema.field(name).type))
+        return Decisions(table, self.actions, self.helpers)
+
+    def rounded(self) -> "Decisions":
+        """With the decimals that are kept."""
+        decimals = {
+            column: kept
+            for name, kept in DECIMALS.items()
+            for column in self.table.column_names
+            if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
+        }
+        return self.replace(**{column: self[column].round(kept) for column, kept in decimals.items()})
+
+    def write(self, path: Path) -> None:
+        """Replace a Parquet file."""
+        with replacing(path) as part:
+            pq.write_table(self.table, part, compression="zstd")
+
+    @classmethod
+    def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
+        """Read a Parquet file. Raises OSError or ValueError if it is none, or has not a run's columns."""
+        table = pq.read_table(path)
+        helpers = sum(name.startswith("helper_") for name in table.column_names)
+        wanted = schema(actions, helpers)
+        if missing := [name for name in wanted.names if name not in table.column_names]:
+            raise ValueError(f"it lacks {', '.join(missing)}")
+        return cls(table.select(wanted.names).cast(wanted).unify_dictionaries(), tuple(actions), helpers)
+
+    def frame(self) -> "pd.DataFrame":
+        """For pandas: names are categories, and what is true, false or unknown stays so."""
+        import pandas as pd
+
+        return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
+
+
+def _array(values: Any, kind: pa.DataType) -> pa.Array:
+    if isinstance(values, Labels):
+        codes = pa.array(values.codes.astype(np.int32), mask=values.codes < 0)
+        return pa.DictionaryArray.from_arrays(codes, pa.array(list(values.names), pa.string()))
+    if kind == FLAG and values.dtype != bool:
+        return pa.array(values == 1.0, mask=np.isnan(values))
+    return pa.array(np.ascontiguousarray(values), kind, from_pandas=kind == NUMBER)
