@@ -11,9 +11,8 @@ from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.evaluate.evaluate import Evaluated
-    from harness.evaluate.live_spec import Drive
-    from harness.evaluate.spec import Latency
+    from harness.evaluate.run import Evaluated
+    from harness.evaluate.spec import Latency, Spec
 
 ALL = "all"
 
@@ -52,11 +51,12 @@ def drive(
     """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
     from harness.backends import cards
     from harness.cli.estimates import in_range
-    from harness.cli.evaluate import parse_seeds
+    from harness.cli.evaluate import default_out, parse_seeds
     from harness.cli.scenario import MOST_WORKERS
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.evaluate.live_spec import spec_of
+    from harness.evaluate.live_world import LiveSource
+    from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
 
     if ALL in condition and len(condition) > 1:
@@ -69,11 +69,12 @@ def drive(
     in_range("--workers", workers, 1, MOST_WORKERS)
     in_range("--save-video", save_video, 0, episodes)
     names = POINTS if condition in ([], [ALL]) else condition
-    spec = spec_of(
-        cards.resolve(model, engine),
-        prompts.load(prompt),
-        tuple(named_point(name) for name in dict.fromkeys(names)),
-        parse_seeds(seeds),
+    spec = Spec(
+        card=cards.resolve(model, engine),
+        prompt=prompts.load(prompt),
+        source=LiveSource(first_seed, episodes),
+        points=tuple(named_point(name) for name in dict.fromkeys(names)),
+        seeds=parse_seeds(seeds),
         thinking=thinking,
         answer=cast("AnswerMode", answer),
         batch_size=batch_size,
@@ -81,10 +82,8 @@ def drive(
         dtype=dtype,
         latency=cast("Latency | None", latency),
         tags=tuple(dict.fromkeys(tag)),
-        first_seed=first_seed,
-        episodes=episodes,
     )
-    _run(spec, out or _default_out(spec, resume), resume, workers, save_video, no_cache, as_json, quiet)
+    _run(spec, out or default_out(spec, resume), resume, workers, save_video, no_cache, as_json, quiet)
 
 
 def _shipped() -> dict[str, Any]:
@@ -94,17 +93,8 @@ def _shipped() -> dict[str, Any]:
     return manifest
 
 
-def _default_out(spec: "Drive", resume: bool) -> Path:
-    from dataclasses import replace
-
-    from harness.cli.evaluate import default_out
-
-    named = replace(spec.dataset, manifest={**spec.dataset.manifest, "name": "drive"})
-    return default_out(replace(spec, dataset=named), resume)
-
-
 def _run(
-    spec: "Drive",
+    spec: "Spec",
     out: Path,
     resume: bool,
     workers: int,
@@ -116,10 +106,12 @@ def _run(
     from harness.backends.cache import default_file
     from harness.cli.evaluate import as_mapping
     from harness.cli.progress import bar
-    from harness.evaluate.drive import run
+    from harness.evaluate.run import evaluate
 
-    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json or quiet) as progress:
-        done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
+    cache = None if no_cache else default_file()
+    episodes = spec.source.episodes
+    with bar(f"driving {printable(spec.card.name, 30)}", episodes, quiet=as_json or quiet) as progress:
+        done = evaluate(spec, out, resume, progress, cache, workers=workers)
     # They draw with matplotlib, which no episode waits for.
     from harness.cli.report import write
     from harness.cli.video import write_failures
@@ -145,18 +137,17 @@ def _table(done: "Evaluated") -> None:
     from harness.cli.estimates import interval, tell_answers
 
     console = Console(width=80, markup=False, highlight=False)
-    rows = done.summary[done.summary.interval != "seed means"]
-    figures: dict[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
+    figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
     table = Table(box=None, width=80, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("condition", overflow="fold")
     for heading in ("success % [95 % CI]", "crash", "late", "latency", "missed", "gap", "clear"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for point in done.manifest["conditions"]:
+    for point in done.manifest.conditions:
         name = point["name"]
 
         def cell(metric: str, scale: float = 1.0, unit: str = "", name: str = name) -> str:
             value = figures[name, metric].value
-            return "-" if value != value else f"{value * scale:.1f}{unit}"
+            return "-" if value is None else f"{value * scale:.1f}{unit}"
 
         success = figures[name, "success_rate"]
         table.add_row(
@@ -171,13 +162,13 @@ def _table(done: "Evaluated") -> None:
         )
     m = done.manifest
     console.print(
-        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · driven live"
+        f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · driven live"
     )
     console.print(table)
-    last = m["first_seed"] + m["episodes"] - 1
+    first, n = m.world.first_seed, m.world.episodes
     console.print(
-        f"n = {m['episodes']} episodes (layout seeds {m['first_seed']} to {last}) × "
-        f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
+        f"n = {n} episodes (layout seeds {first} to {first + n - 1}) × "
+        f"{len(m.seeds)} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
         "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means"
     )
     tell_answers(console, m, figures)

@@ -1,11 +1,10 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import typer
 
 from harness.cli.progress import QUIET
@@ -14,7 +13,7 @@ from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.evaluate.evaluate import Evaluated
+    from harness.evaluate.run import Evaluated
     from harness.evaluate.spec import Latency, Spec
 
 MOST_SEEDS = 1000
@@ -57,6 +56,7 @@ def evaluate(
     from harness.backends import cards
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
 
@@ -65,10 +65,9 @@ def evaluate(
     spec = Spec(
         card=cards.resolve(model, engine),
         prompt=prompts.load(prompt),
-        dataset=load.load(load.find(dataset), limit),
+        source=FrozenSource(load.load(load.find(dataset), limit), limit),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
         seeds=parse_seeds(seeds),
-        limit=limit,
         thinking=thinking,
         answer=cast("AnswerMode", answer),
         batch_size=batch_size,
@@ -87,9 +86,10 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, q
     from harness.backends.cache import default_file
     from harness.cli.progress import bar
     from harness.evaluate.asking import request_count
-    from harness.evaluate.evaluate import evaluate as evaluate_run
+    from harness.evaluate.run import evaluate as evaluate_run
 
-    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), as_json or quiet) as progress:
+    count = request_count(spec, spec.source.dataset.scenes)
+    with bar(f"asking {printable(spec.card.name, 30)}", count, as_json or quiet) as progress:
         cache = None if no_cache else default_file()
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
@@ -129,7 +129,7 @@ def default_out(spec: "Spec", resume: bool) -> Path:
     """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
     safe = file_name(spec.card.name)
     mode = "" if spec.answer == "json" else f"-{spec.answer}"
-    base = Path("reports") / f"{safe}-{spec.prompt.version}{mode}-{spec.dataset.name}"
+    base = Path("reports") / f"{safe}-{spec.prompt.version}{mode}-{spec.source.name}"
     found, number = base, 1
     last = base
     while found.exists():
@@ -140,16 +140,13 @@ def default_out(spec: "Spec", resume: bool) -> Path:
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
     """A finished run for machines: its folder and the rows of its summary."""
-    rows = done.summary.to_dict(orient="records")
+    m = done.manifest
+    of_run = {"model": m.model["name"], "prompt": m.prompt["version"], "answer": m.answer}
     return {
         "run": str(done.out),
-        "manifest": done.manifest,
-        "summary": [{k: None if _unknown(v) else v for k, v in row.items()} for row in rows],
+        "manifest": msgspec.to_builtins(m),
+        "summary": [{**of_run, **msgspec.structs.asdict(score)} for score in done.scores],
     }
-
-
-def _unknown(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def _table(done: "Evaluated") -> None:
@@ -159,18 +156,17 @@ def _table(done: "Evaluated") -> None:
     from harness.cli.estimates import interval, tell_answers
 
     console = Console(width=80, markup=False, highlight=False)
-    rows = done.summary[done.summary.interval != "seed means"]
-    figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
+    figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
     table = Table(box=None, width=80, pad_edge=False)
     table.add_column("condition", overflow="fold")
     for heading in ("success % [95 % CI]", "gain, points", "latency", "trigger", "msgs"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for point in done.manifest["conditions"]:
+    for point in done.manifest.conditions:
         name = point["name"]
 
         def cell(metric: str, scale: float = 1.0, ends: bool = False, name: str = name) -> str:
             r = figures.get((name, metric))
-            if r is None or _unknown(r.value):
+            if r is None or r.value is None:
                 return "-"
             return interval(r.value, r.ci_low, r.ci_high, scale) if ends else f"{r.value * scale:.1f}"
 
@@ -184,11 +180,10 @@ def _table(done: "Evaluated") -> None:
         )
     m = done.manifest
     console.print(
-        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · "
-        f"{m['dataset']['name']}"
+        f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {m.world.name}"
     )
     console.print(table)
-    n = m["dataset"]["episodes"]
+    n = m.world.episodes
     console.print(
         f"n = {n} episodes × {len(m['seeds'])} channel seeds; intervals over episodes; msgs an episode;"
     )
@@ -203,7 +198,7 @@ def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -
     count = counter(tokenizer, spec.card)
     sizes: dict[str, list[int]] = {}
     asked = 0
-    for request in requests(spec, spec.dataset.scenes):
+    for request in requests(spec, spec.source.dataset.scenes):
         asked += 1
         if count:
             sizes.setdefault(request.role, []).append(count(request.messages))
@@ -214,7 +209,7 @@ def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -
         )
     if as_json or quiet:
         return
-    scenes = len(spec.dataset.scenes)
+    scenes = len(spec.source.dataset.scenes)
     typer.echo(f"{asked} requests for {scenes} scenes; would score {len(spec.points)} conditions × "
                f"{len(spec.seeds)} seeds; no model was called")  # fmt: skip
     for role, s in stats.items():

@@ -6,19 +6,52 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Protocol, Self, get_args
+
+import msgspec
 
 from harness import __version__
 from harness.backends.base import AnswerMode
 from harness.backends.cards import WEIGHTED, Card, load, names
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
-from harness.dataset.load import Dataset
+from harness.dataset.load import Scene
 from harness.prompts.versions import Prompt
+from harness.runs.metrics import World
+from harness.runs.records import ClosedLoop, FrozenScenes
 
-FORMAT = "swarmdrive-run/1"
 Latency = Literal["card", "measured", "paper"]
 TAG_CHARACTERS = 40
+
+
+class Source(Protocol):
+    """Which world is walked.
+
+    Attributes:
+        kind: what a run's manifest calls it.
+        command: that walks it: `eval` or `drive`.
+    """
+
+    kind: World
+    command: str
+
+    @property
+    def name(self) -> str:
+        """What it is called in the name of a run's folder."""
+        ...
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the environment's order."""
+        ...
+
+    def record(self) -> FrozenScenes | ClosedLoop:
+        """What a run's manifest says of it."""
+        ...
+
+    def options(self) -> list[tuple[str, object]]:
+        """Options of `command` that name it, None for one that is not given."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -28,10 +61,9 @@ class Spec:
     Attributes:
         card: the model.
         prompt: the prompt version.
-        dataset: the scenes, already limited.
+        source: which world is walked.
         points: conditions, each an operating point.
         seeds: seeds of the channel's luck.
-        limit: how many episodes of the dataset were taken; None for all.
         thinking: whether the model is asked to think first.
         answer: how answers are had: free `json`, `constrained` to the schema, or the `readout` of letters.
         batch_size: most requests that go through the engine together.
@@ -43,10 +75,9 @@ class Spec:
 
     card: Card
     prompt: Prompt
-    dataset: Dataset
+    source: Source
     points: tuple[OperatingPoint, ...]
     seeds: tuple[int, ...]
-    limit: int | None = None
     thinking: bool = False
     answer: AnswerMode = "json"
     batch_size: int = 8
@@ -120,38 +151,49 @@ class Spec:
         """This, with the tags that a run was begun with before its own."""
         return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
 
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the environment's order."""
+        return self.source.actions
+
+    @property
+    def ego_alone(self) -> bool:
+        """Whether helpers are not asked, as a driver's are not."""
+        return self.card.engine == "driver"
+
+    def viewers(self, scene: Scene) -> tuple[str, ...]:
+        """Who is asked in a scene, the ego first."""
+        return scene.viewers[:1] if self.ego_alone else scene.viewers
+
     def settings(self) -> dict[str, Any]:
-        """What a resumed run must have in common with the one it continues."""
+        """What a resumed run must have in common with the one it continues, as plain values."""
+        world = msgspec.to_builtins(self.source.record())
         return {
             "model": asdict(self.card),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
-            "dataset": {
-                "name": self.dataset.name, "sha256": self.dataset.sha256, "scenes": len(self.dataset.scenes),
-                "episodes": len({s.record["episode"] for s in self.dataset.scenes}),
-            },
-            "actions": list(self.dataset.actions),
+            "world": world,
+            "actions": list(self.actions),
             "conditions": [asdict(point) for point in self.points],
             "seeds": list(self.seeds),
-            "limit": self.limit,
             "thinking": self.thinking,
             "answer": self.answer,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
             "latency_source": self.latency,
-        }  # fmt: skip
+        }
 
     def command(self, out: Path) -> str:
         """A command line that runs this again, quoted for a shell."""
         options = [
             ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
-            ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
+            *self.source.options(), ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
-            ("--batch-size", self.batch_size),
-            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype),
+            ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
-        return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])
+        command = ["harness", self.source.command, *parts, *(["--thinking"] if self.thinking else [])]
+        return shlex.join(command)
 
 
 def model_argument(card: Card) -> str:

@@ -1,4 +1,4 @@
-"""What runs are measured by: one entry a metric. Values come from the tables of decisions and episodes alone."""
+"""What runs are measured by: one entry a metric, with values from the tables of decisions and episodes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,8 +40,8 @@ class Metric:
     Attributes:
         name: in tables, with its unit at the end.
         meaning: for people.
-        decisions: its values (n,) from those columns; an episode has their mean. None for a metric of episodes.
-        episodes: its values (E,) from those records. None for a metric of decisions.
+        decisions: its values (n,), of which an episode has the mean; None for a metric of episodes.
+        episodes: an episode's value; None for a metric of decisions.
         world: where it is known; None for everywhere.
         yes_or_no: an episode has it or has not.
         closed_loop: what it means in the closed loop, where that differs.
@@ -95,7 +95,7 @@ METRICS = {
               "closed-loop"),
         Metric("time_to_clear_s", "until the ego has cleared the intersection, where it does, late or not",
                episodes=lambda e: e.time_s if e.failure in ("", "late") else None, world="closed-loop"),
-        Metric("least_gap_m", "smallest distance to another vehicle's outline in an episode; 0 in a collision",
+        Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
                episodes=_field("least_gap_m"), world="closed-loop"),
         Metric("hard_brakings_per_episode", "times the ego begins to brake harder than 4 m/s²",
                episodes=_field("hard_brakings"), world="closed-loop"),
@@ -175,7 +175,7 @@ class Grid:
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """The episode of each decision, (n,), counted row by row. Raises ValueError for one out of the grid."""
+        """The episode of each decision, (n,), counted row by row. ValueError for one outside the grid."""
         condition = decisions.codes("condition", self.conditions)
         seed, episode = (
             _position(decisions.whole(name), names)

@@ -4,9 +4,6 @@ from typing import Any, Literal
 
 from msgspec import Struct, field
 
-FORMAT = "swarmdrive-run/2"
-READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}  # older formats, and who reads them
-
 Role = Literal["ego", "helper", "merge"]
 
 
@@ -224,3 +221,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
     cached_answers: int
     engine_errors: int
     versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def of_run(self) -> dict[str, str]:
+        """What every line of a run's CSV files begins with."""
+        return {"model": self.model["name"], "prompt": self.prompt["version"], "answer": self.answer}

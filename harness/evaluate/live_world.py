@@ -1,0 +1,187 @@
+"""The closed loop: every decision is asked from what is seen at its moment, and acts when it is ready.
+
+Decision k is due at k decision periods. Whoever is asked answers from what it sees in that frame; the action
+is taken in the first frame that begins after the decision's latency, and until then the ego keeps to its last
+action. A decision that is still open when the next is due goes on, and the next one is skipped.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.files import digest
+from harness.dataset.freeze import moment
+from harness.dataset.load import Scene
+from harness.evaluate.branches import Course, Decision, Trajectory
+from harness.evaluate.walk import Decided, Due, channel_draws
+from harness.runs import metrics
+from harness.runs.records import ClosedLoop, Episode
+from harness.world import reference
+from harness.world.drivers import PRIVILEGED
+from harness.world.outcome import Outcome
+from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
+from harness.world.world import World
+
+P = Parameters()
+ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
+
+
+@dataclass(frozen=True)
+class LiveSource:
+    """Layouts that are driven: episode e has layout seed `first_seed` + e."""
+
+    first_seed: int
+    episodes: int
+    name: ClassVar[str] = "drive"
+    kind: ClassVar[metrics.World] = "closed-loop"
+    command: ClassVar[str] = "drive"
+    actions: ClassVar[tuple[str, ...]] = tuple(ACTIONS)
+
+    def record(self) -> ClosedLoop:
+        """The scenario, and which of its layouts."""
+        return ClosedLoop(
+            scenario={"name": NAME, "parameters": asdict(P)}, first_seed=self.first_seed,
+            episodes=self.episodes, late_against="full-view driver, whose decisions act at once",
+        )  # fmt: skip
+
+    def options(self) -> list[tuple[str, object]]:
+        """Which layouts."""
+        return [("--episodes", self.episodes), ("--first-seed", self.first_seed)]
+
+    def trial(self, most: int, ego_alone: bool) -> list[Scene]:
+        """The first moment of some episodes, each a while after its start."""
+        scenes = []
+        for number in range(min(most, self.episodes)):
+            trajectory = Trajectory(number, World.start(self.first_seed + number), [])
+            trajectory.world.advance(round(number * P.decision_period_s * P.simulation_hz / 2))
+            scenes.append(look(trajectory, 0, ego_alone))
+        return scenes
+
+
+class LiveWorld:
+    """Some episodes of a scenario under all conditions and seeds, which share worlds until they part."""
+
+    def __init__(
+        self, first_seed: int, numbers: Sequence[int], points: Sequence[OperatingPoint],
+        seeds: Sequence[int], ego_alone: bool,
+    ) -> None:  # fmt: skip
+        """The first moments.
+
+        Args:
+            first_seed: layout seed of episode 0.
+            numbers: of the episodes.
+            points: the conditions.
+            seeds: of the channel's draws.
+            ego_alone: whether helpers are not asked, so need not look.
+        """
+        self._first_seed, self._ego_alone = first_seed, ego_alone
+        self._going = [
+            Trajectory(n, World.start(first_seed + n), [Course(p, s) for p in points for s in seeds])
+            for n in numbers
+        ]
+        self._ended: list[Trajectory] = []
+        self._decisions: list[Decision] = []
+        self._step = 0
+
+    def observe(self) -> Sequence[Scene]:
+        """Every moment in which some episode has no open decision, once."""
+        while self._going and self._step < P.decisions:
+            for one in self._going:
+                for course in one.courses:
+                    course.skipped += course.open is not None
+            self._deciding = [one for one in self._going if any(c.open is None for c in one.courses)]
+            if self._deciding:
+                self._moments = [look(one, self._step, self._ego_alone) for one in self._deciding]
+                return self._moments
+            self._advance()
+        return ()
+
+    def due(self, point: OperatingPoint) -> Due:
+        """Each episode of the condition that has no open decision."""
+        places = self._places(point)
+        at, seed = (
+            np.array([n for n, _ in places], dtype=int),
+            np.array([c.seed for _, c in places], dtype=int),
+        )
+        layouts = np.array([scene.record["episode_seed"] for scene in self._moments])
+        helpers = max(len(scene.viewers) for scene in self._moments) - 1
+        return Due(
+            at, seed, channel_draws(seed, layouts[at], np.full(len(at), self._step), P.decisions, helpers)
+        )
+
+    def step(self, decided: Sequence[Decided[Scene]]) -> None:
+        """Open every decision, and live until the next are due."""
+        begun = round(self._step * P.decision_period_s * P.simulation_hz)
+        for part in decided:
+            latencies_s, actions = part.result.latency_s.tolist(), part.result.action.tolist()
+            for (_, course), latency_s, action in zip(
+                self._places(part.point), latencies_s, actions, strict=True
+            ):
+                course.open = Decision(ACTIONS[action], begun + frames(latency_s))
+                self._decisions.append(course.open)
+        self._advance()
+
+    def _places(self, point: OperatingPoint) -> list[tuple[int, Course]]:
+        return [
+            (n, course) for n, one in enumerate(self._deciding) for course in one.courses
+            if course.open is None and course.point is point
+        ]  # fmt: skip
+
+    def _advance(self) -> None:
+        self._step += 1
+        until_s = P.time_limit_s if self._step == P.decisions else self._step * P.decision_period_s
+        parts = [part for one in self._going for part in one.advance(round(until_s * P.simulation_hz))]
+        self._ended += [one for one in parts if one.world.outcome.ended]
+        self._going = [one for one in parts if not one.world.outcome.ended]
+
+    def columns(self) -> dict[str, Any]:
+        """When each decision acts, and whether it has, in the order of decisions."""
+        return {
+            "acts_at_s": np.array([d.frame for d in self._decisions]) / P.simulation_hz,
+            "acted": np.array([d.acted for d in self._decisions]),
+        }
+
+    def episodes(self) -> list[Episode]:
+        """How each episode ended, held against a full-view driver whose decisions act at once."""
+        references = {
+            number: reference.drive(PRIVILEGED, self._first_seed + number)
+            for number in sorted({one.number for one in self._ended if one.world.outcome.success})
+        }
+        return [
+            _episode(one, course, references.get(one.number)) for one in self._ended for course in one.courses
+        ]
+
+
+def frames(latency_s: float) -> int:
+    """Whole frames that a decision takes."""
+    return math.ceil(latency_s * P.simulation_hz - ROUNDING_FRAMES)
+
+
+def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
+    """What there is to be seen and asked in a trajectory now. The same moment has the same id anywhere."""
+    world = trajectory.world
+    state = replace(world.state(), step=step)
+    viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
+    seen = moment(world, state, trajectory.number, viewers)
+    return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
+
+
+def _episode(one: Trajectory, course: Course, against: Outcome | None) -> Episode:
+    """How an episode ended; it is `late` if it cleared too long after the reference."""
+    ended = one.world.outcome
+    outcome = ended.judged(against, P) if against else ended
+    delay_s = None
+    if against and against.time_s is not None and against.success and ended.success:
+        delay_s = round((ended.time_s or 0.0) - against.time_s, 3)
+    return Episode(
+        condition=course.point.name, seed=course.seed, episode=one.number, layout_seed=one.world.seed,
+        danger=one.world.env.layout.danger or "none", success=outcome.success,
+        failure="" if outcome.success else outcome.result, delay_s=delay_s, time_s=outcome.time_s,
+        partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
+        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=one.world.hard_brakings,
+        other_crashes=outcome.other_crashes, skipped=course.skipped,
+    )  # fmt: skip

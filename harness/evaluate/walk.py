@@ -1,0 +1,220 @@
+"""The one loop: what a world shows is asked, coordinated under every condition and seed, and acted on.
+
+Frozen scenes, the closed loop and the calibrated proxy of the paper's study are worlds. They differ in where
+their moments come from and in what an action leads to, and in nothing else.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.coordination.channel import Draws
+from harness.coordination.coordinate import Coordination, FusionCall, coordinate
+from harness.coordination.exchange import exchange
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.core import noise
+from harness.core.arrays import Ints
+from harness.dataset.load import Scene
+from harness.evaluate.fusion import codes_of
+from harness.runs.decisions import Decisions, Labels, by_action, by_message
+
+Moment = TypeVar("Moment")
+
+
+@dataclass(frozen=True)
+class Due:
+    """Decisions that are to be made now under one condition.
+
+    Attributes:
+        at: the moment of each, a position among those the world shows, (n,).
+        seed: seed of the channel's draws of each, (n,).
+        draws: those draws, (n, ...).
+    """
+
+    at: Ints
+    seed: Ints
+    draws: Draws
+
+
+@dataclass(frozen=True)
+class Decided(Generic[Moment]):
+    """Decisions made under one condition.
+
+    Attributes:
+        point: the condition.
+        moments: what the world showed.
+        due: what was to be decided.
+        result: what was, (n, ...).
+    """
+
+    point: OperatingPoint
+    moments: Sequence[Moment]
+    due: Due
+    result: Coordination
+
+
+class World(Protocol[Moment]):
+    """Where decisions are made, and what comes of them."""
+
+    def observe(self) -> Sequence[Moment]:
+        """Every distinct moment in which some episode is to decide now; none if all episodes are decided."""
+        ...
+
+    def due(self, point: OperatingPoint) -> Due:
+        """The decisions of a condition that are due in the moments just shown."""
+        ...
+
+    def step(self, decided: Sequence[Decided[Moment]]) -> None:
+        """Act on the decisions, one `Decided` a condition, and go on to the next moments."""
+        ...
+
+
+class Ask(Protocol[Moment]):
+    """Where intents come from."""
+
+    def __call__(self, moments: Sequence[Moment]) -> Intents:
+        """What every vehicle intends in these moments, (n, ...)."""
+        ...
+
+    def fusion_call(self, moments: Sequence[Moment], codes: Ints) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,)."""
+        ...
+
+
+def walk(
+    world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
+) -> Iterator[Sequence[Decided[Moment]]]:
+    """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
+    while moments := world.observe():
+        intents = ask(moments)
+        due = [world.due(point) for point in points]
+        calls = _fusion_calls(points, due, moments, intents, ask)
+        decided = [
+            Decided(point, moments, each, coordinate(
+                point, intents.take(each.at), each.draws, calls(each.at) if point.asks_again else None
+            ))
+            for point, each in zip(points, due, strict=True)
+            if len(each.at)
+        ]  # fmt: skip
+        yield decided
+        world.step(decided)
+
+
+def _fusion_calls(
+    points: Sequence[OperatingPoint], due: Sequence[Due], moments: Sequence[Moment], intents: Intents,
+    ask: Ask[Moment],
+) -> Callable[[Ints], FusionCall]:  # fmt: skip
+    """Who is heard depends on no fusion call: each set of messages that any condition hears is asked once."""
+    codes = [np.empty(0, dtype=int)]
+    for point, each in zip(points, due, strict=True):
+        if point.asks_again:
+            on_time = exchange(point, intents.take(each.at), each.draws).on_time
+            codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
+    return ask.fusion_call(moments, np.unique(np.concatenate(codes)))
+
+
+@lru_cache(maxsize=1 << 16)
+def _channel(seed: int, layout_seed: int, steps: int, helpers: int) -> NDArray[np.float64]:
+    return noise.uniforms((2 + steps, helpers), "channel", seed, layout_seed)
+
+
+def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
+    """The channel's draws of decisions (n,): a link is up or down for an episode, jitter is a decision's own.
+
+    The key is the seed and the episode's layout, so every condition, prompt and model, frozen and in the
+    closed loop, has the same.
+    """
+    pairs, place = np.unique(np.stack([seed, layout_seed]), axis=1, return_inverse=True)
+    of_pairs = np.array([_channel(s, layout, steps, helpers) for s, layout in pairs.T.tolist()])
+    of_pairs, place = of_pairs.reshape(-1, 2 + steps, helpers), place.reshape(-1)
+    return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step])
+
+
+def columns(decided: Decided[Any]) -> dict[str, Any]:
+    """Numbers of decisions (n,) by name, as the table of decisions has them, NaN where unknown."""
+    c, point = decided.result, decided.point
+    anybody = c.on_time.any(axis=-1)
+    return {
+        "messages": c.messages, "triggered": c.triggered, "own_failed": c.own_failed,
+        "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
+        "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
+        "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
+        "fusion_ms": c.fusion_s * 1000,
+        "fusion_failed": np.where(anybody & point.asks_again, c.fusion_failed, np.nan),
+        "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
+    }  # fmt: skip
+
+
+def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
+    """The table of decisions, in the order of episode, step, moment, condition and seed.
+
+    Args:
+        decided: in any order.
+        more: further columns (n,), in the order of `decided`.
+        actions: meta-actions.
+    """
+    first = {id(part.moments): part.moments for part in decided}
+    starts = np.cumsum([0, *map(len, first.values())]).tolist()
+    start = dict(zip(first, starts, strict=False))
+    scenes = [scene for moments in first.values() for scene in moments]
+    helpers = max(len(scene.viewers) for scene in scenes) - 1
+    at = np.concatenate([start[id(part.moments)] + part.due.at for part in decided])
+    n_each = [len(part.due.at) for part in decided]
+    points = list(dict.fromkeys(part.point.name for part in decided))
+    point = np.repeat([points.index(part.point.name) for part in decided], n_each)
+
+    def of_scenes(values: Iterable[Any]) -> Any:
+        return np.array(list(values))[at]
+
+    def of_messages(name: str) -> Any:
+        arrays = [getattr(part.result, name) for part in decided]
+        wide = [np.pad(each, ((0, 0), (0, helpers - each.shape[1]))) for each in arrays]
+        return np.concatenate(wide)
+
+    numbers = [columns(part) for part in decided]
+    asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
+    sent = {
+        "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
+        "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
+        "weight": np.concatenate([
+            np.pad(part.result.weights[:, 1:], ((0, 0), (0, helpers + 1 - part.result.weights.shape[1])))
+            for part in decided
+        ]),
+    }  # fmt: skip
+    senders = [[*scene.viewers[1:], *[None] * (helpers + 1 - len(scene.viewers))] for scene in scenes]
+    episode, step = (of_scenes(scene.record[name] for scene in scenes) for name in ("episode", "step"))
+    ids = [scene.id for scene in scenes]
+    rank = np.unique(ids, return_inverse=True)[1]
+    order = np.lexsort((point, rank[at], step, episode))
+    found = {
+        **{name: np.concatenate([each[name] for each in numbers]) for name in numbers[0]},
+        **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
+        **more,
+        **{
+            column: values
+            for name, each in sent.items()
+            for column, values in by_message(name, np.where(asked, each, np.nan)).items()
+        },
+        "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
+    }  # fmt: skip
+    labels = {
+        "scene": _labels(ids, at), "danger": _labels([s.record["danger"]["sector"] for s in scenes], at),
+        "condition": Labels(point, points),
+        "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
+        **{
+            f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)
+        },
+    }  # fmt: skip
+    made = Decisions.of({**found, **labels}, actions, helpers)
+    return made.take(order)
+
+
+def _labels(of_scenes: Sequence[str | None], at: Ints, there: Any = True) -> Labels:
+    names = list(dict.fromkeys(label for label in of_scenes if label is not None))
+    code = {None: -1, **{name: place for place, name in enumerate(names)}}
+    return Labels(np.where(there, np.array([code[label] for label in of_scenes])[at], -1), names)
