@@ -140,12 +140,10 @@ def default_out(spec: "Spec", resume: bool) -> Path:
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
     """A finished run for machines: its folder and the rows of its summary."""
-    m = done.manifest
-    of_run = {"model": m.model["name"], "prompt": m.prompt["version"], "answer": m.answer}
     return {
         "run": str(done.out),
-        "manifest": msgspec.to_builtins(m),
-        "summary": [{**of_run, **msgspec.structs.asdict(score)} for score in done.scores],
+        "manifest": msgspec.to_builtins(done.manifest),
+        "summary": [{**done.manifest.of_run, **msgspec.structs.asdict(score)} for score in done.scores],
     }
 
 
