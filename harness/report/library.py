@@ -1,4 +1,4 @@
-"""What a page carries besides its text: compressed data, the charting library, and what lets it run.
+"""What a page carries besides its text: packed data, pictures, the charting library, and what lets it run.
 
 Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which vl-convert
 brings along. It is compressed in the page as everything large is; scripts are let run by their digest alone.
@@ -65,6 +65,11 @@ def packed(value: Any) -> Markup:
     if not isinstance(value, str):
         text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode())
+
+
+def picture(svg: bytes) -> str:
+    """A picture as what an `img` of a page that stands alone takes."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
 
 
 def policy(*scripts: str) -> str:
