@@ -92,7 +92,7 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, q
     with bar(f"asking {printable(spec.card.name, 30)}", count, as_json or quiet) as progress:
         cache = None if no_cache else default_file()
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
-    from harness.cli.report import write  # draws with matplotlib, which no answer waits for
+    from harness.cli.report import write
 
     page = write([out], quiet=as_json or quiet)
     if as_json:
