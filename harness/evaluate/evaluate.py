@@ -13,6 +13,7 @@ from harness.backends.base import Rendering
 from harness.backends.cache import Cached
 from harness.backends.registry import open_backend
 from harness.coordination.channel import Draws
+from harness.coordination.coordinate import Fusion
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json, digest, write_whole
 from harness.core.memory import uncollected
@@ -115,7 +116,7 @@ def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[st
     """Score the answers and write the run's files; `begun` is what its manifest says of its making."""
     laid, known = told.laid, told.known
     runs = [
-        score(laid, known, point, seed, told.draws[seed], second)
+        score(laid, known, point, seed, told.draws[seed], Fusion(second))
         for point in spec.points for seed in spec.seeds
     ]  # fmt: skip
     result = summary(spec, laid, known, runs, second)

@@ -15,7 +15,7 @@ import numpy as np
 
 from harness.backends.base import Backend
 from harness.coordination.channel import Draws
-from harness.coordination.coordinate import coordinate
+from harness.coordination.coordinate import Fusion, coordinate
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -150,8 +150,8 @@ class _Round:
 
     def decide(self, actions: Sequence[str], second: Merged | None) -> None:
         """Open every decision."""
-        fusion_call = partial(second, at=self.at) if second else None
-        result = coordinate(*self.inputs, fusion_call)
+        fusion = Fusion(partial(second, at=self.at)) if second else None
+        result = coordinate(*self.inputs, fusion)
         begun = round(self.step * P.decision_period_s * P.simulation_hz)
         viewers = [self.scenes[n].viewers[1:] for n, _ in self.places]
         made = record.decisions(result, self.point, [e.seed for _, e in self.places], viewers, actions)

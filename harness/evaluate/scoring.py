@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.coordination.channel import Draws
-from harness.coordination.coordinate import Coordination, FusionCall, coordinate
+from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
@@ -43,13 +43,13 @@ def score(
     point: OperatingPoint,
     seed: int,
     draws: Draws,
-    fusion_call: FusionCall | None = None,
+    fusion: Fusion | None = None,
 ) -> Scored:
     """Coordinate every decision at one operating point with one seed's draws, and look up what comes of it.
 
-    `draws` are those of that seed, for every point the same. `fusion_call` is for a point that fuses by one.
+    `draws` are those of that seed, for every point the same. `fusion` is what fusing needs besides.
     """
-    return outcome(laid, point, seed, coordinate(point, intents, draws, fusion_call))
+    return outcome(laid, point, seed, coordinate(point, intents, draws, fusion))
 
 
 def outcome(laid: Table, point: OperatingPoint, seed: int, made: Coordination) -> Scored:
