@@ -77,7 +77,7 @@ class FrozenWorld:
         n, helpers = len(scenes), max(len(scene.viewers) for scene in scenes) - 1
         at, seed = np.tile(np.arange(n), len(self._seeds)), np.repeat(self._seeds, n)
         draws = channel_draws(seed, self._laid.seeds[there][at], np.full(len(at), self._step), steps, helpers)
-        self._due = Due(at, seed, draws)
+        self._due = Due(at, self._laid.episodes[there][at], seed, draws)
         return scenes
 
     def due(self, point: OperatingPoint) -> Due:

@@ -206,7 +206,7 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*of_run, *kind.__struct_fields__])
+    writer.writerow([*of_run, *kind.__struct_encode_fields__])
     for record in records:
         values = (getattr(record, name) for name in kind.__struct_fields__)
         writer.writerow([*of_run.values(), *("" if value is None else value for value in values)])
@@ -216,7 +216,8 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     with file.open(encoding="utf-8", newline="") as lines:
         rows = list(csv.DictReader(lines))
-    optional = {name for name, hint in get_type_hints(kind).items() if type(None) in get_args(hint)}
+    hints = zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True)
+    optional = {name for name, hint in hints if type(None) in get_args(hint)}
     return tuple(
         msgspec.convert(
             {k: None if v == "" and k in optional else v for k, v in row.items()}, kind, strict=False
