@@ -95,16 +95,14 @@ def walk(
     memories: dict[str, _Memory] = {point.name: _Memory() for point in points}
     while moments := world.observe():
         intents = ask(moments)
-        due = [world.due(point) for point in points]
-        calls = _fusion_calls(points, due, moments, intents, ask)
-        decided = [
-            Decided(point, moments, each, coordinate(
-                point, intents.take(each.at), each.draws,
-                Fusion(calls(each.at) if point.asks_again else None, memories[point.name].recall(each)),
-            ))
-            for point, each in zip(points, due, strict=True)
-            if len(each.at)
-        ]  # fmt: skip
+        due = {point: each for point in points if len((each := world.due(point)).at)}
+        calls = _fusion_calls(due, moments, intents, ask)
+        decided = []
+        for point, each in due.items():
+            call = calls(each.at) if calls and point.asks_again else None
+            fusion = Fusion(call, memories[point.name].recall(each))
+            result = coordinate(point, intents.take(each.at), each.draws, fusion)
+            decided.append(Decided(point, moments, each, result))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
         yield decided
@@ -130,16 +128,15 @@ class _Memory:
 
 
 def _fusion_calls(
-    points: Sequence[OperatingPoint], due: Sequence[Due], moments: Sequence[Moment], intents: Intents,
-    ask: Ask[Moment],
-) -> Callable[[Ints], FusionCall]:  # fmt: skip
+    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
+) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
     """Who is heard depends on no fusion call: each set of messages that any condition hears is asked once."""
-    codes = [np.empty(0, dtype=int)]
-    for point, each in zip(points, due, strict=True):
+    codes = []
+    for point, each in due.items():
         if point.asks_again:
             on_time = exchange(point, intents.take(each.at), each.draws).on_time
             codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
-    return ask.fusion_call(moments, np.unique(np.concatenate(codes)))
+    return ask.fusion_call(moments, np.unique(np.concatenate(codes))) if codes else None
 
 
 @lru_cache(maxsize=1 << 16)

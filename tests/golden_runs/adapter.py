@@ -117,7 +117,8 @@ def _made_of(row: dict[str, Any], actions: list[str]) -> dict[str, Any]:
     plain = {name: value for name, value in row.items() if name not in spread}
     for name in ("scene", "episode", "step", "danger", "messages"):
         del plain[name]
-    plain["merge_failed"] = plain.pop("fusion_failed")
+    failed = plain.pop("fusion_failed")
+    plain["merge_failed"] = None if failed is None else float(failed)
     fused = [row[f"fused_{action}"] for action in actions]
     return {**plain, "fused": fused, "messages": messages}
 
