@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.coordination.channel import CHANNELS, Channel, Delivery, Draws, Links, Radio, link_up
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Delivery, Draws, Links, Radio, link_up
 from harness.coordination.consensus import RULES, Fused, Messages, Rule, linear_pool
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
@@ -129,11 +129,11 @@ def test_a_channel_may_lose_each_link_by_itself():
 
 def test_a_points_overrides_are_fields_of_its_channel():
     point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
-    assert point.channel == Fog(latency_s=0.05)
+    assert point.channel() == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
     v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
-    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
-    assert OperatingPoint("x", None, loss=0.5).channel == OperatingPoint("y", None).channel
+    assert v2x.channel() == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel() == NO_CHANNEL
 
 
 @pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
@@ -231,8 +231,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    assert OperatingPoint("x", "slow-radio").channel.latency_s == 0.5
-    assert OperatingPoint("x", "v2x").channel.latency_s == 0.025
+    assert OperatingPoint("x", "slow-radio").channel().latency_s == 0.5
+    assert OperatingPoint("x", "v2x").channel().latency_s == 0.025
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
         UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"

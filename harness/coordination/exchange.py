@@ -102,7 +102,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
     ready_s = helpers_s if point.on_demand else np.maximum(helpers_s - request_s, 0.0)
     links = Links(asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure)
-    up, delay_s, loss = point.channel.deliver(links, draws)
+    up, delay_s, loss = point.channel().deliver(links, draws)
     delivered = asked & up
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)

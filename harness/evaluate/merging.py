@@ -74,8 +74,8 @@ def delivered(intents: Intents, points: Iterable[OperatingPoint], draws: Iterabl
     found: Ints = np.empty(0, dtype=int)
     draws = list(draws)
     for point in points:
-        for one in draws if point.asks_again else ():
-            heard = exchange(point, intents, one).on_time
+        for seed_draws in draws if point.asks_again else ():
+            heard = exchange(point, intents, seed_draws).on_time
             found = np.union1d(found, codes_of(heard)[heard.any(axis=1)])
     return found
 
