@@ -105,4 +105,4 @@ def _loss(point: OperatingPoint) -> float | None:
     """Probability that a crossing is lost; None where it hangs on who is there, which no frozen row says."""
     if point.profile is None or point.density_coupled or point.helper_rounds:
         return None
-    return getattr(point.channel, "loss", None)
+    return getattr(point.channel(), "loss", None)
