@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.core.errors import UserError, printable
+from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.driven_folder import LIVE, Driven, driven
 from harness.runs.folder import FROZEN, Run, answers_of, dataset_of, read
@@ -47,8 +48,13 @@ class Runs:
         return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
 
 
-def gather(paths: Sequence[Path]) -> Runs:
+@uncollected()
+def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
     """Read runs to be reported together.
+
+    Args:
+        paths: their folders.
+        dataset: one that was read already; it is read again where it is not that of the runs.
 
     Raises:
         UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
@@ -66,7 +72,10 @@ def gather(paths: Sequence[Path]) -> Runs:
                 f"{printable(first.path)} and {printable(other.path)} are not of the same scenes "
                 f"({_shown(first)} and {_shown(other)}); report them apart"
             )
-    dataset = None if isinstance(first, Driven) else dataset_of(first)
+    if isinstance(first, Driven):
+        dataset = None
+    elif dataset is None or dataset.sha256 != first.config["dataset"]["sha256"]:
+        dataset = dataset_of(first)
     return Runs(tuple(found), _names(found), dataset)
 
 
