@@ -17,7 +17,7 @@ from harness.core.files import write_whole
 from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
-from harness.report.decision_charts import policies, timeline
+from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, roads
 from harness.report.panels import panels
