@@ -94,7 +94,7 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, q
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
     from harness.cli.report import write
 
-    page = write([out], quiet=as_json or quiet)
+    page = write([out], quiet=as_json or quiet, dataset=spec.dataset)
     if as_json:
         typer.echo(json.dumps(as_mapping(done), indent=1))
     if as_json or quiet:

@@ -1,9 +1,12 @@
 """`harness report`: one HTML page about a run, or about several side by side."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from harness.dataset.load import Dataset
 
 
 def command(
@@ -22,13 +25,15 @@ def command(
     typer.echo(f"wrote {write(runs, out)}")
 
 
-def write(runs: list[Path], out: Path | None = None, quiet: bool = False) -> Path:
-    """Write a report, with a progress bar; returns the file."""
+def write(
+    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None
+) -> Path:
+    """Write a report, with a progress bar, on runs whose dataset may have been read; returns the file."""
     from harness.cli.progress import bar
     from harness.report.page import write_report
     from harness.report.runs import gather
 
-    found = gather(runs)
+    found = gather(runs, dataset)
     scenes = len({scene for run in found.runs for scene in run.decisions.scenes})
     with bar("packing decisions", scenes, quiet) as progress:
         return write_report(found, out or runs[0] / "report.html", progress=progress)

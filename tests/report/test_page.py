@@ -4,6 +4,8 @@ import base64
 import hashlib
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -329,3 +331,13 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     ):
         with pytest.raises(UserError, match=message):
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+
+
+def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(run, tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from harness.cli.report import write;"
+        f"write([Path({str(run)!r})], Path({str(tmp_path / 'page.html')!r}), quiet=True);"
+        "print(sorted({'matplotlib', 'highway_env', 'gymnasium', 'pandas', 'torch'} & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert said.stdout == "[]\n"
