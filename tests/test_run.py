@@ -242,7 +242,8 @@ def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None
 
 
 def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
-    pytest.importorskip("huggingface_hub", reason="needs the transformers extra")
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("transformers", reason="needs the transformers extra")
     assert "no-such-model" in refused(spec_of(small, "nobody/no-such-model"), tmp_path / "out")
     (tmp_path / "hollow").mkdir()
     (tmp_path / "hollow" / "config.json").write_text("{}")
