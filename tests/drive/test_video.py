@@ -4,6 +4,7 @@ import json
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -25,6 +26,7 @@ def out(tmp_path_factory):
 
 
 def test_an_episode_played_again_ends_as_it_did(out):
+    row: Any
     for row in pd.read_csv(out / "episodes.csv", keep_default_na=False).itertuples():
         seen = list(stills(find(out, row.episode, row.condition, row.seed)))
         assert seen[-1].state.time_s == row.time_s
