@@ -15,8 +15,8 @@ eval: .venv/base ## evaluate the default model on the shipped dataset and write 
 test: check browser ## every check and every test
 	$(BIN)/python -m pytest -n 2
 
-light: .venv-light/test ## the tests without torch, llama.cpp and a browser: what needs one is skipped
-	.venv-light/bin/python -m pytest -n 2
+light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
+	.venv-light/bin/python -m pytest -n 2 $(ONLY)
 
 browser: ## Debian's chromium for the tests that open pages, which are skipped where there is none
 	@command -v chromium >/dev/null || (apt-get update --quiet=2 && apt-get install --quiet=2 --yes \
@@ -58,8 +58,8 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 
 .venv-light/test: pyproject.toml requirements.lock
 	$(PYTHON) -m venv .venv-light
-	.venv-light/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock \
-		--editable '.[test]'
+	.venv-light/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
+		--constraint requirements.lock --editable '.[test]'
 	touch $@
 
 clean:
