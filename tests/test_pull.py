@@ -45,7 +45,13 @@ def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) 
     assert sorted(hub.asked) == ["chat_template.jinja", "config.json", "model.safetensors", "tokenizer.json"]
     fetched = snapshot(tmp_path, "some/model") / "model.safetensors"
     assert fetched.read_bytes() == CHECKPOINT["model.safetensors"]
-    # With the hub gone, what was fetched is found.
+
+
+def test_with_the_hub_gone_what_was_fetched_is_found(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("transformers", reason="needs the transformers extra")
+    with serving({"some/model": CHECKPOINT}) as hub:
+        harness(tmp_path, hub.url, "pull", "some/model")
     again = harness(tmp_path, hub.url, "check", "some/model")
     assert "does not load" in again.stderr, "these weights are none; but they are found"
 

@@ -5,6 +5,7 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -194,7 +195,8 @@ def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
         raise KeyboardInterrupt
 
     opened = open_tiny(tiny)
-    opened.engine.model.register_forward_pre_hook(press)
+    engine: Any = opened.engine
+    engine.model.register_forward_pre_hook(press)
     with pytest.raises(KeyboardInterrupt):
         opened.complete([ask(0)])
 

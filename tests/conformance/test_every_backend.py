@@ -78,7 +78,7 @@ def case(
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
     tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *cards.WEIGHTED}
-    assert tried == set(cards.Engine.__args__)
+    assert tried == set(get_args(cards.Engine))
     assert all(missing(cards.load(name)) is None for name in model_free())
 
 
@@ -134,6 +134,6 @@ def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) 
 def test_its_identity_is_json_and_stays_the_same(case: Case) -> None:
     identity = case.backend.identity()
     assert json.loads(json.dumps(identity, allow_nan=False)) == identity
-    assert identity["engine"] in cards.Engine.__args__
+    assert identity["engine"] in get_args(cards.Engine)
     case.backend.complete(case.asked[:1])
     assert case.backend.identity() == identity

@@ -216,7 +216,8 @@ def test_a_lone_surrogate_in_an_answer_does_not_break_the_page(dataset, tmp_path
 
 
 def scored(run, *scores):
-    return replace(run, scores=tuple(Score(*s, n=2, n_excluded=0, interval="episodes") for s in scores))
+    named = (dict(zip(("condition", "metric", "value", "low", "high"), s, strict=True)) for s in scores)
+    return replace(run, scores=tuple(Score(**s, n=2, n_excluded=0, interval="episodes") for s in named))
 
 
 def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run):

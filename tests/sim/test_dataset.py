@@ -323,7 +323,7 @@ def test_a_record_that_is_not_what_it_should_be_is_named_by_line_and_never_used(
         load(copy)
 
 
-HOSTILE_MANIFESTS = {
+HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "a path upwards": {"files": {"../../etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "an absolute path": {"files": {"/etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "a folder": {"files": {"..": "0" * 64, "scenes.jsonl": "0" * 64}},
