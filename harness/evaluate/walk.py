@@ -131,7 +131,7 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     """
     pairs, place = np.unique(np.stack([seed, layout_seed]), axis=1, return_inverse=True)
     of_pairs = np.array([_channel(s, layout, steps, helpers) for s, layout in pairs.T.tolist()])
-    of_pairs, place = of_pairs.reshape(-1, 2 + steps, helpers), place.reshape(-1)
+    of_pairs, place = of_pairs.reshape(pairs.shape[1], 2 + steps, helpers), place.reshape(-1)
     return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step])
 
 
