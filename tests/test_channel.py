@@ -1,17 +1,25 @@
 """Which replies cross, and when they have arrived."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.channel import NO_CHANNEL, PROFILES, density_coupled_loss, link_up, reply_delay_s
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Draws, Links, density_coupled_loss, link_up
 from harness.core.noise import uniforms
 
-V2X, SIXG = PROFILES["v2x"], PROFILES["6g"]
+V2X, SIXG = CHANNELS["v2x"], CHANNELS["6g"]
 RANGE_M = np.array([10.0, 20.0, 30.0])
 ALL = np.array([True, True, True])
 NONE_S = np.zeros(3)
+
+
+def reply_delay_s(channel, asked, ready_s, range_m, payload_bits, jitter, roadside_edge=False):
+    links = Links(asked, ready_s, range_m, payload_bits, in_radius=asked, rounds=np.zeros_like(asked))
+    channel = replace(channel, roadside_edge=roadside_edge)
+    return channel.deliver(links, Draws(np.zeros((*asked.shape, 2)), jitter)).delay_s
 
 
 def test_density_coupled_loss_meets_the_papers_three_points_and_ends_at_one():
@@ -41,7 +49,7 @@ def test_a_roadside_edge_gives_the_reply_a_second_path_and_the_request_none():
 
 def test_each_decision_may_have_its_own_loss():
     draws = np.full((2, 1, 2), 0.1)
-    assert link_up(draws, np.array([0.05, 0.2])).tolist() == [[True], [False]]
+    assert link_up(draws, np.array([[0.05], [0.2]])).tolist() == [[True], [False]]
 
 
 def test_nothing_crosses_without_a_channel():

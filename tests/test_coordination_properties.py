@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.coordination.channel import Draws
-from harness.coordination.consensus import RULES
+from harness.coordination.consensus import POOLS
 from harness.coordination.coordinate import Coordination, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
@@ -45,7 +45,7 @@ points = st.builds(
     max_helpers=st.integers(0, 5),
     roadside_edge=st.booleans(),
     on_demand=st.booleans(),
-    consensus=st.sampled_from(sorted(RULES)),
+    consensus=st.sampled_from(sorted(POOLS)),
 )
 
 

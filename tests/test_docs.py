@@ -8,7 +8,7 @@ import pytest
 
 from harness.backends.base import AnswerMode
 from harness.backends.failures import Failures
-from harness.coordination.consensus import NAMES
+from harness.coordination.consensus import EGO_PROMPT, POOLS
 from harness.coordination.operating_point import POINTS, SETTINGS
 from harness.parsing.parse import Repair, Status
 from harness.report.compare.table import METRICS
@@ -52,7 +52,7 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
     assert cell == (f"{shown:g}" if isinstance(shown, float) else str(shown))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*POOLS, EGO_PROMPT])
 def test_every_consensus_is_documented(name: str) -> None:
     assert f"| `{name}` |" in (ROOT / "docs/operating-points.md").read_text()
 

@@ -4,20 +4,18 @@ The cache is a help and nothing else. A run's rows hold its answers, and where t
 goes on without it.
 """
 
-import os
 import sqlite3
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from harness import __version__
 from harness.backends.base import Completion, Rendering, Request
 from harness.backends.completion_file import CompletionFile
+from harness.core import kept
 from harness.core.errors import printable
-from harness.core.files import digest, sha256_bytes
+from harness.core.files import digest
 
 T = TypeVar("T")
 
@@ -28,16 +26,13 @@ NOT_IN_KEY = {
     "view": "no language model reads it",
     "truth": "no language model reads it",
 }
-# The program's own part in an answer: how it is asked for and put into text.
+# The program's own part in an answer, how it is asked for and put into text: other code finds no old answers.
 _CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
 
 def default_file() -> Path:
-    """`completions.sqlite` in `$SWARMDRIVE_CACHE`, else in the user's cache folder."""
-    if moved := os.environ.get("SWARMDRIVE_CACHE"):
-        return Path(moved) / "completions.sqlite"
-    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(caches) / "swarmdrive-harness" / "completions.sqlite"
+    """Where completions are kept unless another file is named."""
+    return kept.folder() / "completions.sqlite"
 
 
 def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
@@ -47,15 +42,7 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
     16 bits it may move one by rounding, with a cache or without; the identity holds the number format.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
-    return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": _code_sha256()})
-
-
-@cache
-def _code_sha256() -> str:
-    """So that a program that asks otherwise finds no old answers."""
-    package = Path(__file__).parent.parent
-    files = sorted(file for pattern in _CODE for file in package.glob(pattern))
-    return digest([__version__, *(sha256_bytes(file.read_bytes()) for file in files)])
+    return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)})
 
 
 class Cached:

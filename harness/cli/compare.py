@@ -42,7 +42,7 @@ def compare(
     found = compared(pair(a, b))
     verdicts = [judge(one, found) for one in gates]
     if html:
-        from harness.report.compare.page import write  # loads matplotlib, which no table waits for
+        from harness.report.compare.page import write
 
         write(found, verdicts, show, html)
     if as_json:

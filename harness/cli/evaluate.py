@@ -92,7 +92,7 @@ def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, q
     with bar(f"asking {printable(spec.card.name, 30)}", count, as_json or quiet) as progress:
         cache = None if no_cache else default_file()
         done = evaluate_run(spec, out, resume, progress, cache, progress.more)
-    from harness.cli.report import write  # draws with matplotlib, which no answer waits for
+    from harness.cli.report import write
 
     page = write([out], quiet=as_json or quiet)
     if as_json:
@@ -140,12 +140,10 @@ def default_out(spec: "Spec", resume: bool) -> Path:
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
     """A finished run for machines: its folder and the rows of its summary."""
-    m = done.manifest
-    of_run = {"model": m.model["name"], "prompt": m.prompt["version"], "answer": m.answer}
     return {
         "run": str(done.out),
-        "manifest": msgspec.to_builtins(m),
-        "summary": [{**of_run, **msgspec.structs.asdict(score)} for score in done.scores],
+        "manifest": msgspec.to_builtins(done.manifest),
+        "summary": [{**done.manifest.of_run, **msgspec.structs.asdict(score)} for score in done.scores],
     }
 
 

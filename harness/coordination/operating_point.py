@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from harness.coordination.channel import PROFILES
-from harness.coordination.consensus import EGO_PROMPT, NAMES
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel
+from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 
 FALLBACKS = ("uniform", "brake")
+OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
 _LARGEST = sys.float_info.max
 
 
@@ -32,7 +33,7 @@ class OperatingPoint:
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
-        roadside_edge: replies travel over a roadside edge node as well (`channel.link_up`).
+        roadside_edge: replies travel over a roadside edge node as well (`channel.Radio`).
         on_demand: a helper infers when it is asked, and not in parallel with the ego.
     """
 
@@ -55,12 +56,12 @@ class OperatingPoint:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
-        if self.profile is not None and str(self.profile) not in PROFILES:
-            raise unknown("channel profile", str(self.profile), PROFILES, "; leave it out to disable V2V")
+        if self.profile is not None and str(self.profile) not in CHANNELS:
+            raise unknown("channel profile", str(self.profile), CHANNELS, "; leave it out to disable V2V")
         if self.fallback not in FALLBACKS:
             raise unknown("fallback", str(self.fallback), FALLBACKS)
-        if str(self.consensus) not in NAMES:
-            raise unknown("consensus", str(self.consensus), NAMES)
+        if str(self.consensus) not in RULES and self.consensus != EGO_PROMPT:
+            raise unknown("consensus", str(self.consensus), names())
         self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
         self._number("window_s", "seconds above 0")
         self._number("radius_m", "metres above 0")
@@ -76,6 +77,9 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+        for key in self._overrides:
+            if key not in {field.name for field in fields(self._profile)}:
+                raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
@@ -90,6 +94,21 @@ class OperatingPoint:
         if "name" not in values:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
+
+    @property
+    def channel(self) -> Channel:
+        """The profile's, with the point's overrides."""
+        return replace(self._profile, **self._overrides)
+
+    @property
+    def _profile(self) -> Channel:
+        return NO_CHANNEL if self.profile is None else CHANNELS[self.profile]
+
+    @property
+    def _overrides(self) -> dict[str, Any]:
+        """Settings in place of the profile's. Without a channel there is nothing to override."""
+        values = {key: getattr(self, key) for key in OVERRIDES if self.profile is not None}
+        return {key: value for key, value in values.items() if value is not None and value is not False}
 
     @property
     def asks_again(self) -> bool:

@@ -10,16 +10,23 @@ make always braking perfect. Live driving is judged alike: clearing later than t
 than the allowance is a forced failure. `harness dataset rank` holds the two against each other.
 """
 
+import json
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from harness.core import kept
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.files import canonical_json, digest
 from harness.dataset.load import Dataset
-from harness.world.drivers import PRIVILEGED, choose
+from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import ROUNDING_S
 from harness.world.perception.graph import truth_graph
+
+# What decides how a reference driver fares on a dataset: other code finds nothing that was kept.
+_CODE = ("core/**/*.py", "world/**/*.py", "dataset/**/*.py", "evaluate/success.py")
 
 
 @dataclass(frozen=True)
@@ -117,3 +124,30 @@ def driver_choices(dataset: Dataset, driver: str) -> Ints:
         truth = truth_graph(scene.state) if driver == PRIVILEGED else None
         chosen.append(actions.index(choose(driver, graph, truth, actions)))
     return np.array(chosen)
+
+
+def reference_success(dataset: Dataset) -> dict[str, float]:
+    """Share of a dataset's episodes in which each reference driver succeeds; played once and then kept."""
+    laid = table(dataset)
+    decided_by = [
+        dataset.sha256, laid.episodes.tolist(), kept.code_sha256(*_CODE), version("numpy"), version("shapely")
+    ]  # fmt: skip
+    name = f"references-{digest(decided_by)}.json"
+    shares = _shares(kept.recall(name))
+    if shares is None:
+        shares = {
+            driver: float(judge_choices(laid, driver_choices(dataset, driver)).success.mean())
+            for driver in DRIVERS
+        }
+        kept.keep(name, canonical_json(shares).encode())
+    return shares
+
+
+def _shares(data: bytes | None) -> dict[str, float] | None:
+    """What was kept of every reference driver; None where it is not that."""
+    try:
+        shares = json.loads(data or b"")
+        known = {driver: float(shares[driver]) for driver in DRIVERS}
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return known if all(0.0 <= share <= 1.0 for share in known.values()) else None

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from harness.report.drawing.pictures import BLUE, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing.colours import BLUE, ORANGE, PURPLE, SKY, VERMILLION
 from harness.report.layers import (
     BASE,
     NUMBER,

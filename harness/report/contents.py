@@ -3,7 +3,7 @@
 from typing import Any
 
 from harness.report import words
-from harness.report.drawing.pictures import uri
+from harness.report.library import picture
 from harness.report.runs import Runs
 from harness.runs.driven_folder import Driven
 from harness.runs.folder import Run, answers_of
@@ -50,8 +50,8 @@ def sweeps(run: Run) -> list[dict[str, str]]:
     """Pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
     here = run.path.resolve()
     return [
-        {"name": f"{manifest.parent.name}: {picture.stem}", "src": uri(picture.read_bytes())}
+        {"name": f"{manifest.parent.name}: {svg.stem}", "src": picture(svg.read_bytes())}
         for manifest in sorted(run.path.glob("*/sweep.json"))
-        for picture in sorted(manifest.parent.glob("*.svg"))
-        if picture.is_file() and picture.resolve().is_relative_to(here)
+        for svg in sorted(manifest.parent.glob("*.svg"))
+        if svg.is_file() and svg.resolve().is_relative_to(here)
     ]

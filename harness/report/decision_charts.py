@@ -1,6 +1,6 @@
 """Charts of one decision, as Vega-Lite specifications whose values the page fills in."""
 
-from harness.report.drawing.pictures import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing.colours import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from harness.report.layers import BASE, NUMBER, RULE, Spec, layered, x_axis
 
 TIMES = {

@@ -6,7 +6,6 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.dataset.load import Scene
-from harness.evaluate.replay import scene_of
 from harness.parsing.parse import Status, spans
 from harness.prompts import readout, versions
 from harness.report import scenes
@@ -88,6 +87,8 @@ class Decisions:
 
     def _played(self, failed: Sequence[Mapping[int, int]]) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
+        from harness.evaluate.replay import scene_of  # loads the simulator, which no frozen run waits for
+
         telling = [
             str(chosen.row["scene"])
             for run, of in zip(self._runs.runs, failed, strict=True)

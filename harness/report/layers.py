@@ -7,7 +7,7 @@ What is drawn in `currentColor` is light on dark and dark on light.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from harness.report.drawing.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
 
 Spec = dict[str, Any]
 Rows = Sequence[Mapping[str, Any]]

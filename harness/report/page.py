@@ -18,8 +18,7 @@ from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
 from harness.report.decision_charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
-from harness.report.drawing.ground import roads
-from harness.report.drawing.scene import VIEW_M
+from harness.report.drawing.geometry import VIEW_M, roads
 from harness.report.panels import panels
 from harness.report.runs import Runs
 
@@ -97,7 +96,7 @@ def render(
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     """What the page's script has to know of the runs, besides the decisions."""
-    outline, marks, stops = roads(VIEW_M + 5.0)
+    outline, marks, stops = roads()
     return {
         "names": runs.names,
         "runs": [

@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from harness.evaluate.success import driver_choices, judge_choices, table
+from harness.evaluate.success import reference_success
 from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
 from harness.runs.folder import Run
-from harness.world.drivers import DRIVERS
 
 Part = Literal["overview", "answers", "communication"]
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
@@ -125,8 +124,4 @@ def _references(runs: Runs) -> dict[str, float]:
     driven = replace(
         runs.dataset, scenes=tuple(s for s in runs.dataset.scenes if s.record["episode"] in episodes)
     )
-    laid = table(driven)
-    return {
-        driver: float(judge_choices(laid, driver_choices(driven, driver)).success.mean())
-        for driver in DRIVERS
-    }
+    return reference_success(driven)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.dataset.load import Scene
-from harness.report.drawing.scene import conflict_points
+from harness.report.drawing.geometry import conflict_points
 from harness.runs.folder import Row
 
 

@@ -27,7 +27,6 @@ from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
-OF_RUN = ("model", "prompt", "answer")  # what every line of a CSV file says of its run
 _ANSWER = msgspec.json.Decoder(Answer)
 _ENCODER = msgspec.json.Encoder()
 
@@ -151,15 +150,10 @@ def write(
     answers: Sequence[Answer], scores: Sequence[Score],
 ) -> None:  # fmt: skip
     """Write a run's files, the manifest last. Decisions are rounded already."""
-    of_run = {
-        "model": manifest.model["name"],
-        "prompt": manifest.prompt["version"],
-        "answer": manifest.answer,
-    }
     write_whole(out / "answers.jsonl", _ENCODER.encode_lines(answers))
     decisions.write(out / "decisions.parquet")
-    write_whole(out / "episodes.csv", csv_text(Episode, episodes, of_run))
-    write_whole(out / "summary.csv", csv_text(Score, scores, of_run))
+    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.of_run))
+    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.of_run))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
 

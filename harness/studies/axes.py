@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.coordination.consensus import NAMES, RULES
+from harness.coordination.consensus import POOLS, names
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
 
@@ -50,7 +50,7 @@ AXES = {
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
         Axis("latency", "nominal latency of the channel, ms", "latency_s", 1e-3, "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", "window_s", 1e-3, "150:400:25"),
-        Axis("consensus", "consensus", "consensus", 1.0, ",".join(RULES)),
+        Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS)),
     )
 }
 
@@ -71,8 +71,8 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.name == "consensus":
         for part in parts:
-            if part not in NAMES:
-                raise unknown("--grid", part, NAMES)
+            if part not in names():
+                raise unknown("--grid", part, names())
         return tuple(dict.fromkeys(parts))
     found = [value for part in parts for value in _values(axis, part)]
     if len(found) > MOST_POINTS:

@@ -7,7 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from harness.core.files import write_whole
-from harness.report.drawing.pictures import COLOURS, GREY, MARKERS, PALE, styled, uri
+from harness.report.drawing.colours import COLOURS, GREY, MARKERS, PALE
+from harness.report.drawing.pictures import styled
+from harness.report.library import picture
 from harness.studies.episode_tables import write_table
 from harness.studies.fidelity import WHO, Fidelity, disagreements
 from harness.studies.figures import save_all
@@ -28,7 +30,7 @@ def write(found: Fidelity, out: Path) -> Path:
     save_all(scatter(found.table), out / "fidelity")
     page = render(
         "fidelity.html.j2",
-        figure=uri((out / "fidelity.svg").read_bytes()),
+        figure=picture((out / "fidelity.svg").read_bytes()),
         rows=[shown(row) for row in found.table.to_dict("records")],
         headline=" ".join(headline(found)),
         ways=disagreements(found.episodes).head(SHOWN).to_dict("records"),

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 
-from harness.report.drawing.pictures import COLOURS, FORMATS, GREY, INK, MARKERS, PALE, save, styled
+from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE
+from harness.report.drawing.pictures import FORMATS, save, styled
 from harness.studies.axes import AXES
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.report.drawing.pictures import uri
+from harness.report.library import picture
 from harness.studies.html import render
 
 if TYPE_CHECKING:
@@ -20,7 +20,8 @@ def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> s
     rows = [shown(row) for row in ledger.itertuples()]
     totals = tally(ledger)
     pictures = {
-        key: uri((folder / f"{key.replace('_', '-')}.svg").read_bytes()) for key in ("figure_a", "figure_b")
+        key: picture((folder / f"{key.replace('_', '-')}.svg").read_bytes())
+        for key in ("figure_a", "figure_b")
     }
     off = {v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF}
     return render("paper.html.j2", manifest=manifest, rows=rows, off=off, **pictures, **totals)

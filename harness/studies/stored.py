@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.channel import Draws
+from harness.coordination.coordinate import Fusion
 from harness.coordination.exchange import nearest
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools
@@ -82,7 +83,7 @@ class Stored:
     def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
         """Every decision at one operating point, with the ego and so many of the nearest vehicles."""
         known = self._with(vehicles)
-        yield self._laid, score(self._laid, known, point, seed, self._draw(seed), self._second)
+        yield self._laid, score(self._laid, known, point, seed, self._draw(seed), Fusion(self._second))
 
     def _with(self, vehicles: int) -> Answered:
         return replace(self._known, valid=self._known.valid & self._there(vehicles - 1))

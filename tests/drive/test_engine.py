@@ -9,7 +9,7 @@ from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, decisions, dr
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.noise import uniforms
 from harness.evaluate.branches import Decision, Episode, Trajectory
-from harness.evaluate.live import P, _luck, frames
+from harness.evaluate.live import P, _draws, frames
 from harness.evaluate.scoring import draw
 from harness.evaluate.success import table
 from harness.world import reference as live
@@ -165,10 +165,10 @@ def test_who_is_driven_beside_changes_nothing():
 def test_the_luck_is_the_frozen_runs(small):
     drawn = draw(table(small), 3, (len(small.scenes), 3))
     first = small.scenes[0].record["episode_seed"]
-    assert np.array_equal(_luck(3, first, 3)[:2].T, drawn.link[0])
-    assert np.array_equal(_luck(3, first, 3)[2 + 4], drawn.jitter[4])
+    assert np.array_equal(_draws(3, first, 3)[:2].T, drawn.link[0])
+    assert np.array_equal(_draws(3, first, 3)[2 + 4], drawn.jitter[4])
     assert P.decisions == 6
-    assert uniforms((8, 3), "channel", 3, first).tolist() == _luck(3, first, 3).tolist()
+    assert uniforms((8, 3), "channel", 3, first).tolist() == _draws(3, first, 3).tolist()
 
 
 def test_helpers_that_cannot_be_heard_make_no_difference_but_time():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.coordination.consensus import RULES
+from harness.coordination.consensus import POOLS
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.studies.axes import AXES, axis_of, grid
@@ -51,5 +51,5 @@ def test_values_take_the_axis_unit() -> None:
 def test_unknown_axes_and_rules_name_what_there_is() -> None:
     with pytest.raises(UserError, match="--over"):
         axis_of("speed")
-    with pytest.raises(UserError, match=next(iter(RULES))):
+    with pytest.raises(UserError, match=next(iter(POOLS))):
         grid(AXES["consensus"], "mode")

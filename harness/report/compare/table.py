@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.coordination.channel import PROFILES
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import brier, negative_log_likelihood, safe_target
 from harness.evaluate.live_spec import FORMAT as DRIVEN
@@ -106,4 +105,4 @@ def _loss(point: OperatingPoint) -> float | None:
     """Probability that a crossing is lost; None where it hangs on who is there, which no frozen row says."""
     if point.profile is None or point.density_coupled or point.helper_rounds:
         return None
-    return PROFILES[point.profile].loss if point.loss is None else point.loss
+    return getattr(point.channel, "loss", None)

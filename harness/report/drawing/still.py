@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,17 +16,16 @@ from numpy.typing import NDArray
 
 from harness.core.errors import printable
 from harness.evaluate.replay import Played, Still
-from harness.report.drawing.ground import ground, north_up
-from harness.report.drawing.pictures import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILLION
-from harness.report.drawing.scene import LOOKS
+from harness.report.drawing.colours import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILLION
+from harness.report.drawing.geometry import VIEW_M, north_up
+from harness.report.drawing.ground import TEXT_PT, ground
+from harness.report.drawing.scene import style_of
 from harness.world.scenarios.occluded_intersection import ACTIONS
 from harness.world.state import Building, VehicleState, WorldState
 
 Pixels = NDArray[np.uint8]  # (height, width, 3)
 
-VIEW_M = 80.0
 SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
-TEXT_PT = 6.5
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 EYES = (BLUE, GREEN, PURPLE, ORANGE)  # of the ego and the helpers: lines to what each sees
 
@@ -39,9 +37,7 @@ class Canvas:
         self.played = played
         height = SIDE_IN + BARS_IN
         self.figure = Figure(figsize=(SIDE_IN, height), dpi=DPI)
-        self.axes = self.figure.add_axes((0.0, BARS_IN / height, 1.0, SIDE_IN / height))
-        self.axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[])
-        ground(self.axes, buildings, VIEW_M, TEXT_PT)
+        self.axes = ground(self.figure, (0.0, BARS_IN / height, 1.0, SIDE_IN / height), buildings)
         self.bars = self.figure.add_axes((0.62, 0.28 / height, 0.35, 0.8 / height))
         self.bars.set(xlim=(0, 1), ylim=(len(ACTIONS) - 0.5, -0.5), xticks=[0, 0.5, 1])
         self.bars.set_yticks(range(len(ACTIONS)), labels=ACTIONS, size=7)
@@ -91,12 +87,9 @@ def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
 
 def _vehicle(vehicle: VehicleState, known: bool) -> Artist:
     """Filled if the ego knew of it when its last decision began."""
-    style: dict[str, Any] = dict(LOOKS[vehicle.part])
-    if vehicle.crashed:
+    style = style_of(vehicle.part, not known)
+    if known and vehicle.crashed:
         style["facecolor"] = VERMILLION
-    if not known:
-        style |= {"facecolor": "none", "linestyle": (0, (2, 1.2))}
-        style.pop("hatch", None)
     return Polygon(north_up(vehicle.corners()), **style)
 
 
@@ -104,13 +97,8 @@ def _names(vehicles: Iterable[VehicleState]) -> Artist:
     """Every vehicle's id beside it, as one outline, which costs a fifth of as many texts."""
     at = north_up(np.array([(v.x_m, v.y_m) for v in vehicles])) + 2.5
     outlines = [_outline(v.id) for v in vehicles]
-    path = Outline.make_compound_path(
-        *(
-            Outline(outline.vertices + place, outline.codes)
-            for outline, place in zip(outlines, at, strict=True)
-        )
-    )
-    return PathPatch(path, facecolor=INK, edgecolor="none")
+    moved = [Outline(o.vertices + place, o.codes) for o, place in zip(outlines, at, strict=True)]
+    return PathPatch(Outline.make_compound_path(*moved), facecolor=INK, edgecolor="none")
 
 
 @lru_cache

@@ -1,0 +1,258 @@
+"""Channels and rules that the harness does not have, one of each, and what holds for every plug-in."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.coordination.channel import CHANNELS, Channel, Delivery, Draws, Links, Radio, link_up
+from harness.coordination.consensus import RULES, Fused, Messages, Rule, linear_pool
+from harness.coordination.coordinate import Coordination, Fusion, coordinate
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
+from harness.core.plugins import Plugins
+
+
+@dataclass(frozen=True)
+class Fog:
+    """A channel whose loss grows with range, so that each link has its own."""
+
+    latency_s: float = 0.01
+    loss_per_m: float = 0.01
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        loss = links.range_m * self.loss_per_m
+        delay_s = np.where(links.asked, links.ready_s + self.latency_s, np.inf)
+        return Delivery(link_up(draws.link, loss), delay_s, loss)
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A rule with memory: the mean of what it would do now and of what it did at the last step."""
+
+    def start(self, batch, helpers, actions):
+        return np.full((*batch, actions), np.nan)
+
+    def fuse(self, messages, state):
+        now = linear_pool(messages.intents, messages.weights)
+        policy = np.where(np.isnan(state), now, (now + state) / 2)
+        return Fused(policy, messages.weights, policy)
+
+
+@pytest.fixture(autouse=True)
+def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CHANNELS._loaded, "fog", Fog())
+    monkeypatch.setitem(RULES._loaded, "smooth", Smooth())
+
+
+def step(
+    point: OperatingPoint, helper, crosses, state=None, own=(0.5, 0.5), range_m=(10.0,), link=None
+) -> Coordination:
+    """One step of episodes (E,), each with one helper as far from the conflict zone as the ego."""
+    helper, crosses = np.array(helper, dtype=float), np.array(crosses)
+    shape = crosses.shape
+    intents = Intents(
+        own=np.broadcast_to(own, (*shape, 2)),
+        helpers=helper[..., None, :],
+        valid=np.ones((*shape, 1), dtype=bool),
+        distance_m=np.full((*shape, 2), 10.0),
+        range_m=np.broadcast_to(range_m, (*shape, 1)),
+        payload_bits=np.zeros((*shape, 1)),
+        inference_s=np.full((*shape, 2), 0.1),
+    )
+    link = np.where(crosses, 0.99, 0.0)[..., None, None] * np.ones(2)
+    return coordinate(point, intents, Draws(link, np.zeros((*shape, 1))), Fusion(state=state))
+
+
+def test_a_rule_with_memory_is_driven_step_by_step():
+    """What is heard makes .75, then nobody is heard, then .25: means of now and before are .75, .625, .4375.
+
+    A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
+    """
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    first = step(point, [(1.0, 0.0), (0.5, 0.5)], [True, True])
+    assert first.fused.tolist() == [[0.75, 0.25], [0.5, 0.5]]
+    second = step(point, [(1.0, 0.0), (0.5, 0.5)], [False, True], first.state)
+    assert second.lost.tolist() == [1, 0]
+    assert second.fused.tolist() == [[0.625, 0.375], [0.5, 0.5]]
+    third = step(point, [(0.0, 1.0), (0.5, 0.5)], [True, True], second.state)
+    assert third.fused.tolist() == [[0.4375, 0.5625], [0.5, 0.5]]
+    assert third.action.tolist() == [1, 0]
+
+
+def test_an_episode_takes_its_memory_along_wherever_its_row_is():
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    state = step(point, [(1.0, 0.0), (0.0, 1.0)], [True, True]).state
+    alone = step(point, [(0.0, 1.0)], [True], state[[1]])
+    assert alone.fused.tolist() == [[0.25, 0.75]]
+    single = step(point, (0.0, 1.0), True, state[1])
+    assert single.fused.tolist() == [0.25, 0.75]
+
+
+def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
+    """Sure of the first action, it does not ask: half of (.9, .1) and half of (.25, .75)."""
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    doubt = step(point, (0.0, 1.0), True)
+    sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
+    assert not sure.triggered
+    assert sure.fused == pytest.approx([0.575, 0.425])
+
+
+def test_a_rule_without_memory_leaves_no_state():
+    assert step(OperatingPoint("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (1, 0)
+
+
+def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
+    """An unsure ego and three helpers; their draws are all the same."""
+    intents = Intents(
+        np.full(2, 0.5), np.full((3, 2), 0.5), np.ones(3, bool), np.ones(4), np.array(range_m), np.zeros(3),
+        np.full(4, 0.1),
+    )  # fmt: skip
+    return intents, Draws(np.full((3, 2), link), np.zeros(3))
+
+
+def test_a_channel_may_lose_each_link_by_itself():
+    """1 % a metre: where all draws are .35, the links of 10 and 30 m are up and that of 50 is not."""
+    point = OperatingPoint("x", "fog", tau_nats=0.5)
+    decision = coordinate(point, *three(link=0.35))
+    assert decision.delivered.tolist() == [True, True, False]
+    assert decision.arrival_s == pytest.approx([0.11, 0.11, np.inf])
+    assert decision.loss == pytest.approx(0.3), "the mean over those asked"
+    assert coordinate(replace(point, max_helpers=2), *three()).loss == pytest.approx(0.2)
+    assert np.isnan(coordinate(replace(point, max_helpers=0), *three()).loss)
+
+
+def test_a_points_overrides_are_fields_of_its_channel():
+    point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
+    assert point.channel == Fog(latency_s=0.05)
+    assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
+    v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
+    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel == OperatingPoint("y", None).channel
+
+
+@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
+def test_an_override_that_a_channel_does_not_have_is_refused(override):
+    [name] = override
+    with pytest.raises(
+        UserError, match=f"'x': {name} is .*; it must be left out: channel profile fog has no"
+    ):
+        OperatingPoint("x", "fog", **override)
+
+
+# -- every plug-in, those of installed packages included ---------------------------------------------------
+
+
+def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws]:
+    rng = np.random.default_rng(seed)
+    asked = rng.random(shape) < 0.6
+    links = Links(
+        asked,
+        np.where(asked, rng.uniform(0, 0.1, shape), np.nan),
+        np.where(asked, rng.uniform(1, 90, shape), np.nan),
+        np.where(asked, rng.uniform(0, 8000, shape), np.nan),
+        asked | (rng.random(shape) < 0.5),
+        asked & (rng.random(shape) < 0.5),
+    )
+    return links, Draws(rng.random((*shape, 2)), rng.random(shape))
+
+
+@pytest.mark.parametrize("name", [*CHANNELS, "fog"])
+def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
+    channel = CHANNELS[name]
+    links, draws = links_and_draws((40, 4))
+    up, delay_s, loss = channel.deliver(links, draws)
+    assert up.shape == delay_s.shape == (40, 4)
+    assert loss.shape in ((40, 4), (40, 1))
+    assert np.array_equal(np.isfinite(delay_s), links.asked)
+    assert np.all((delay_s >= links.ready_s)[links.asked])
+    assert np.nanmin(loss) >= 0
+    assert np.nanmax(loss) <= 1
+    row = Links(**{field: getattr(links, field)[7] for field in links.__dataclass_fields__})
+    for batch, single in zip((up, delay_s, loss), channel.deliver(row, draws.take(7)), strict=True):
+        assert np.array_equal(batch[7], single, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", [*RULES, "smooth"])
+def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
+    rule, rng = RULES[name], np.random.default_rng(1)
+    state = rule.start((20,), 3, 4)
+    alone = rule.start((), 3, 4)
+    for _ in range(3):
+        heard = rng.random((20, 3)) < 0.6
+        weights = np.insert(heard, 0, True, axis=-1) * rng.uniform(0.1, 1, (20, 4))
+        weights /= weights.sum(axis=-1, keepdims=True)
+        intents = rng.dirichlet(np.ones(4), (20, 4))
+        messages = Messages(
+            intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3))
+        )
+        fused = rule.fuse(messages, state)
+        assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
+        assert (fused.policy >= 0).all()
+        row = Messages(**{field: getattr(messages, field)[7] for field in messages.__dataclass_fields__})
+        single = rule.fuse(row, alone)
+        assert single.policy == pytest.approx(fused.policy[7])
+        state, alone = fused.state, single.state
+
+
+# -- how packages add them ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package with a channel, and with three entries that do not work."""
+    info = tmp_path / "radios-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: radios\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
+        "broken = radios:NONE\nodd = radios:ODD\n"
+    )
+    (tmp_path / "radios.py").write_text(
+        "from harness.coordination.channel import Radio\n"
+        "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
+        "ODD = 7\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CHANNELS, "_loaded", dict(CHANNELS.built_in))
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_package_adds_a_channel_and_replaces_none():
+    assert OperatingPoint("x", "slow-radio").channel.latency_s == 0.5
+    assert OperatingPoint("x", "v2x").channel.latency_s == 0.025
+    assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
+    with pytest.raises(
+        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"
+    ):
+        OperatingPoint("x", "slowradio")
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        (
+            "broken",
+            r"plug-in 'broken' \(swarmdrive.channels\): radios:NONE does not load \(.*'NONE'.*\); repair",
+        ),
+        (
+            "odd",
+            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair or uninst",
+        ),
+    ],
+)
+def test_a_package_that_does_not_work_is_one_line(name: str, says: str):
+    with pytest.raises(UserError, match=says) as error:
+        OperatingPoint("x", name)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_built_in_needs_no_look_at_the_packages(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Plugins, "_entries", lambda self: pytest.fail("looked"))
+    OperatingPoint("x", "6g", consensus="median")
+    assert isinstance(CHANNELS["6g"], Radio)
+    assert isinstance(Radio(0.0, 0.0, 1.0, "serial", 0.0), Channel)
+    assert isinstance(RULES["linear"], Rule)
