@@ -44,11 +44,11 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
         yield words.success(c, pair)
         for name, some in (("gained", c.gained), ("lost", c.lost)):
             if some:
-                yield f"  {name}: {words.turned(some, pair, most)}"
+                yield f"  {name}: {words.flips(some, pair, most)}"
     if not found.answers:
         yield "answers: none changed its verdict"
     for t in found.answers:
-        yield f"answers: {words.answers_turned(t, found)}"
+        yield f"answers: {words.answers_flipped(t, found)}"
         yield "  " + ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
     yield from map(words.judged, verdicts)
 
@@ -72,12 +72,12 @@ def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
         for name, some in (("gained", c.gained), ("lost", c.lost)):
             if some:
-                said += [f"- {name}: {code(words.turned(some, pair, most))}"]
+                said += [f"- {name}: {code(words.flips(some, pair, most))}"]
         said += [""]
     said += ["<details><summary>Answers and settings</summary>", ""]
     for t in found.answers:
         ids = ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
-        said += [f"- {code(words.answers_turned(t, found))}: {code(ids)}"]
+        said += [f"- {code(words.answers_flipped(t, found))}: {code(ids)}"]
     said += [] if found.answers else ["- no answer changed its verdict"]
     said += [f"- {code(f'{name}: {_setting(a)} → {_setting(b)}')}" for name, a, b in found.settings]
     return "\n".join([*said, "", "</details>"])

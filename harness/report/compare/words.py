@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from harness.core.errors import printable
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
-from harness.report.compare.difference import AnswersTurned, Comparison, Difference, InCondition, Turned
+from harness.report.compare.difference import AnswersFlipped, Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
-from harness.report.words import unit
+from harness.runs.metrics import unit
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def line(d: Difference) -> Line:
 
 def who(side: Side) -> str:
     """Model, prompt and answer mode of a run."""
-    config = side.run.config
-    return f"{config['model']['name']} · prompt {config['prompt']['version']} · {side.run.answer}"
+    of_run = side.run.manifest.of_run
+    return f"{of_run['model']} · prompt {of_run['prompt']} · {of_run['answer']}"
 
 
 def paired(pair: Pair) -> str:
@@ -48,7 +48,7 @@ def paired(pair: Pair) -> str:
     said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
-        episodes = len(side.episodes) - len(pair.episodes)
+        episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             said += f"; only {name} has {', '.join(conditions)}"
         if episodes:
@@ -64,7 +64,7 @@ def differing(found: Comparison) -> str:
 
 def success(c: InCondition, pair: Pair) -> str:
     """How many successes were gained and lost, and what the test says."""
-    gained, lost = (sum(len(t.seeds) for t in turned) for turned in (c.gained, c.lost))
+    gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
     said = f"success: {gained} gained, {lost} lost of {of}"
     if c.test is None:
@@ -76,7 +76,7 @@ def success(c: InCondition, pair: Pair) -> str:
     return f"{said}; {how} {ends} points, 95 %"
 
 
-def turned(some: Sequence[Turned], pair: Pair, most: int) -> str:
+def flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
     said = []
     for t in some[:most]:
@@ -91,7 +91,7 @@ def more(n: int, most: int) -> list[str]:
     return [f"{n - most} more"] if n > most else []
 
 
-def answers_turned(t: AnswersTurned, found: Comparison) -> str:
+def answers_flipped(t: AnswersFlipped, found: Comparison) -> str:
     """How many answers of a role changed their verdict."""
     return f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}"
 
