@@ -6,45 +6,39 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import ask_all, requests
-from harness.evaluate.evaluate import Evaluated, evaluate
-from harness.evaluate.intents import Answered, intents
-from harness.evaluate.scoring import Scored, draw, score
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.live_world import LiveSource
+from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
-from harness.evaluate.success import Table, table
 from harness.prompts import versions as prompts
+from harness.runs.records import Score
 
-FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
+FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
 
 
 def spec_of(dataset: Dataset, model: str = "proxy", prompt: str = "v2", **options: Any) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(cards.resolve(model), prompts.load(prompt), dataset, **options)
+    return Spec(cards.resolve(model), prompts.load(prompt), FrozenSource(dataset), **options)
+
+
+def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:
+    options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
+    return Spec(cards.resolve(model), prompts.load("v2"), LiveSource(first_seed, episodes), **options)
 
 
 def run(spec: Spec, out: Path, resume: bool = False) -> Evaluated:
     return evaluate(spec, out, resume, lambda done: None)
 
 
-def rows_of(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
-
-
-def decisions(rows: list[dict[str, Any]], condition: str) -> list[dict[str, Any]]:
-    return [d for row in rows for d in row["decisions"] if d["condition"] == condition]
-
-
-def figure(done: Evaluated, condition: str, metric: str, interval: str = "episodes") -> Any:
+def figure(done: Evaluated, condition: str, metric: str, interval: str = "episodes") -> Score:
     """The one row of a summary that says this."""
-    t = done.summary
-    [row] = t[(t.condition == condition) & (t.metric == metric) & (t.interval == interval)].itertuples()
-    return row
+    wanted = (condition, metric, interval)
+    [score] = [s for s in done.scores if (s.condition, s.metric, s.interval) == wanted]
+    return score
 
 
 class Scripted:
@@ -79,22 +73,6 @@ def says(p: Sequence[float], role: str = "ego", actions: Sequence[str] = ("SLOWE
 
 def sure(action: str, role: str = "ego") -> str:
     return says([float(a == action) for a in ("SLOWER", "IDLE", "FASTER")], role)
-
-
-def ask(spec: Spec, backend: Backend, folder: Path) -> Answered:
-    """Every answer asked for and read."""
-    by_id = ask_all(
-        spec, backend, requests(spec, spec.dataset.scenes), folder / "answers.jsonl", lambda done: None
-    )
-    return intents(spec.dataset, by_id, spec.answer, spec.thinking)
-
-
-def scored(
-    spec: Spec, known: Answered, point: OperatingPoint, seed: int = 0, infer_s: float = 0.1
-) -> tuple[Table, Scored]:
-    laid = table(spec.dataset)
-    timed = replace(known, inference_s=np.full(known.distance_m.shape, infer_s))
-    return laid, score(laid, timed, point, seed, draw(laid, seed, known.valid.shape))
 
 
 def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:

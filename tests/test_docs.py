@@ -11,7 +11,7 @@ from harness.backends.failures import Failures
 from harness.coordination.consensus import EGO_PROMPT, POOLS
 from harness.coordination.operating_point import POINTS, SETTINGS
 from harness.parsing.parse import Repair, Status
-from harness.report.compare.table import METRICS
+from harness.report.compare.gate import NAMES
 
 ROOT = Path(__file__).parent.parent
 
@@ -57,6 +57,6 @@ def test_every_consensus_is_documented(name: str) -> None:
     assert f"| `{name}` |" in (ROOT / "docs/operating-points.md").read_text()
 
 
-@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("metric", NAMES)
 def test_every_metric_that_runs_are_compared_by_is_documented(metric: str) -> None:
     assert f"`{metric}`" in (ROOT / "docs/comparing.md").read_text()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
@@ -107,7 +108,9 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Whole numbers (n,)."""
+        """Whole numbers (n,). ValueError if one is unknown."""
+        if self.table[name].null_count:
+            raise ValueError(f"{name} is unknown")
         return self[name].astype(np.int64)
 
     def flags(self, name: str) -> Bools:
@@ -132,7 +135,7 @@ class Decisions:
         position = {label: place for place, label in enumerate(names)}
         own = column.dictionary.to_pylist()
         if others := [label for label in own if label not in position]:
-            raise ValueError(f"{name} {others[0]!r}")
+            raise ValueError(f"unknown {name} {others[0]!r}")
         lookup = np.array([*(position[label] for label in own), -1])
         return cast(Ints, lookup[column.indices.fill_null(len(own)).to_numpy(zero_copy_only=False)])
 
@@ -171,6 +174,11 @@ class Decisions:
         fused = tuple(row[f"fused_{action}"] for action in self.actions)
         return Decision(**{**plain, "fused": fused, "messages": messages})
 
+    def infinite(self) -> str | None:
+        """Name of a column with an infinite number; None if there is none."""
+        numbers = [one.name for one in self.table.schema if one.type == NUMBER]
+        return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
+
     def take(self, which: Any) -> "Decisions":
         """Some of the decisions, by their positions."""
         return Decisions(self.table.take(pa.array(which)), self.actions, self.helpers)
@@ -201,7 +209,8 @@ class Decisions:
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
         """Read a Parquet file. Raises OSError or ValueError if it is none, or has not a run's columns."""
-        table = pq.read_table(path)
+        with path.open("rb") as file:  # not read_table, which takes names of folders for columns
+            table = pq.ParquetFile(file).read()
         helpers = sum(name.startswith("helper_") for name in table.column_names)
         wanted = schema(actions, helpers)
         if missing := [name for name in wanted.names if name not in table.column_names]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 
 from harness.core.errors import UserError, printable
@@ -27,6 +28,16 @@ from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
+_BROKEN = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    NotImplementedError,  # of Arrow, for a column of another type
+    RecursionError,
+    OverflowError,
+    csv.Error,
+)
 _ANSWER = msgspec.json.Decoder(Answer)
 _ENCODER = msgspec.json.Encoder()
 
@@ -111,14 +122,20 @@ class Run:
 
     def _decisions(self, file: Path) -> Decisions:
         decisions = Decisions.read(file, self.actions)
-        if not len(decisions):
-            raise ValueError("no decisions")
-        self.grid.places(decisions)
-        decisions.codes("action", self.actions)
+        if (decisions.codes("action", self.actions) < 0).any():
+            raise ValueError("a decision has no action")
+        if infinite := decisions.infinite():
+            raise ValueError(f"{infinite} is infinite")
+        places, step = self.grid.places(decisions), decisions.whole("step")
+        if len(np.unique(np.stack([places, step]), axis=1).T) != len(decisions):
+            raise ValueError("a decision is there twice")
+        begun = np.bincount(places, minlength=len(self.episodes))
+        if (begun != [episode.decisions for episode in self.episodes]).any():
+            raise ValueError("not every decision of episodes.csv is there")
         return decisions
 
     def _read(self, name: str, reader: Callable[[Path], T]) -> T:
-        return _whole(self.path / name, reader)
+        return whole(self.path / name, reader)
 
 
 def read(path: Path) -> Run:
@@ -133,7 +150,7 @@ def read(path: Path) -> Run:
             f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
-    stated: Any = _whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
+    stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
     found = stated.get("format") if isinstance(stated, dict) else None
     if found != FORMAT:
         old = READ_BY.get(found) if isinstance(found, str) else None
@@ -142,7 +159,7 @@ def read(path: Path) -> Run:
             + (f"harness {old} reads it: run again, or install that version" if old
                else "give a folder made by `harness eval` or `harness drive`")
         )  # fmt: skip
-    return Run(path, _whole(file, lambda file: msgspec.convert(stated, Manifest)))
+    return Run(path, whole(file, lambda file: msgspec.convert(stated, Manifest)))
 
 
 def write(
@@ -172,7 +189,7 @@ def write_part(
 
 def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[Answer]]:
     """What `write_part` wrote. Raises UserError if it is broken."""
-    return _whole(part, lambda part: (
+    return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
         _answers(part / "answers.jsonl", len(actions)),
     ))  # fmt: skip
@@ -215,7 +232,12 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
 
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     with file.open(encoding="utf-8", newline="") as lines:
-        rows = list(csv.DictReader(lines))
+        reader = csv.DictReader(lines, strict=True)
+        if missing := [
+            name for name in kind.__struct_encode_fields__ if name not in (reader.fieldnames or ())
+        ]:
+            raise ValueError(f"it lacks {', '.join(missing)}")
+        rows = list(reader)
     hints = zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True)
     optional = {name for name, hint in hints if type(None) in get_args(hint)}
     return tuple(
@@ -234,9 +256,10 @@ def _answers(file: Path, actions: int) -> list[Answer]:
     return answers
 
 
-def _whole(file: Path, reader: Callable[[Path], T]) -> T:
+def whole(file: Path, reader: Callable[[Path], T]) -> T:
+    """What a reader makes of a file. Raises UserError if it is broken."""
     try:
         return reader(file)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError, OverflowError, csv.Error) as error:
+    except _BROKEN as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{printable(file)} is broken ({printable(reason)}); make the run again") from None

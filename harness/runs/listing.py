@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.evaluate.evaluate import CONFIG, WORK
-from harness.evaluate.live_spec import FORMAT as DRIVE
-from harness.evaluate.spec import FORMAT as EVAL
+from harness.runs.formats import CONFIG, FORMAT, READ_BY, WORK
 
 DEPTH = 2  # a sweep lies in its run's folder, and a driven study's run in the study's
-KINDS = {EVAL: "eval", DRIVE: "drive"}
+KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
 _BROKEN = (
     OSError,
@@ -39,7 +37,8 @@ class Listed:
         kind: `eval`, `drive`, `sweep` or `study`; `run` where a broken one does not say.
         state: `finished`, `unfinished` or `broken`.
         date: when it was begun; of a study and a broken run, when it was last written.
-        why: of an unfinished one, the option that goes on with it; of a broken one, the file at fault.
+        why: of an unfinished one, the option that goes on with it; of a broken one, the file at fault, and
+            whose format it has where that is an older version's.
         model: name of its card; of a sweep, its sources.
         prompt: version.
         answer: answer mode.
@@ -107,8 +106,9 @@ def _one(path: str, root: str) -> Listed | None:
     if has(WORK, CONFIG):
         try:
             begun = _json(path, WORK, CONFIG)
-            made = Listed("", _kind(begun["settings"]), "unfinished", _date(begun["created"]), "--resume")
-            return _described(made, {**begun["settings"], "tags": begun.get("tags", ())})
+            kind = KINDS[begun["settings"]["world"]["kind"]]
+            made = Listed("", kind, "unfinished", _date(begun["created"]), "--resume")
+            return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     for name, kind in STUDIES.items():
@@ -120,7 +120,7 @@ def _one(path: str, root: str) -> Listed | None:
                 return Listed("", kind, "finished", written, model=model or None)
             except _BROKEN:
                 return Listed("", kind, "broken", written, name)
-    if has("rows.jsonl") or has("summary.csv"):  # the manifest is written last
+    if has("answers.jsonl") or has("summary.csv"):  # the manifest is written last
         return Listed("", "run", "broken", written, "run.json")
     return None
 
@@ -129,7 +129,11 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
     made = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
-        made = replace(made, kind=KINDS[config["format"]], date=_date(config["created"]))
+        if config["format"] in READ_BY:
+            return replace(made, why=f"run.json: format of harness {READ_BY[config['format']]}")
+        if config["format"] != FORMAT:
+            return made
+        made = replace(made, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         made = replace(_described(made, config), why="summary.csv")
         if not has_summary:
             return made
@@ -147,17 +151,13 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
         return made
 
 
-def _kind(settings: dict[str, Any]) -> str:
-    return "drive" if "scenario" in settings else "eval"
-
-
 def _described(made: Listed, config: dict[str, Any]) -> Listed:
     return replace(
         made,
         model=str(config["model"]["name"]),
         prompt=str(config["prompt"]["version"]),
-        answer=str(config.get("answer", "json")),  # runs of older versions name none, and had one
-        tags=tuple(map(str, config.get("tags", ()))),
+        answer=str(config["answer"]),
+        tags=tuple(map(str, config["tags"])),
     )
 
 

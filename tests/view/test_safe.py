@@ -122,7 +122,7 @@ def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path
     assert made.status_code == 200
     assert SECRET not in made.text
     assert "Conditions side by side" in made.text
-    for file in ("rows.jsonl", "episodes.csv"):
+    for file in ("decisions.parquet", "answers.jsonl", "episodes.csv"):
         (reports / "second" / file).rename(outside / file)
         (reports / "second" / file).symlink_to(outside / file)
         for page in ("/run?path=second", "/report?path=second", "/compare?path=first&path=second"):

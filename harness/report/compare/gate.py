@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.difference import Comparison
-from harness.report.compare.table import METRICS
+from harness.runs.metrics import METRICS, PERCENTILES
 
+NAMES = (*METRICS, *(f"latency_p{percent}_ms" for percent in PERCENTILES))
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
@@ -65,8 +66,8 @@ def gate(text: str) -> Gate:
             f"--fail-if {printable(text)!r} cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as '6g:success_rate < -0.01'"
         )
-    if found["metric"] not in METRICS:
-        raise unknown("metric of --fail-if", found["metric"], METRICS)
+    if found["metric"] not in NAMES:
+        raise unknown("metric of --fail-if", found["metric"], NAMES)
     if found["end"] not in (None, *ENDS):
         raise unknown(f"end of {found['metric']}'s interval in --fail-if", found["end"], ENDS)
     condition = found["condition"]

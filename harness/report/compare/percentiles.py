@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean
-from harness.runs.summary import PERCENTILES
+from harness.runs.metrics import PERCENTILES
 
 RESAMPLES, RESAMPLING_SEED = 999, 0
 AT_ONCE = 4_000_000  # numbers that are laid out together

@@ -43,7 +43,7 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
     if not found.answers:
         yield "answers: none changed its verdict"
-    for turned, requests in words.answers_turned(found, most):
+    for turned, requests in words.answers_flipped(found, most):
         yield f"answers: {turned}"
         yield f"  {requests}"
     yield from map(words.judged, verdicts)
@@ -62,7 +62,7 @@ def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
         said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         said += [""]
     said += ["<details><summary>Answers and settings</summary>", ""]
-    said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_turned(found, most)]
+    said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(found, most)]
     said += [] if found.answers else ["- no answer changed its verdict"]
     said += [f"- {code(setting)}" for setting in words.settings(found)]
     return "\n".join([*said, "", "</details>"])

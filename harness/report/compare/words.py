@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from harness.core.errors import printable
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
-from harness.report.compare.difference import Comparison, Difference, InCondition, Turned
+from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
-from harness.report.words import unit
+from harness.runs.metrics import unit
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def line(d: Difference) -> Line:
 
 def who(side: Side) -> str:
     """Model, prompt and answer mode of a run."""
-    config = side.run.config
-    return f"{config['model']['name']} · prompt {config['prompt']['version']} · {side.run.answer}"
+    of_run = side.run.manifest.of_run
+    return f"{of_run['model']} · prompt {of_run['prompt']} · {of_run['answer']}"
 
 
 def sides(pair: Pair) -> list[tuple[str, str]]:
@@ -53,7 +53,7 @@ def paired(pair: Pair) -> str:
     said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
-        episodes = len(side.episodes) - len(pair.episodes)
+        episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             said += f"; only {name} has {', '.join(conditions)}"
         if episodes:
@@ -69,7 +69,7 @@ def differing(found: Comparison) -> str:
 
 def success(c: InCondition, pair: Pair) -> str:
     """How many successes were gained and lost, and what the test says."""
-    gained, lost = (sum(len(t.seeds) for t in turned) for turned in (c.gained, c.lost))
+    gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
     said = f"success: {gained} gained, {lost} lost of {of}"
     if c.test is None:
@@ -84,10 +84,10 @@ def success(c: InCondition, pair: Pair) -> str:
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
     """What a condition gained and what it lost, where it did: up to so many episodes of each."""
     ways = (("gained", c.gained), ("lost", c.lost))
-    return [(way, _turned(some, pair, most)) for way, some in ways if some]
+    return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
 
-def _turned(some: Sequence[Turned], pair: Pair, most: int) -> str:
+def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
     said = []
     for t in some[:most]:
@@ -97,7 +97,7 @@ def _turned(some: Sequence[Turned], pair: Pair, most: int) -> str:
     return _listed(said, len(some), most)
 
 
-def answers_turned(found: Comparison, most: int) -> list[tuple[str, str]]:
+def answers_flipped(found: Comparison, most: int) -> list[tuple[str, str]]:
     """How many answers of a role changed their verdict, and up to so many of them."""
     return [
         (
