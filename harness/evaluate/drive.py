@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 from harness.core.files import canonical_json, write_whole
 from harness.core.memory import uncollected
 from harness.core.parallel import spread
-from harness.evaluate.evaluate import CONFIG, Evaluated, finished, refuse, tidy, working
+from harness.evaluate.evaluate import Evaluated, finished, refuse, tidy, working
 from harness.evaluate.live import drive
 from harness.evaluate.live_model import begin, opened
-from harness.evaluate.live_spec import FORMAT, Drive
+from harness.evaluate.live_spec import Drive
 from harness.evaluate.spec import versions
 from harness.runs import driven_record as record
 from harness.runs.driven_record import Row
 from harness.runs.driven_summary import summary
 from harness.runs.folder import answers_of
+from harness.runs.formats import CONFIG, DRIVE
 
 if TYPE_CHECKING:
     pass
@@ -100,7 +101,7 @@ def _written(spec: Drive, out: Path, work: Path, begun: Mapping[str, Any]) -> Ev
     result = summary(spec, moments, episodes)
     answers = [a for row in moments for a in answers_of(row).values()]
     manifest = {
-        "format": FORMAT,
+        "format": DRIVE,
         "name": out.name,
         "created": begun["created"],
         "command": spec.command(out),

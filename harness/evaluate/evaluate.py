@@ -22,17 +22,15 @@ from harness.evaluate.asking import Answer, ask_all, requests
 from harness.evaluate.intents import Intents, intents
 from harness.evaluate.merging import Merged
 from harness.evaluate.scoring import draw, score
-from harness.evaluate.spec import FORMAT, Spec, versions
+from harness.evaluate.spec import Spec, versions
 from harness.evaluate.success import Table, table
 from harness.evaluate.timing import inference_s, measure, merge_latency, merge_s, settled
 from harness.runs import record
+from harness.runs.formats import CONFIG, EVAL, WORK
 from harness.runs.summary import summary
 
 if TYPE_CHECKING:
     import pandas as pd
-
-WORK = ".work"
-CONFIG = "config.json"  # what the run was begun with; its work counts only once this is there
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[st
     ]  # fmt: skip
     result = summary(spec, laid, known, runs, second)
     manifest = {
-        "format": FORMAT,
+        "format": EVAL,
         "name": out.name,
         "created": begun["created"],
         "command": spec.command(out),

@@ -13,8 +13,6 @@ from harness.evaluate.spec import Spec, model_argument
 from harness.prompts.versions import Prompt
 from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
 
-FORMAT = "swarmdrive-drive/1"
-
 
 @dataclass(frozen=True)
 class Drive(Spec):

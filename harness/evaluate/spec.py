@@ -16,7 +16,6 @@ from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Dataset
 from harness.prompts.versions import Prompt
 
-FORMAT = "swarmdrive-run/1"
 Latency = Literal["card", "measured", "paper"]
 TAG_CHARACTERS = 40
 

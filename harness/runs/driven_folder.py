@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from harness.core.errors import UserError, printable
-from harness.evaluate.live_spec import FORMAT
 from harness.runs import folder
 from harness.runs.folder import NEEDED, NEEDED_IN_ROW, Form, Row, Run, number
+from harness.runs.formats import DRIVE
 
-LIVE = Form(
-    FORMAT, "harness drive", (*NEEDED, "scenario", "first_seed", "episodes"), (*NEEDED_IN_ROW, "step")
-)
+LIVE = Form(DRIVE, "harness drive", (*NEEDED, "scenario", "first_seed", "episodes"), (*NEEDED_IN_ROW, "step"))
 NUMBERS = ("time_s", "delay_s", "least_gap_m", "hard_brakings", "other_crashes")
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.spec import FORMAT
+from harness.runs.formats import EVAL
 
 T = TypeVar("T")
 Row = dict[str, Any]  # one decision point of rows.jsonl
@@ -34,7 +34,7 @@ class Form:
 
 NEEDED = ("model", "prompt", "actions", "conditions", "seeds", "latency")
 NEEDED_IN_ROW = ("scene", "episode", "danger", "answers", "decisions")
-FROZEN = Form(FORMAT, "harness eval", (*NEEDED, "dataset"), (*NEEDED_IN_ROW, "safe", "delay_s"))
+FROZEN = Form(EVAL, "harness eval", (*NEEDED, "dataset"), (*NEEDED_IN_ROW, "safe", "delay_s"))
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.evaluate.evaluate import CONFIG, WORK
-from harness.evaluate.live_spec import FORMAT as DRIVE
-from harness.evaluate.spec import FORMAT as EVAL
+from harness.runs.formats import CONFIG, DRIVE, EVAL, WORK
 
 DEPTH = 2  # a sweep lies in its run's folder, and a driven study's run in the study's
 KINDS = {EVAL: "eval", DRIVE: "drive"}

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
-from harness.evaluate.live_spec import FORMAT as DRIVE
-from harness.evaluate.spec import FORMAT as EVAL
 from harness.runs.folder import answers_of
+from harness.runs.formats import DRIVE, EVAL
 
 if TYPE_CHECKING:
     import pandas as pd

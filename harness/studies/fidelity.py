@@ -14,10 +14,9 @@ import numpy as np
 
 from harness.core.errors import UserError, printable
 from harness.core.statistics import episode_interval
-from harness.evaluate.live_spec import FORMAT as DRIVEN
-from harness.evaluate.spec import FORMAT as FROZEN
 from harness.evaluate.success import table
 from harness.runs.folder import dataset_of, read
+from harness.runs.formats import DRIVE, EVAL
 from harness.runs.summary import over_episodes
 
 if TYPE_CHECKING:
@@ -55,14 +54,14 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
     """
     import pandas as pd
 
-    told: dict[str, list[pd.DataFrame]] = {FROZEN: [], DRIVEN: []}
+    told: dict[str, list[pd.DataFrame]] = {EVAL: [], DRIVE: []}
     for run in runs:
         kind, episodes = _episodes(run)
         told[kind].append(episodes)
-    for kind, name in ((FROZEN, "frozen scenes (harness eval)"), (DRIVEN, "live episodes (harness drive)")):
+    for kind, name in ((EVAL, "frozen scenes (harness eval)"), (DRIVE, "live episodes (harness drive)")):
         if not told[kind]:
             raise UserError(f"no run on {name} among {len(runs)} folders; give at least one of each kind")
-    frozen, closed = (pd.concat(told[kind], ignore_index=True) for kind in (FROZEN, DRIVEN))
+    frozen, closed = (pd.concat(told[kind], ignore_index=True) for kind in (EVAL, DRIVE))
     for each in (frozen, closed):
         if each.duplicated(list(KEY)).any():
             raise UserError("two of the runs have the same episodes; give one run of each model and prompt")
@@ -94,11 +93,11 @@ def _episodes(run: Path) -> "tuple[str, pd.DataFrame]":
         kind = config["format"]
         text = dict.fromkeys((*WHO, "condition", "failure"), str)
         episodes = pd.read_csv(run / "episodes.csv", dtype=text, keep_default_na=False)
-        if kind == FROZEN:
+        if kind == EVAL:
             laid = table(dataset_of(read(run)))
             seeds = dict(zip(laid.episodes.tolist(), laid.seeds.tolist(), strict=True))
             episodes["layout_seed"] = episodes["episode"].map(seeds)
-        elif kind != DRIVEN:
+        elif kind != DRIVE:
             raise ValueError(f"format {kind}")
         return kind, episodes[[*KEY, "success", "failure"]].astype({"success": bool})
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
-from harness.evaluate.live_spec import FORMAT as DRIVEN
 from harness.report.compare.table import tables
 from harness.report.words import facts
 from harness.runs.driven_folder import LIVE
 from harness.runs.folder import FROZEN, Run, answers_of, read
+from harness.runs.formats import DRIVE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -104,7 +104,7 @@ def _side(path: Path) -> Side:
     run = read(path, FROZEN, LIVE)
     config = run.config
     try:
-        if config["format"] == DRIVEN:
+        if config["format"] == DRIVE:
             scenes = [config["scenario"], config["first_seed"]]
             on = f"{config['scenario']['name']} from layout seed {config['first_seed']}"
         else:

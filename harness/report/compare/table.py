@@ -8,8 +8,8 @@ import numpy as np
 from harness.coordination.channel import PROFILES
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import brier, negative_log_likelihood, safe_target
-from harness.evaluate.live_spec import FORMAT as DRIVEN
 from harness.runs.folder import Run
+from harness.runs.formats import DRIVE
 from harness.runs.summary import PERCENTILES
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def tables(run: Run) -> tuple["pd.DataFrame", "pd.Series[float]"]:
     """
     import pandas as pd
 
-    live = run.config["format"] == DRIVEN
+    live = run.config["format"] == DRIVE
     columns: dict[str, Any] = {
         "condition": str, "seed": int, "episode": int, "success": bool, "failure": str, "messages": float,
     }  # fmt: skip
