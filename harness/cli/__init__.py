@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 import typer
+from typer.main import get_command
 
 from harness.cli import (
     campaign,
@@ -25,38 +26,57 @@ from harness.cli import (
     prompt,
     report,
     scenario,
+    shell,
     sweep,
     video,
     view,
 )
 from harness.core.errors import UserError, printable
 
+COMMANDS: dict[str, dict[str, Any]] = {
+    "Evaluate": {
+        "eval": evaluate.evaluate,
+        "drive": drive.drive,
+        "sweep": sweep.sweep,
+        "compare": compare.compare,
+        "fidelity": fidelity.fidelity,
+        "campaign": campaign.app,
+    },
+    "Look": {
+        "ls": ls.ls,
+        "view": view.view,
+        "report": report.command,
+        "video": video.command,
+        "parse": parse.command,
+    },
+    "Data": {
+        "init": init.init,
+        "prompt": prompt.app,
+        "dataset": dataset.app,
+        "scenario": scenario.app,
+    },
+    "Models": {
+        "distill": distill.distill,
+        "parity": parity.parity,
+        "doctor": doctor.doctor,
+        "model": model.app,
+    },
+}
+
 app = typer.Typer(
     name="harness",
+    cls=shell.Map,
     help="Evaluate prompts and parsing in cooperative driving.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.command("eval")(evaluate.evaluate)
-app.command("drive")(drive.drive)
-app.command("init")(init.init)
-app.command("ls")(ls.ls)
-app.command("view")(view.view)
-app.command("video")(video.command)
-app.add_typer(prompt.app, name="prompt")
-app.add_typer(dataset.app, name="dataset")
-app.add_typer(scenario.app, name="scenario")
-app.add_typer(model.app, name="model")
-app.command("report")(report.command)
-app.command("parse")(parse.command)
-app.command("distill")(distill.distill)
-app.command("sweep")(sweep.sweep)
-app.command("fidelity")(fidelity.fidelity)
-app.command("compare")(compare.compare)
-app.command("doctor")(doctor.doctor)
-app.add_typer(campaign.app, name="campaign")
-app.command("parity")(parity.parity)
+for panel, commands in COMMANDS.items():
+    for name, command in commands.items():
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, rich_help_panel=panel)
+        else:
+            app.command(name, rich_help_panel=panel)(command)
 
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]
@@ -64,8 +84,10 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 def main() -> None:
     """Entry point: bad input is one line on stderr and exit code 2."""
+    program = get_command(app)
+    shell.hasten(program)
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(program(standalone_mode=False))
     except UserError as error:
         _fail(str(error))
     except typer.Abort:

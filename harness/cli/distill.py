@@ -18,21 +18,21 @@ LINE_S = 60.0
 
 
 def distill(
-    dataset: str = typer.Argument(help="A dataset's folder: what it learns from.", metavar="DIR"),
+    dataset: str = typer.Argument(help="A dataset's folder: what the model learns from.", metavar="DIR"),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
     prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
     samples: str = typer.Option(
         SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers."
     ),
-    seed: int = typer.Option(0, help="Of the weights and of the order."),
+    seed: int = typer.Option(0, help="Seed of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
     apart_from: str = typer.Option(
-        resources.DATASET, help="Dataset that it will be evaluated on: no scene may be in both."
+        resources.DATASET, help="Dataset to evaluate the model on: no scene may be in both."
     ),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
-    """Train a small Qwen3 on a frozen dataset; the same command again goes on where a killed one stopped."""
+    """Train a small Qwen3 on a frozen dataset. The same command again continues training that was stopped."""
     from harness.backends.transformers import checkpoint
     from harness.dataset import load
     from harness.prompts import versions as prompts

@@ -1,73 +1,75 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
-import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import typer
 
-from harness.cli.progress import QUIET
+from harness.cli import options
+from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
+from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core import resources
 from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.evaluate.evaluate import Evaluated
     from harness.evaluate.spec import Latency, Spec
 
-MOST_SEEDS = 1000
+COLUMNS = (
+    Column("success % [95 % CI]", "success_rate", 100, interval=True),
+    Column("gain, points", "success_gain_over_single-local", 100, interval=True),
+    Column("latency", "latency_proxy_ms", unit=" ms"),
+    Column("trigger", "trigger_rate", 100, " %"),
+    Column("msgs", "messages_per_episode"),
+)
 
 
 def evaluate(
     model: str = typer.Option(
         "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
     ),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
-    prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
-    dataset: str = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder."),
-    condition: list[str] = typer.Option(
-        [],
-        help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all.",
-    ),
-    seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
-    limit: int | None = typer.Option(None, help="Only the dataset's first so many episodes."),
-    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
-    answer: str = typer.Option("json", help="json: free text; constrained: to the schema; readout: letters."),
-    batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
-    device: str | None = typer.Option(None, help="cpu or cuda."),
-    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
-    latency: str | None = typer.Option(
-        None,
-        help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's.",
-    ),
+    engine: options.Engine = None,
+    prompt: options.Prompt = "v2",
+    dataset: options.Dataset = resources.DATASET,
+    condition: options.Conditions = None,
+    seeds: options.Seeds = "0:5",
+    limit: int | None = typer.Option(None, help="How many of the dataset's episodes. Default: all."),
+    thinking: options.Thinking = False,
+    answer: options.Answer = "json",
+    batch_size: options.BatchSize = 8,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    latency: options.Latency = None,
     out: Path | None = typer.Option(
         None, help="The run's folder. Default: reports/<model>-<prompt>-<dataset>."
     ),
-    resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
-    no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
+    resume: options.Resume = False,
+    no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
     tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
-    tag: list[str] = typer.Option([], help="Word to find the run by. Repeatable."),
-    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
-    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
+    tag: options.Tags = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Evaluate a model with a prompt on frozen scenes, and write a report."""
+    """Evaluate a model with a prompt on frozen scenes. Writes the run's folder, with a report."""
     from harness.backends import cards
+    from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load
+    from harness.evaluate.asking import request_count
+    from harness.evaluate.evaluate import evaluate as evaluate_run
     from harness.evaluate.spec import Spec
-    from harness.prompts import versions as prompts
+    from harness.prompts import versions
 
     if limit is not None and limit < 1:
         raise UserError(f"--limit {limit}: give 1 or more episodes")
     spec = Spec(
         card=cards.resolve(model, engine),
-        prompt=prompts.load(prompt),
+        prompt=versions.load(prompt),
         dataset=load.load(load.find(dataset), limit),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
-        seeds=parse_seeds(seeds),
+        seeds=options.parse_seeds(seeds),
         limit=limit,
         thinking=thinking,
         answer=cast("AnswerMode", answer),
@@ -75,125 +77,31 @@ def evaluate(
         device=device,
         dtype=dtype,
         latency=cast("Latency | None", latency),
-        tags=tuple(dict.fromkeys(tag)),
+        tags=tuple(dict.fromkeys(tag or ())),
     )
     if dry_run:
         _dry_run(spec, tokenizer, as_json, quiet)
         return
-    _run(spec, out or default_out(spec, resume), resume, no_cache, as_json, quiet)
-
-
-def _run(spec: "Spec", out: Path, resume: bool, no_cache: bool, as_json: bool, quiet: bool) -> None:
-    from harness.backends.cache import default_file
-    from harness.cli.progress import bar
-    from harness.evaluate.asking import request_count
-    from harness.evaluate.evaluate import evaluate as evaluate_run
-
-    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), as_json or quiet) as progress:
+    folder = out or default_out(spec, resume)
+    silent = as_json or quiet
+    with bar(f"asking {printable(spec.card.name, 30)}", request_count(spec), silent) as progress:
         cache = None if no_cache else default_file()
-        done = evaluate_run(spec, out, resume, progress, cache, progress.more)
+        done = evaluate_run(spec, folder, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
-    page = write([out], quiet=as_json or quiet)
+    page = write([folder], silent)
     if as_json:
-        typer.echo(json.dumps(as_mapping(done), indent=1))
-    if as_json or quiet:
+        echo_json(as_mapping(done))
+    if silent:
         return
-    _table(done)
+    data = done.manifest["dataset"]
+    notes = (
+        f"n = {data['episodes']} episodes × {len(spec.seeds)} channel seeds; intervals over episodes; "
+        "msgs an episode;",
+        "gain is over single-local, paired by episode",
+    )
+    show(done, data["name"], COLUMNS, notes)
     typer.echo(f"wrote {page}")
-
-
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds from `0:5` (0 to 4) or `3,7,9`."""
-    start, colon, stop = text.partition(":")
-    try:
-        # A range is counted before it is made: 0:99999999999 would not fit into memory.
-        most = int(start) + MOST_SEEDS + 1 if colon else 0
-        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
-    except ValueError:
-        seeds = ()
-    if not 0 < len(seeds) <= MOST_SEEDS:
-        raise UserError(
-            f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
-            f"of {MOST_SEEDS} seeds at most"
-        )
-    return seeds
-
-
-def file_name(model: str) -> str:
-    """A model's name as part of a folder's."""
-    return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
-
-
-def default_out(spec: "Spec", resume: bool) -> Path:
-    """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
-    safe = file_name(spec.card.name)
-    mode = "" if spec.answer == "json" else f"-{spec.answer}"
-    base = Path("reports") / f"{safe}-{spec.prompt.version}{mode}-{spec.dataset.name}"
-    found, number = base, 1
-    last = base
-    while found.exists():
-        last, number = found, number + 1
-        found = base.with_name(f"{base.name}-{number}")
-    return last if resume else found
-
-
-def as_mapping(done: "Evaluated") -> dict[str, Any]:
-    """A finished run for machines: its folder and the rows of its summary."""
-    rows = done.summary.to_dict(orient="records")
-    return {
-        "run": str(done.out),
-        "manifest": done.manifest,
-        "summary": [{k: None if _unknown(v) else v for k, v in row.items()} for row in rows],
-    }
-
-
-def _unknown(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
-
-
-def _table(done: "Evaluated") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from harness.cli.estimates import interval, tell_answers
-
-    console = Console(width=80, markup=False, highlight=False)
-    rows = done.summary[done.summary.interval != "seed means"]
-    figures: Mapping[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
-    table = Table(box=None, width=80, pad_edge=False)
-    table.add_column("condition", overflow="fold")
-    for heading in ("success % [95 % CI]", "gain, points", "latency", "trigger", "msgs"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for point in done.manifest["conditions"]:
-        name = point["name"]
-
-        def cell(metric: str, scale: float = 1.0, ends: bool = False, name: str = name) -> str:
-            r = figures.get((name, metric))
-            if r is None or _unknown(r.value):
-                return "-"
-            return interval(r.value, r.ci_low, r.ci_high, scale) if ends else f"{r.value * scale:.1f}"
-
-        table.add_row(
-            name,
-            cell("success_rate", 100, True),
-            cell("success_gain_over_single-local", 100, True),
-            f"{cell('latency_proxy_ms')} ms",
-            f"{cell('trigger_rate', 100)} %",
-            cell("messages_per_episode"),
-        )
-    m = done.manifest
-    console.print(
-        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · "
-        f"{m['dataset']['name']}"
-    )
-    console.print(table)
-    n = m["dataset"]["episodes"]
-    console.print(
-        f"n = {n} episodes × {len(m['seeds'])} channel seeds; intervals over episodes; msgs an episode;"
-    )
-    console.print("gain is over single-local, paired by episode")
-    tell_answers(console, m, figures)
 
 
 def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:
@@ -209,9 +117,7 @@ def _dry_run(spec: "Spec", tokenizer: Path | None, as_json: bool, quiet: bool) -
             sizes.setdefault(request.role, []).append(count(request.messages))
     stats = {role: spread_of(n) for role, n in sizes.items()}
     if as_json:
-        typer.echo(
-            json.dumps({**spec.settings(), "requests": asked, "prompt_tokens": stats or None}, indent=1)
-        )
+        echo_json({**spec.settings(), "requests": asked, "prompt_tokens": stats or None})
     if as_json or quiet:
         return
     scenes = len(spec.dataset.scenes)
