@@ -4,63 +4,20 @@ Heavy packages load inside the commands, so that `harness --help` answers at onc
 """
 
 import sys
+from importlib import import_module
 from typing import Any
 
 import typer
 from typer.main import get_command
 
-from harness.cli import (
-    campaign,
-    compare,
-    dataset,
-    distill,
-    doctor,
-    drive,
-    evaluate,
-    fidelity,
-    init,
-    ls,
-    model,
-    parity,
-    parse,
-    prompt,
-    report,
-    scenario,
-    shell,
-    sweep,
-    video,
-    view,
-)
+from harness.cli import shell
 from harness.core.errors import UserError, printable
 
-COMMANDS: dict[str, dict[str, Any]] = {
-    "Evaluate": {
-        "eval": evaluate.evaluate,
-        "drive": drive.drive,
-        "sweep": sweep.sweep,
-        "compare": compare.compare,
-        "fidelity": fidelity.fidelity,
-        "campaign": campaign.app,
-    },
-    "Look": {
-        "ls": ls.ls,
-        "view": view.view,
-        "report": report.command,
-        "video": video.command,
-        "parse": parse.command,
-    },
-    "Data": {
-        "init": init.init,
-        "prompt": prompt.app,
-        "dataset": dataset.app,
-        "scenario": scenario.app,
-    },
-    "Models": {
-        "distill": distill.distill,
-        "parity": parity.parity,
-        "doctor": doctor.doctor,
-        "model": model.app,
-    },
+PANELS = {
+    "Evaluate": ("eval", "drive", "sweep", "compare", "fidelity", "campaign"),
+    "Look": ("ls", "view", "report", "video", "parse"),
+    "Data": ("init", "prompt", "dataset", "scenario"),
+    "Models": ("model", "distill", "parity", "doctor"),
 }
 
 app = typer.Typer(
@@ -71,12 +28,13 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for panel, commands in COMMANDS.items():
-    for name, command in commands.items():
-        if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name, rich_help_panel=panel)
+for panel, names in PANELS.items():
+    for name in names:
+        module = import_module(f"harness.cli.{name}")
+        if hasattr(module, "app"):
+            app.add_typer(module.app, name=name, rich_help_panel=panel)
         else:
-            app.command(name, rich_help_panel=panel)(command)
+            app.command(name, rich_help_panel=panel)(module.command)
 
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]

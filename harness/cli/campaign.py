@@ -1,7 +1,6 @@
 """`harness campaign`: whole studies."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import typer
 
@@ -10,10 +9,6 @@ from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.sweep import tables
 from harness.core.errors import printable
-
-if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode
-    from harness.evaluate.spec import Latency
 
 app = typer.Typer(help="Run a whole study: the paper's, or its panels closed-loop.", no_args_is_help=True)
 
@@ -93,9 +88,9 @@ def closed_loop(
         versions.load(prompt),
         tuple(points.values()),
         options.parse_seeds(seeds),
-        answer=cast("AnswerMode", answer),
+        answer=answer,
         batch_size=batch_size,
-        latency=cast("Latency | None", latency),
+        latency=latency,
         first_seed=first_seed,
         episodes=episodes,
     )

@@ -9,7 +9,7 @@ from harness.cli.estimates import echo_json
 from harness.core.errors import UserError, printable
 
 
-def compare(
+def command(
     a: Path = typer.Argument(help="Folder of the base run.", metavar="A"),
     b: Path = typer.Argument(help="Folder of the run that is held against it.", metavar="B"),
     fail_if: list[str] | None = typer.Option(

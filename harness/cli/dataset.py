@@ -121,15 +121,9 @@ def _as_mapping(name: str, episodes: int, agree: bool, standings: dict[str, "Sta
 
 def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None:
     heads = ("driver", "frozen % [95 % CI]", "live % [95 % CI]", "difference, pts", "same %")
-    rows = [
-        (
-            driver,
-            shown(s.frozen),
-            shown(s.live),
-            shown(s.difference_points, 1.0),
-            f"{100 * s.agreement.value:.0f}",
-        )
-        for driver, s in standings.items()
-    ]
+    rows = []
+    for driver, s in standings.items():
+        agreement = f"{100 * s.agreement.value:.0f}"
+        rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
     console().print(f"n = {episodes} episodes; ranks agree: {'yes' if agree else 'no'}")

@@ -17,7 +17,7 @@ BATCH = 16
 LINE_S = 60.0
 
 
-def distill(
+def command(
     dataset: str = typer.Argument(help="A dataset's folder: what the model learns from.", metavar="DIR"),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
     prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),

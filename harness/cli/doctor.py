@@ -11,7 +11,7 @@ from harness.core.errors import printable
 WIDTH, MARGIN = 80, 10
 
 
-def doctor(
+def command(
     gpu: bool = typer.Option(False, "--gpu", help="Ask torch for GPUs too; it takes seconds to load."),
     as_json: options.Json = False,
 ) -> None:

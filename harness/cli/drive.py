@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import typer
 
@@ -12,10 +11,6 @@ from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core.errors import UserError, printable
 from harness.core.resources import DATASET, folder
-
-if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode
-    from harness.evaluate.spec import Latency
 
 ALL = "all"
 COLUMNS = (
@@ -29,7 +24,7 @@ COLUMNS = (
 )
 
 
-def drive(
+def command(
     model: options.Model = "proxy",
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
@@ -79,11 +74,11 @@ def drive(
         tuple(named_point(name) for name in dict.fromkeys(names)),
         options.parse_seeds(seeds),
         thinking=thinking,
-        answer=cast("AnswerMode", answer),
+        answer=answer,
         batch_size=batch_size,
         device=device,
         dtype=dtype,
-        latency=cast("Latency | None", latency),
+        latency=latency,
         tags=tuple(dict.fromkeys(tag or ())),
         first_seed=first_seed,
         episodes=episodes,

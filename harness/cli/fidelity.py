@@ -10,7 +10,7 @@ from harness.core.errors import printable
 LABEL = 16  # characters of a condition's name that leave its row on one line
 
 
-def fidelity(
+def command(
     runs: list[Path] = typer.Argument(
         help="Folders of `harness eval` and of `harness drive`; models may be several.", metavar="RUN..."
     ),

@@ -9,7 +9,7 @@ from harness.core.errors import UserError, printable
 PROMPT = "v2"  # what one's own prompt begins as
 
 
-def init(
+def command(
     folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do."),
 ) -> None:
     """Make a project with a prompt and a model card to change. Commands typed there find them by name."""

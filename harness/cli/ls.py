@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from harness.runs.listing import Listed
 
 
-def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
+def command(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
     """List runs and studies, newest first. Each has the success of its best condition."""
     from harness.runs.listing import runs
 

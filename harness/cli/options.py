@@ -1,11 +1,17 @@
 """Options that several commands have, each declared once."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
 from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
+    from harness.evaluate.spec import Latency as LatencySource
+else:  # typer takes any text; what is evaluated says which are allowed
+    AnswerMode = LatencySource = str
 
 MOST_SEEDS = 1000
 MOST_WORKERS = 256
@@ -23,14 +29,14 @@ Conditions = Annotated[
 Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
 FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
 Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
-Answer = Annotated[str, Option(help="json: free text; constrained: to the schema; readout: letters.")]
+Answer = Annotated[AnswerMode, Option(help="json: free text; constrained: to the schema; readout: letters.")]
 BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
 Workers = Annotated[int, Option(help="Processes.")]
 ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded.")]
 Device = Annotated[str | None, Option(help="cpu or cuda.")]
 Dtype = Annotated[str | None, Option(help="float32, bfloat16 or auto, in place of the card's.")]
 Latency = Annotated[
-    str | None,
+    LatencySource | None,
     Option(help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's."),
 ]
 Resume = Annotated[bool, Option("--resume", help="Continue a run that was stopped.")]

@@ -12,7 +12,7 @@ from harness.core import resources
 from harness.core.errors import UserError, printable
 
 
-def parity(
+def command(
     model: str = typer.Argument(help="Card or directory that names a checkpoint and a GGUF file."),
     prompt: options.Prompt = "v2",
     dataset: options.Dataset = resources.DATASET,

@@ -29,10 +29,7 @@ def list_scenarios(as_json: options.Json = False) -> None:
 
 
 @app.command()
-def show(
-    name: options.Scenario,
-    as_json: options.Json = False,
-) -> None:
+def show(name: options.Scenario, as_json: options.Json = False) -> None:
     """Print a scenario's actions and parameters. Each parameter has its meaning and value."""
     import textwrap
 

@@ -23,7 +23,7 @@ COLUMNS = (
 )
 
 
-def sweep(
+def command(
     runs: list[Path] = typer.Argument(
         help="Folders of finished runs; several are drawn together.", metavar="RUN..."
     ),

@@ -8,7 +8,7 @@ import typer
 from harness.cli import options
 
 
-def view(
+def command(
     folder: options.Reports = Path("reports"),
     port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 takes a free one."),
     open_browser: bool = typer.Option(False, "--open", help="Open it in the browser."),

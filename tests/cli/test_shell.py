@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from harness.cli import COMMANDS, app
+from harness.cli import PANELS, app
 from harness.cli.shell import UNREAD, plain
 
 Said = tuple[int, str, str]
@@ -64,9 +64,7 @@ def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: 
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
-@pytest.mark.parametrize(
-    "group", ["", *(name for of in COMMANDS.values() for name, c in of.items() if isinstance(c, typer.Typer))]
-)
+@pytest.mark.parametrize("group", ["", "campaign", "dataset", "model", "prompt", "scenario"])
 def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., Said], group: str) -> None:
     code, out, err = harness(*group.split(), "--help")
     assert (code, err) == (0, "")
@@ -77,5 +75,5 @@ def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., S
 def test_the_map_has_every_command_under_its_panel(harness: Callable[..., Said]) -> None:
     blocks = [block.splitlines() for block in harness("--help")[1].split("\n\n")]
     shown = {head: {line.split()[0] for line in lines} for head, *lines in blocks if lines}
-    for panel, commands in COMMANDS.items():
+    for panel, commands in PANELS.items():
         assert shown[f"{panel}:"] == set(commands)

@@ -1,7 +1,7 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -13,8 +13,7 @@ from harness.core import resources
 from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode
-    from harness.evaluate.spec import Latency, Spec
+    from harness.evaluate.spec import Spec
 
 COLUMNS = (
     Column("success % [95 % CI]", "success_rate", 100, interval=True),
@@ -25,7 +24,7 @@ COLUMNS = (
 )
 
 
-def evaluate(
+def command(
     model: str = typer.Option(
         "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
     ),
@@ -72,11 +71,11 @@ def evaluate(
         seeds=options.parse_seeds(seeds),
         limit=limit,
         thinking=thinking,
-        answer=cast("AnswerMode", answer),
+        answer=answer,
         batch_size=batch_size,
         device=device,
         dtype=dtype,
-        latency=cast("Latency | None", latency),
+        latency=latency,
         tags=tuple(dict.fromkeys(tag or ())),
     )
     if dry_run:
