@@ -17,9 +17,7 @@ MOST_EPISODES = 1_000_000
 
 @app.command("paper")
 def paper(
-    out: Path = typer.Option(
-        Path("reports/paper"), help="Folder to write; an earlier study there is replaced."
-    ),
+    out: Path = typer.Option(Path("reports/paper"), help="Folder to write; replaces a study there."),
     episodes: int = typer.Option(1500, help="Episodes a seed, to compare operating points."),
     sweep_episodes: int = typer.Option(300, help="Episodes a seed at each grid point of a sweep."),
     as_json: options.Json = False,

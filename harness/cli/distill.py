@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from harness.core import resources
 from harness.core.errors import UserError, printable
+from harness.core.resources import DATASET
 
 SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
@@ -21,14 +21,10 @@ def command(
     dataset: str = typer.Argument(help="A dataset's folder: what the model learns from.", metavar="DIR"),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
     prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
-    samples: str = typer.Option(
-        SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers."
-    ),
+    samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
     seed: int = typer.Option(0, help="Seed of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
-    apart_from: str = typer.Option(
-        resources.DATASET, help="Dataset to evaluate the model on: no scene may be in both."
-    ),
+    apart_from: str = typer.Option(DATASET, help="Dataset to evaluate it on: no scene may be in both."),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:

@@ -39,11 +39,9 @@ def command(
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
-    out: Path | None = typer.Option(None, help="The run's folder. Default: reports/<model>-<prompt>-drive."),
+    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
     resume: options.Resume = False,
-    save_video: int = typer.Option(
-        0, help="How many of the last condition's failed episodes to draw into videos/."
-    ),
+    save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
     no_cache: options.NoCache = False,
     tag: options.Tags = None,
     as_json: options.Json = False,

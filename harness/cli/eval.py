@@ -40,9 +40,7 @@ def command(
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
-    out: Path | None = typer.Option(
-        None, help="The run's folder. Default: reports/<model>-<prompt>-<dataset>."
-    ),
+    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-<dataset>."),
     resume: options.Resume = False,
     no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),

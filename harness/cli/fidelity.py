@@ -11,13 +11,11 @@ LABEL = 16  # characters of a condition's name that leave its row on one line
 
 
 def command(
-    runs: list[Path] = typer.Argument(
-        help="Folders of `harness eval` and of `harness drive`; models may be several.", metavar="RUN..."
-    ),
+    runs: options.Runs,
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
     as_json: options.Json = False,
 ) -> None:
-    """Compare frozen with closed-loop success, by episode."""
+    """Compare frozen with closed-loop success, by episode. Takes runs of `eval` and of `drive`."""
     from harness.studies import fidelity_page
     from harness.studies.fidelity import fidelity as compared
 

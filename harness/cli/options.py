@@ -16,6 +16,7 @@ else:  # typer takes any text; what is evaluated says which are allowed
 MOST_SEEDS = 1000
 MOST_WORKERS = 256
 
+Runs = Annotated[list[Path], Argument(help="Folders of finished runs.", metavar="RUN...")]
 Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds them.")]
 Model = Annotated[str, Option(help="Card, checkpoint directory, .gguf file or hub id. `harness model list`.")]
 Scenario = Annotated[str, Argument(help="Scenario.")]

@@ -4,17 +4,16 @@ from pathlib import Path
 
 import typer
 
+from harness.cli import options
 from harness.cli.progress import bar
 from harness.core.errors import UserError
 
 
 def command(
-    runs: list[Path] = typer.Argument(help="Folders of finished runs on the same scenes.", metavar="RUN..."),
-    out: Path | None = typer.Option(
-        None, help="File to write. Default: RUN/report.html; needed for several runs."
-    ),
+    runs: options.Runs,
+    out: Path | None = typer.Option(None, help="File to write. Default, for one run: RUN/report.html."),
 ) -> None:
-    """Write one HTML file about a run, or several side by side. The file needs no network."""
+    """Write one HTML file about a run, or several side by side. It needs no network. All share their scenes."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out=out)}")

@@ -24,17 +24,14 @@ COLUMNS = (
 
 
 def command(
-    runs: list[Path] = typer.Argument(
-        help="Folders of finished runs; several are drawn together.", metavar="RUN..."
-    ),
+    runs: options.Runs,
     over: list[str] | None = typer.Option(
         None,
         help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus; "
         "repeatable. Default: the paper's panels.",
     ),
     grid: list[str] | None = typer.Option(
-        None,
-        help="Values for each --over, in order: a list 0,10,20 or from:to:step. Default: the usual ones.",
+        None, help="Values of each --over in order: 0,10,20 or from:to:step. Default: the usual ones."
     ),
     condition: list[str] = typer.Option(
         ["6g"], help="Operating point that is varied, or a change of one: 6g:on_demand=true. Repeatable."

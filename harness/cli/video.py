@@ -12,9 +12,7 @@ def command(
     episode: int = typer.Argument(help="Number of the episode."),
     condition: str | None = typer.Option(None, help="Operating point. Default: the run's last."),
     seed: int | None = typer.Option(None, help="Channel seed. Default: the run's first."),
-    out: Path = typer.Option(
-        Path("episode.gif"), help="File to write: .gif, or .mp4 with the extra `video`."
-    ),
+    out: Path = typer.Option(Path("episode.gif"), help="File: .gif, or .mp4 with the extra `video`."),
 ) -> None:
     """Draw a driven episode from above, as a video. Shows sight, messages and the ego's policy."""
     from harness.evaluate.replay import find, stills
