@@ -9,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from harness.cli.progress import drawn
 from harness.core.errors import UserError, printable
 from harness.core.resources import DATASET
 
@@ -86,10 +87,8 @@ def _losses(samples: Mapping[str, int]) -> Iterator[Callable[[str, int, float], 
     """Shows each stage's progress and loss on stderr: a bar for people, a line a minute for a log."""
     if sys.stderr.isatty():
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True)) as bars:
+        with drawn(Console(stderr=True)) as bars:
             tasks = {
                 stage: bars.add_task(stage, total=count, start=False) for stage, count in samples.items()
             }

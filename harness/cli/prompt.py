@@ -20,12 +20,9 @@ def list_prompts(as_json: options.Json = False) -> None:
     """List the prompt versions."""
     from harness.prompts import versions as prompts
 
-    found = [prompts.load(name) for name in prompts.names()]
-    rows = [
-        {"version": p.version, "released": p.released, "sha256": p.sha256, "description": p.description,
-         "changed": p.changed, "known_failures": p.known_failures}
-        for p in found
-    ]  # fmt: skip
+    fields = ("version", "released", "sha256", "description", "changed", "known_failures")
+    versions = [prompts.load(name) for name in prompts.names()]
+    rows = [{field: getattr(version, field) for field in fields} for version in versions]
     if as_json:
         echo_json(rows)
         return
