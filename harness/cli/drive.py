@@ -89,7 +89,7 @@ def command(
     from harness.cli.report import write
     from harness.cli.video import write_failures
 
-    page = write([where], silent)
+    page = write([where], quiet=silent)
     videos = write_failures(where, save_video, silent) if save_video else []
     if as_json:
         echo_json(as_mapping(done))

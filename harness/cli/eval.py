@@ -86,7 +86,7 @@ def command(
         done = evaluate_run(spec, folder, resume, progress, cache, progress.more)
     from harness.cli.report import write  # draws with matplotlib, which no answer waits for
 
-    page = write([folder], silent)
+    page = write([folder], quiet=silent)
     if as_json:
         echo_json(as_mapping(done))
     if silent:

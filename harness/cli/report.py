@@ -16,10 +16,10 @@ def command(
     """Write one HTML file about a run, or several side by side. It needs no network."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
-    typer.echo(f"wrote {write(runs, out=out)}")
+    typer.echo(f"wrote {write(runs, out)}")
 
 
-def write(runs: list[Path], quiet: bool = False, out: Path | None = None) -> Path:
+def write(runs: list[Path], out: Path | None = None, quiet: bool = False) -> Path:
     """Write a report, with a progress bar; returns the file."""
     from harness.report.page import write_report
     from harness.report.runs import gather
