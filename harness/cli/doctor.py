@@ -5,16 +5,17 @@ from textwrap import wrap
 
 import typer
 
+from harness.cli import options
 from harness.core.errors import printable
 
 WIDTH, MARGIN = 80, 10
 
 
-def doctor(
+def command(
     gpu: bool = typer.Option(False, "--gpu", help="Ask torch for GPUs too; it takes seconds to load."),
-    as_json: bool = typer.Option(False, "--json", help="Print JSON."),
+    as_json: options.Json = False,
 ) -> None:
-    """Show versions, the machine, which models can run here and what the others lack, and the cache."""
+    """Show what can run here: versions, machine, models, cache. Says what the other models lack."""
     from harness.cli.machine import look
 
     found = look(gpu)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
+from harness.cli import options
 from harness.core.errors import printable
 from harness.core.resources import DATASET
 
@@ -21,8 +22,8 @@ _WIDTH = 100  # of lines of tokens
 
 
 @app.command("list")
-def list_models(as_json: bool = typer.Option(False, "--json", help="Print the cards as JSON.")) -> None:
-    """List the model cards, on each of their engines, and which of them can run here."""
+def list_models(as_json: options.Json = False) -> None:
+    """List the model cards and which of them can run here. A card has a line for each of its engines."""
     from harness.backends import cards
     from harness.backends.registry import missing
 
@@ -46,9 +47,9 @@ def list_models(as_json: bool = typer.Option(False, "--json", help="Print the ca
 @app.command()
 def pull(
     name: str = typer.Argument(help="Card or hub id."),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
+    engine: options.Engine = None,
 ) -> None:
-    """Fetch a model's weights from its hub, at the revision that its card names."""
+    """Fetch a model's weights from its hub. The card names the revision."""
     from harness.backends.cards import resolve
     from harness.backends.pull import pull as fetch
 
@@ -60,13 +61,13 @@ def pull(
 @app.command()
 def check(
     name: str = typer.Argument(help="Card, checkpoint directory, .gguf file or hub id."),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
-    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
+    engine: options.Engine = None,
+    thinking: options.Thinking = False,
     device: str | None = typer.Option(None, help="cpu, cuda or cuda:N; CUDA if there is any."),
-    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
-    as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
+    dtype: options.Dtype = None,
+    as_json: options.Json = False,
 ) -> None:
-    """Load a model, show the prompt that it reads, and time one decision in each answer mode."""
+    """Load a model, show its prompt and time one decision. Does so in each answer mode."""
     from harness.backends import cards
 
     card = cards.resolve(name, engine)

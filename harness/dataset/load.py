@@ -74,6 +74,11 @@ class Dataset:
         """Meta-actions, in the environment's order."""
         return tuple(self.manifest["actions"])
 
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """Numbers of the episodes."""
+        return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
+
     def scene(self, scene_id: str) -> Scene:
         """The scene of that id."""
         for scene in self.scenes:

@@ -117,8 +117,7 @@ def _frozen(
         latencies.keep(work / "latency.json", asker.latency)
         with uncollected():
             walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
-        episodes = tuple(dict.fromkeys(scene.record["episode"] for scene in scenes))
-        return _written(spec, out, work, episodes, walked, backend.identity(), asker.latency)
+        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), asker.latency)
 
 
 def _closed_loop(
