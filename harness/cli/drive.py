@@ -97,9 +97,11 @@ def _shipped() -> dict[str, Any]:
 def _default_out(spec: "Drive", resume: bool) -> Path:
     from dataclasses import replace
 
+    from msgspec import structs
+
     from harness.cli.evaluate import default_out
 
-    named = replace(spec.dataset, manifest={**spec.dataset.manifest, "name": "drive"})
+    named = replace(spec.dataset, manifest=structs.replace(spec.dataset.manifest, name="drive"))
     return default_out(replace(spec, dataset=named), resume)
 
 

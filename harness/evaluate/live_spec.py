@@ -9,6 +9,7 @@ from harness.backends.cards import Card
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset
+from harness.dataset.schema import Manifest
 from harness.evaluate.spec import Spec, model_argument
 from harness.prompts.versions import Prompt
 from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
@@ -64,5 +65,9 @@ def spec_of(
     card: Card, prompt: Prompt, points: tuple[OperatingPoint, ...], seeds: tuple[int, ...], **options: Any
 ) -> Drive:
     """A live run. It has the scenario's name and actions in the place of a dataset, and no frozen scenes."""
-    live = Dataset(Path(NAME), {"name": NAME, "actions": list(ACTIONS)}, "", ())
+    manifest = Manifest(
+        format="swarmdrive-dataset/1", name=NAME, scenario=NAME, actions=list(ACTIONS), parameters={},
+        behaviour={}, episodes=0, decisions=0, seed=0, versions={}, files={},
+    )  # fmt: skip
+    live = Dataset(Path(NAME), manifest, "", ())
     return Drive(card, prompt, live, points, seeds, **options)
