@@ -49,14 +49,14 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
     if as_json:
-        counts = {k: manifest[k] for k in ("name", "episodes", "decisions")}
+        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "decisions")}
         echo_json({**counts, "sha256": digest, "problems": problems})
     elif problems:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest['name']} is sound: {manifest['episodes']} episodes, {manifest['decisions']} decision "
-            f"points, {len(manifest['files'])} files\nmanifest sha256 {digest}"
+            f"{manifest.name} is sound: {manifest.episodes} episodes, {manifest.decisions} decision "
+            f"points, {len(manifest.files)} files\nmanifest sha256 {digest}"
         )
     if problems:
         raise typer.Exit(1)
@@ -101,7 +101,7 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: option
     data = load.load(load.find(dataset))
     from harness.studies.rank import rank, ranks_agree
 
-    episodes = int(data.manifest["episodes"])
+    episodes = data.manifest.episodes
     with bar(f"driving {printable(data.name, 30)} live", episodes) as progress:
         standings = rank(data, workers, progress)
     agree = ranks_agree(standings)

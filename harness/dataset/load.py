@@ -15,6 +15,7 @@ from harness.core.files import canonical_json
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
+from harness.dataset.schema import Manifest
 from harness.dataset.verify import file_problems, read_manifest, records, released
 from harness.world.state import WorldState
 
@@ -60,19 +61,19 @@ class Dataset:
     """
 
     path: Path
-    manifest: dict[str, Any]
+    manifest: Manifest
     sha256: str
     scenes: tuple[Scene, ...]
 
     @property
     def name(self) -> str:
         """Name in the manifest."""
-        return str(self.manifest["name"])
+        return self.manifest.name
 
     @property
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
-        return tuple(self.manifest["actions"])
+        return tuple(self.manifest.actions)
 
     @property
     def episodes(self) -> tuple[int, ...]:
