@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from harness import __version__
-from harness.backends.base import Completion, Rendering, Request
+from harness.backends.base import Backend, Completion, Rendering, Request
+from harness.backends.cards import Card
 from harness.backends.completion_file import CompletionFile
+from harness.backends.registry import capabilities
 from harness.core.errors import printable
 from harness.core.files import digest, sha256_bytes
 
@@ -56,6 +58,13 @@ def _code_sha256() -> str:
     package = Path(__file__).parent.parent
     files = sorted(file for pattern in _CODE for file in package.glob(pattern))
     return digest([__version__, *(sha256_bytes(file.read_bytes()) for file in files)])
+
+
+def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
+    """A card's backend with a cache before it, if there is a file and its prompts are known."""
+    if file is None or not capabilities(card.engine).renders:
+        return backend
+    return Cached(cast("Rendering", backend), file)
 
 
 class Cached:

@@ -8,16 +8,14 @@ from typing import Any, Literal, get_args
 
 from harness.backends import failures, servers
 from harness.backends.failures import Failures
+from harness.backends.registry import engines, registration
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable, unknown
 
-Engine = Literal["proxy", "driver", "replay", "transformers", "llama-cpp", "openai"]
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
 LatencySource = Literal["card", "measured"]
 Table = Mapping[str, Any]
-
-WEIGHTED: tuple[Engine, ...] = ("transformers", "llama-cpp")  # engines that load weights here
 
 # What one model may have anew for each engine that it runs on.
 _BY_ENGINE: Mapping[str, type] = {
@@ -30,22 +28,15 @@ _KEYS: Mapping[str, type] = {
 }  # fmt: skip
 _LATENCY_KEYS: Mapping[str, type] = {"source": str, "inference_s": float, "basis": str}
 _CHOICES = {
-    "engine": get_args(Engine),
     "dtype": get_args(Dtype),
     "thinking": get_args(Thinking),
     "source": get_args(LatencySource),
     "kind": servers.KINDS,
 }
-# Keys that mean something to some engines only; those of the second must be there for these.
-_ONLY: Mapping[str, tuple[Engine, ...]] = {
-    "revision": WEIGHTED, "sha256": WEIGHTED, "gated": WEIGHTED, "dtype": ("transformers",),
-    "file": ("llama-cpp",), "quantisation": ("llama-cpp",), "failures": ("proxy",), "privileged": ("driver",),
-}  # fmt: skip
-_ALWAYS: Mapping[str, tuple[Engine, ...]] = {"weights": (*WEIGHTED, "openai"), "server": ("openai",)}
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
-def read(path: Path) -> dict[Engine, dict[str, Any]]:
+def read(path: Path) -> dict[str, dict[str, Any]]:
     """What a card's file says of its model on each engine, checked; the engine it runs on unasked is first.
 
     `latency` stays a table; `server` and `failures` are made what they are.
@@ -66,7 +57,7 @@ def read(path: Path) -> dict[Engine, dict[str, Any]]:
         shared["latency"] = table["latency"]
     for engine, own in others.items():
         at = f"{where} [engines.{printable(engine)}]"
-        known = set(_ALWAYS["weights"]) - {table["engine"]}
+        known = set(_takers("weights")) - {table["engine"]}
         if engine not in known:
             raise unknown(f"engine in {where}", engine, known)
         if not isinstance(own, dict):
@@ -91,12 +82,19 @@ def _checked(table: Table, where: str) -> dict[str, Any]:
             raise UserError(f"{where}: {key} = {table[key]}; allowed: 1 or more")
     if not _SHA256.fullmatch(table.get("sha256", "0" * 64)):
         raise UserError(f"{where}: sha256 = {printable(table['sha256'])!r}; allowed: 64 digits 0-9 a-f")
-    for key, engines in {**_ALWAYS, **_ONLY}.items():
-        lacking = key not in table and engine in _ALWAYS.get(key, ())
-        if lacking or (key in table and engine not in engines):
+    known = registration(engine)
+    for key in (key for key in _KEYS if _takers(key)):
+        lacking = key not in table and key in known.required_keys
+        if lacking or (key in table and key not in known.keys):
             shown = f"[{key}]" if _KEYS[key] is dict else key
-            raise UserError(f"{where}: {shown} goes with engine = {' or '.join(engines)}, and only with it")
+            takers = " or ".join(_takers(key))
+            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
     return {**table, "server": _server(table, where), "failures": _failures(table, where)}
+
+
+def _takers(key: str) -> list[str]:
+    """Engines whose cards may have a key that not all may have."""
+    return [engine for engine in engines() if key in registration(engine).keys]
 
 
 def _server(card: Table, where: str) -> Server | None:
@@ -135,6 +133,8 @@ def _check(table: Table, where: str, keys: Mapping[str, type], required: Collect
             raise UserError(f"{where}: {key} = {printable(value)!r}; allowed: a {kind.__name__}")
         if value not in _CHOICES.get(key, (value,)):
             raise unknown(f"{key} in {where}", str(value), _CHOICES[key])
+    if "engine" in table and table["engine"] not in engines():
+        raise unknown(f"engine in {where}", table["engine"], engines())
     for key in required:
         if key not in table:
             raise UserError(f"{where} has no {key}; add it")

@@ -8,17 +8,17 @@ import os.path
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 from harness.backends import card_file
-from harness.backends.card_file import WEIGHTED, Dtype, Engine, LatencySource, Thinking
+from harness.backends.card_file import Dtype, LatencySource, Thinking
 from harness.backends.failures import Failures
+from harness.backends.registry import engines
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable, unknown
 from harness.core.resources import entries, find
 
-__all__ = ["WEIGHTED", "Card", "Dtype", "Engine", "Latency", "LatencySource", "Thinking", "load", "load_all",
-           "names", "resolve"]  # fmt: skip
+__all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "load", "load_all", "names",
+           "resolve"]  # fmt: skip
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
@@ -70,7 +70,7 @@ class Card:
     """
 
     name: str
-    engine: Engine
+    engine: str
     description: str
     latency: Latency
     weights: str | None = None
@@ -135,8 +135,8 @@ def resolve(text: str, engine: str | None = None) -> Card:
         text: what the user wrote.
         engine: what to run it on, where there is a choice; None for its own.
     """
-    if engine is not None and engine not in get_args(Engine):
-        raise unknown("engine", engine, get_args(Engine))
+    if engine is not None and engine not in engines():
+        raise unknown("engine", engine, engines())
     stem, _, named = text.partition(":")
     if stem in names():
         card = load(f"{stem}:{engine}" if engine and not named else text)
@@ -145,6 +145,13 @@ def resolve(text: str, engine: str | None = None) -> Card:
     if engine not in (None, card.engine):
         raise UserError(f"--engine {engine}: {printable(text)!r} runs on {card.engine}; leave it out")
     return card
+
+
+def argument(card: Card) -> str:
+    """What `--model` was given, or anything that resolves to the same card."""
+    if card.name.partition(":")[0] in names() and load(card.name) == card:
+        return card.name
+    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 
 
 def _on_the_spot(text: str, engine: str | None) -> Card:
@@ -196,7 +203,7 @@ def _path(text: str) -> Path | None:
     return Path(path).resolve() if os.path.exists(path) else None
 
 
-def _made(name: str, engine: Engine, weights: str, description: str, thinking: Thinking = "none") -> Card:
+def _made(name: str, engine: str, weights: str, description: str, thinking: Thinking = "none") -> Card:
     latency = Latency("measured", None, "batch-1 seconds of the run")
     return Card(name, engine, description, latency, weights=weights, thinking=thinking)
 

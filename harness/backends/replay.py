@@ -7,6 +7,7 @@ from typing import Any
 
 from harness.backends.base import Completion, Request
 from harness.backends.cards import Card
+from harness.backends.registry import find
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 
@@ -26,7 +27,8 @@ def open(card: Card, **_: Any) -> "Replay":
     stored, line = {}, "run.json"
     try:
         manifest = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        if manifest["model"]["engine"] == "driver":
+        of = find(manifest["model"]["engine"])
+        if of and not of.capabilities.asks_helpers:
             raise UserError(
                 f"{shown} is a run of a driver; run it again with --model {manifest['model']['name']}"
             )
@@ -84,6 +86,11 @@ class Replay:
             answer.get("label_mass"), answer.get("retries", 0), answer.get("cached", False),
             answer.get("slow_s", 0.0),
         )  # fmt: skip
+
+    def latency(self) -> dict[str, Any]:
+        """The latency that the run's decisions were made with."""
+        found: dict[str, Any] = self.manifest["latency"]
+        return found
 
     def identity(self) -> dict[str, Any]:
         """The run and the digest of its rows."""

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import typer
 
@@ -50,7 +50,7 @@ def pull(
 ) -> None:
     """Fetch a model's weights from its hub, at the revision that its card names."""
     from harness.backends.cards import resolve
-    from harness.backends.pull import pull as fetch
+    from harness.backends.weights import pull as fetch
 
     card = resolve(name, engine)
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
@@ -67,11 +67,12 @@ def check(
     as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
 ) -> None:
     """Load a model, show the prompt that it reads, and time one decision in each answer mode."""
-    from harness.backends import cards
+    from harness.backends.cards import resolve
+    from harness.backends.registry import capabilities
 
-    card = cards.resolve(name, engine)
+    card = resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
-    if card.engine not in (*cards.WEIGHTED, "openai"):
+    if not capabilities(card.engine).renders:
         if as_json:
             typer.echo(json.dumps({**head, "model_free": True}, indent=2))
         else:
@@ -111,8 +112,7 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     # The first of a scene's questions is the ego's.
     asked = [next(requests(replace(spec, answer=way), data.scenes)) for way in ways]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    assert isinstance(backend, Rendering)
-    return spec, look(backend, asked)
+    return spec, look(cast("Rendering", backend), asked)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from harness.backends.base import AnswerMode, Rendering
-from harness.backends.cache import Cached, default_file
+from harness.backends.base import AnswerMode
+from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card, Latency
 from harness.backends.failures import Failures
 from harness.backends.registry import open_backend
@@ -75,7 +75,7 @@ def second_answers(
         backend = open_backend(spec.card, dtype=spec.dtype, batch_size=spec.batch_size)
         _same(backend.identity(), run)
         asking.more(len(owed))
-        answering = Cached(backend, default_file()) if isinstance(backend, Rendering) else backend
+        answering = cached(backend, spec.card, default_file())
         try:
             with alone(run.path / f"{KEPT}.lock"):
                 by_id |= ask_all(spec, answering, owed, kept, asking.done)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from harness.backends.base import Backend, Completion, Request, Role
+from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
@@ -22,7 +23,7 @@ CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 def request_count(spec: Spec) -> int:
     """How many requests an evaluation makes."""
-    return sum(1 if spec.card.engine == "driver" else len(scene.viewers) for scene in spec.dataset.scenes)
+    return sum(len(_viewers(spec, scene)) for scene in spec.dataset.scenes)
 
 
 def most_tokens(spec: Spec, role: Role) -> int:
@@ -35,7 +36,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
     for scene in scenes:
         truth = truth_graph(scene.state) if spec.card.privileged else None
-        for viewer in scene.viewers if spec.card.engine != "driver" else scene.viewers[:1]:
+        for viewer in _viewers(spec, scene):
             graph = scene.record["graphs"][viewer]
             role: Role = graph["role"]
             yield Request(
@@ -50,6 +51,10 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 view=graph,
                 truth=truth,
             )
+
+
+def _viewers(spec: Spec, scene: Scene) -> Sequence[str]:
+    return scene.viewers if capabilities(spec.card.engine).asks_helpers else scene.viewers[:1]
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:

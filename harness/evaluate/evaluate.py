@@ -9,8 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.backends.base import Rendering
-from harness.backends.cache import Cached
+from harness.backends.cache import cached
 from harness.backends.registry import open_backend
 from harness.coordination.exchange import Luck
 from harness.core.arrays import Floats
@@ -83,7 +82,7 @@ def evaluate(
     with working(spec, out, identity) as work:
         # Times are had from the backend itself: the cache answers in no time, which is nobody's.
         latency = measure(spec, backend, work / "latency.json")
-        asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
+        asked = cached(backend, spec.card, cache)
         kept = work / "answers.jsonl"
         by_id = ask_all(spec, asked, requests(spec, spec.dataset.scenes), kept, progress)
         latency = settled(spec, backend, latency, by_id, work / "latency.json")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.backends.base import Backend
+from harness.backends.registry import capabilities
 from harness.coordination.coordinate import coordinate
 from harness.coordination.exchange import Luck, exchange
 from harness.coordination.operating_point import OperatingPoint
@@ -82,8 +83,7 @@ def look(engine: str, trajectory: Trajectory, step: int) -> Scene:
     """What there is to be seen and asked in a trajectory now. The same moment has the same id anywhere."""
     world = trajectory.world
     state = replace(world.state(), step=step)
-    # A rule is asked for the ego alone.
-    viewers = [state.ego] if engine == "driver" else [state.ego, *state.helpers]
+    viewers = [state.ego, *(state.helpers if capabilities(engine).asks_helpers else ())]
     seen = moment(world, state, trajectory.number, viewers)
     return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.backends.base import Backend, Rendering
-from harness.backends.cache import Cached
+from harness.backends.base import Backend
+from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError, printable
@@ -60,5 +60,5 @@ def opened(card: Card, device: str | None, dtype: str | None, batch_size: int, c
     """This process's backend, with the cache in front of a language model's."""
     if cache is not None:
         backend = opened(card, device, dtype, batch_size, None)
-        return Cached(backend, cache) if isinstance(backend, Rendering) else backend
+        return cached(backend, card, cache)
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)

@@ -5,11 +5,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.backends.cards import Card
+from harness.backends.cards import Card, argument
+from harness.backends.registry import capabilities
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset
-from harness.evaluate.spec import Spec, model_argument
+from harness.evaluate.spec import Spec
 from harness.prompts.versions import Prompt
 from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
 
@@ -30,7 +31,7 @@ class Drive(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.card.engine == "replay":
+        if not capabilities(self.card.engine).closed_loop:
             raise UserError(
                 f"--model {printable(self.card.name)}: a replay has answers to frozen scenes alone; "
                 "give the model that it replays"
@@ -49,7 +50,7 @@ class Drive(Spec):
     def command(self, out: Path) -> str:
         """A command line that drives this again, quoted for a shell."""
         options = [
-            ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
+            ("--model", argument(self.card)), ("--prompt", self.prompt.version),
             ("--episodes", self.episodes), ("--first-seed", self.first_seed),
             ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),

@@ -5,12 +5,12 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from harness.backends.base import Backend, Request
-from harness.backends.replay import Replay
+from harness.backends.base import Backend, Request, Timed
+from harness.backends.registry import capabilities
 from harness.core.arrays import Floats
 from harness.core.files import canonical_json, write_whole
 from harness.dataset.load import Scene
@@ -36,9 +36,8 @@ def measure(spec: Spec, backend: Backend, kept: Path) -> dict[str, Any]:
     """
     if spec.latency == "paper":
         return PAPER
-    if isinstance(backend, Replay):  # whatever the decisions replayed were made with
-        replayed: dict[str, Any] = backend.manifest["latency"]
-        return replayed
+    if capabilities(spec.card.engine).own_latency:
+        return cast("Timed", backend).latency()
     card = spec.card.latency
     if (spec.latency or card.source) == "card":
         return {
@@ -71,7 +70,7 @@ def settled(
     Where each answer's own time counts, one that comes from the cache has none. If a role has no other, a
     sample is timed as it is for batches, and stands for every answer of the run; it is kept as well.
     """
-    if latency["inference_s"] is not None or isinstance(backend, Replay):
+    if latency["inference_s"] is not None or capabilities(spec.card.engine).own_latency:
         return latency
     asked = list(requests(spec, spec.dataset.scenes))
     timed = {r.role for r in asked if answers[r.id]["seconds"] is not None}

@@ -20,6 +20,7 @@ from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.transformers import checkpoint
 from harness.backends.transformers import engine as transformers_engine
+from harness.backends.weights import find_checkpoint
 from harness.core.arrays import Floats
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export
@@ -85,7 +86,7 @@ def compare(
     Raises:
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
-    where = checkpoint.find(reference)
+    where = find_checkpoint(reference)
     rows = checkpoint.vocabulary(where)
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
     known = _hear(plain(batch_size=1), asked, letters, rows)

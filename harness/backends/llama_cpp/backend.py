@@ -1,16 +1,14 @@
 """Answers of a GGUF file through llama.cpp, in a process of its own."""
 
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
 from harness.backends.llama_cpp.child import Child
-from harness.backends.transformers.checkpoint import held_to_digest
+from harness.backends.weights import find_gguf, held_to_digest
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.resources import find as beside
 
 
 def open(
@@ -19,46 +17,11 @@ def open(
     """Find and load a card's weights.
 
     Raises:
-        UserError: the package or the file is missing, an option cannot be, or llama.cpp refuses the file.
+        UserError: the file is missing, an option cannot be, or llama.cpp refuses the file.
     """
-    if package := missing_package():
-        raise UserError(
-            f"model {printable(card.name)!r} needs {package}, which is not installed; "
-            "run `pip install 'swarmdrive-harness[llama-cpp]'`"
-        )
     if dtype not in (None, "auto"):
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
-    if batch_size < 1:
-        raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    return LlamaBackend(card, held_to_digest(card, find(card)), device, batch_size)
-
-
-def missing_package() -> str | None:
-    """Name of the package that is not installed; None if it is there."""
-    return None if find_spec("llama_cpp") else "llama-cpp-python"
-
-
-def find(card: Card) -> Path:
-    """The GGUF file of a card: as given, beside the cards, or in the hub's cache.
-
-    Raises:
-        UserError: it is nowhere.
-    """
-    weights = card.weights or ""
-    local = beside("models", weights)
-    where = local / card.file if card.file else local
-    if where.is_file():
-        return where
-    if card.file and not local.is_dir():
-        from huggingface_hub import hf_hub_download
-
-        try:
-            return Path(hf_hub_download(weights, card.file, revision=card.revision, local_files_only=True))
-        except (OSError, ValueError):  # not there; no hub id
-            hint = f"run `harness model pull {printable(card.name)}`, or point --model at a .gguf file"
-    else:
-        hint = "give the path of a .gguf file"
-    raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
+    return LlamaBackend(card, held_to_digest(card, find_gguf(card)), device, batch_size)
 
 
 class LlamaBackend(Child):

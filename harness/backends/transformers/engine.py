@@ -11,6 +11,7 @@ from harness.backends.chat import Chat
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
 from harness.backends.transformers import checkpoint
+from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_bytes
 
@@ -21,19 +22,12 @@ def open(
     """Find and load a card's weights.
 
     Raises:
-        UserError: a package, the device, the weights or the chat template is missing, or files do not load.
+        UserError: the device, the weights or the chat template is missing, or files do not load.
     """
-    if package := checkpoint.missing_package():
-        raise UserError(
-            f"model {card.name!r} needs {package}, which is not installed; "
-            "run `pip install 'swarmdrive-harness[transformers]'`"
-        )
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
-    if batch_size < 1:
-        raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    where = checkpoint.find(card)
+    where = find_checkpoint(card)
     loaded = checkpoint.load(card, where, dtype=dtype, device=device_of(device))
     return LanguageModel(TransformersEngine(card, where, loaded), batch_size)
 
@@ -54,9 +48,10 @@ def device_of(asked: str | None) -> str:
 
 def gpus() -> list[str]:
     """Names of the GPUs that torch sees; none where it is not installed."""
-    if checkpoint.missing_package() == "torch":
+    try:
+        import torch
+    except ImportError:
         return []
-    import torch
 
     return [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
 
