@@ -15,9 +15,11 @@ value is converted but an integer to a float. An unknown key is refused, with th
 
 import re
 import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from sys import float_info
+from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
 from msgspec.inspect import type_info
@@ -25,6 +27,9 @@ from msgspec.inspect import type_info
 from harness.core.errors import UserError, printable, unknown
 
 Record = TypeVar("Record")
+Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=float_info.max, description="seconds, 0 or more")]
+_type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
 _STEPS = re.compile(r"[^.\[\]`]+")  # of a path such as `.points[1].loss`
 _IN_WORDS = {"object": "a table", "array": "a list"}
@@ -58,12 +63,13 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     Raises:
         UserError: an unknown or missing key, or a value that is not allowed.
     """
-    for path, key, known in _unknown_keys(table, type_info(kind), (), given):
+    info = _type_info(cast("Hashable", kind))
+    for path, key, known in _unknown_keys(table, info, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
     try:
         return msgspec.convert({**table, **given}, kind)
     except msgspec.ValidationError as error:
-        raise _mistake(str(error), table, type_info(kind), where) from None
+        raise _mistake(str(error), table, info, where) from None
 
 
 def _place(where: str, path: Sequence[str]) -> str:

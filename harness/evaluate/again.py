@@ -7,12 +7,11 @@ from typing import Any, cast
 
 from harness.backends.base import AnswerMode
 from harness.backends.cache import cached, default_file
-from harness.backends.cards import Card, Latency
-from harness.backends.failures import Failures
+from harness.backends.cards import Card
 from harness.backends.registry import open_backend
-from harness.backends.servers import Server
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Ints
+from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Dataset
@@ -94,18 +93,13 @@ def spec_of(run: Run, dataset: Dataset, points: Sequence[OperatingPoint]) -> Spe
     if prompt.sha256 != config["prompt"]["sha256"]:
         raise UserError(f"{shown}: prompt {printable(version)} has changed since; restore it or run again")
     try:
-        card = _card(config["model"])
-    except (TypeError, KeyError) as error:
+        card = convert(config["model"], Card, "its model")
+    except UserError as error:
         raise UserError(f"{shown}: run.json is of another version ({printable(error)}); run again") from None
     return Spec(
         card, prompt, dataset, tuple(points), tuple(config["seeds"]), thinking=bool(config["thinking"]),
         answer=cast("AnswerMode", run.answer), batch_size=config["batch_size"], dtype=config.get("dtype"),
     )  # fmt: skip
-
-
-def _card(stored: Mapping[str, Any]) -> Card:
-    inner = {"latency": Latency, "server": Server, "failures": Failures}
-    return Card(**{k: inner[k](**v) if k in inner and v is not None else v for k, v in stored.items()})
 
 
 def _same(identity: Mapping[str, Any], run: Run) -> None:
