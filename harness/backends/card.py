@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from harness.backends.failures import Failures
-from harness.backends.registry import engines, find, registration
+from harness.backends.registry import engines, find, registrations
 from harness.backends.servers import Server
 from harness.core.config import Count, Seconds, convert, toml
 from harness.core.errors import UserError, printable, unknown
@@ -155,4 +155,4 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
 
 def _takers(key: str) -> list[str]:
     """Engines whose cards may have a key that not all may have."""
-    return [engine for engine in engines() if key in registration(engine).keys]
+    return [engine for engine, registered in registrations().items() if key in registered.keys]

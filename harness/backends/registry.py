@@ -5,6 +5,7 @@ Importing this loads no engine. A package from outside adds one by an entry poin
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
@@ -165,9 +166,13 @@ def capabilities(engine: str) -> Capabilities:
     return registration(engine).capabilities
 
 
-def with_weights() -> list[str]:
-    """Names of the engines that load weights here."""
-    return [engine for engine in engines() if capabilities(engine).has_weights]
+def registrations() -> dict[str, Registration]:
+    """Every engine by its name, but for plug-ins that do not load."""
+    loaded = {}
+    for engine in engines():
+        with suppress(UserError):
+            loaded[engine] = registration(engine)
+    return loaded
 
 
 def open_backend(

@@ -111,7 +111,10 @@ def _remedy(card: "Card", lack: str | None) -> str | None:
 def _package_remedy(engine: str) -> str | None:
     from harness.backends.registry import missing_package, registration
 
-    return registration(engine).install if missing_package(engine) else None
+    try:
+        return registration(engine).install if missing_package(engine) else None
+    except UserError as error:  # a plug-in that does not load
+        return str(error)
 
 
 def _memory_gib() -> float | None:

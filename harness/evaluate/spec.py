@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, get_args
 from harness import __version__
 from harness.backends.base import AnswerMode
 from harness.backends.cards import Card, argument
-from harness.backends.registry import capabilities, with_weights
+from harness.backends.registry import capabilities, registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Dataset
@@ -97,9 +97,10 @@ class Spec:
                 )  # fmt: skip
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and not can.has_weights:
+                able = [name for name, engine in registrations().items() if engine.capabilities.has_weights]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
-                    f"(engines {' and '.join(with_weights())} have); leave it out"
+                    f"(engines {' and '.join(able)} have); leave it out"
                 )
 
     def _check_latency(self) -> None:
