@@ -17,9 +17,8 @@ from misbehaving import completion, serving
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request
-from harness.backends.cache import NOT_IN_KEY, Cached, cached, default_file, key
+from harness.backends.cache import NOT_IN_KEY, Cached, CompletionFile, cached, default_file, key
 from harness.backends.cards import Latency
-from harness.backends.completion_file import CompletionFile
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest

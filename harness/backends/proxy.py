@@ -38,7 +38,6 @@ class Proxy:
         self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._completion(request) for request in requests]
 
     def _completion(self, request: Request) -> Completion:

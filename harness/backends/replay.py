@@ -58,7 +58,6 @@ class Replay:
         self.stored = stored
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:
@@ -88,7 +87,6 @@ class Replay:
         )  # fmt: skip
 
     def latency(self) -> dict[str, Any]:
-        """The latency that the run's decisions were made with."""
         found: dict[str, Any] = self.manifest["latency"]
         return found
 

@@ -122,6 +122,11 @@ def _download(card: Card) -> None:
         ) from None
 
 
+def hub_commit(folder: Path) -> str | None:
+    """The commit that a folder of the hub's cache holds; None for a folder anywhere else."""
+    return folder.name if folder.parent.name == "snapshots" else None
+
+
 def fetching(card: Card) -> str:
     """What to do about a checkpoint that is not there, or not whole."""
     if Path(card.weights or "").is_absolute():

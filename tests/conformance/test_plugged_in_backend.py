@@ -121,7 +121,5 @@ def test_a_package_that_it_needs_is_named_with_the_command_that_installs_it(proj
     (project / "models" / "echo-1.toml").write_text(text)
     card = cards.load("echo-1")
     assert registry.missing(card) == "a-package"
-    with pytest.raises(
-        UserError, match="needs a-package, which is not installed; run `pip install it`"
-    ):
+    with pytest.raises(UserError, match="needs a-package, which is not installed; run `pip install it`"):
         registry.open_backend(card)

@@ -1,7 +1,8 @@
 """Answers of a GGUF file through llama.cpp, in a process of its own."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
@@ -43,36 +44,22 @@ class LlamaBackend(Child):
         return found
 
 
+def _of_child(attribute: str) -> Any:
+    """A method that is called in the child."""
+
+    def method(chat: "_RemoteChat", *arguments: Any, **options: Any) -> Any:
+        return chat.child.call(f"chat.{attribute}", *arguments, **options)
+
+    return method
+
+
 class _RemoteChat(Chat):
     """A chat template and tokenizer in a child."""
 
     def __init__(self, name: str, child: Child) -> None:
         self.name = name
         self.template = child.call("chat.template")
-        self._child = child
+        self.child = child
 
-    @property
-    def bos(self) -> int | None:
-        """Id of the token that begins a sequence; None if there is none."""
-        token: int | None = self._child.call("chat.bos")
-        return token
-
-    def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
-        """The prompt as the model reads it. Raises UserError where the template refuses the messages."""
-        text: str = self._child.call("chat.render", messages, thinking=thinking)
-        return text
-
-    def encode(self, prompt: str) -> list[int]:
-        """Token ids of a rendered prompt."""
-        ids: list[int] = self._child.call("chat.encode", prompt)
-        return ids
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """Text of an answer without its control tokens."""
-        text: str = self._child.call("chat.decode", ids)
-        return text
-
-    def pieces(self, ids: Sequence[int]) -> list[str]:
-        """The text of each token on its own, control tokens as they are written."""
-        texts: list[str] = self._child.call("chat.pieces", ids)
-        return texts
+    bos = property(_of_child("bos"))
+    render, encode, decode, pieces = map(_of_child, ("render", "encode", "decode", "pieces"))
