@@ -30,11 +30,11 @@ def command(
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
     """Train a small Qwen3 on a frozen dataset. The same command again continues training that was stopped."""
-    from harness.backends.transformers import checkpoint
+    from harness.backends.registry import missing_package
     from harness.dataset import load
     from harness.prompts import versions as prompts
 
-    if package := checkpoint.missing_package():
+    if package := missing_package("transformers"):
         raise UserError(
             f"harness distill needs {package}; run `pip install 'swarmdrive-harness[transformers]'`"
         )

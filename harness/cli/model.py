@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import typer
 
@@ -51,7 +51,7 @@ def pull(
 ) -> None:
     """Fetch a model's weights from its hub. The card names the revision."""
     from harness.backends.cards import resolve
-    from harness.backends.pull import pull as fetch
+    from harness.backends.weights import pull as fetch
 
     card = resolve(name, engine)
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
@@ -68,11 +68,12 @@ def check(
     as_json: options.Json = False,
 ) -> None:
     """Load a model, show its prompt and time one decision. Does so in each answer mode."""
-    from harness.backends import cards
+    from harness.backends.cards import resolve
+    from harness.backends.registry import capabilities
 
-    card = cards.resolve(name, engine)
+    card = resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
-    if card.engine not in (*cards.WEIGHTED, "openai"):
+    if not capabilities(card.engine).renders:
         if as_json:
             typer.echo(json.dumps({**head, "model_free": True}, indent=2))
         else:
@@ -103,17 +104,19 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     from harness.backends.registry import open_backend
     from harness.dataset import load
     from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
 
     data = load.load(load.find(DATASET), 1)
-    spec = Spec(card, prompts.load(PROMPT), data, (), (0,), 1, thinking, "json", 1, device, dtype)
+    spec = Spec(
+        card, prompts.load(PROMPT), FrozenSource(data, 1), (), (0,), thinking, "json", 1, device, dtype
+    )
     ways = ("json",) if spec.thinking else get_args(AnswerMode)
     # The first of a scene's questions is the ego's.
     asked = [next(requests(replace(spec, answer=way), data.scenes)) for way in ways]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    assert isinstance(backend, Rendering)
-    return spec, look(backend, asked)
+    return spec, look(cast("Rendering", backend), asked)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:

@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 
-from harness.backends.base import Backend, Rendering
-from harness.backends.cache import Cached
+from harness.backends.base import Backend
+from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError, printable
@@ -109,7 +109,7 @@ def _frozen(
         trial = partial(requests, spec, latencies.sample(scenes))
         if latency is None:
             latency = latencies.measured(spec, backend, list(trial()))
-        asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
+        asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
         asker.ask(list(requests(spec, scenes)))
         if latency.each_its_own and latencies.lacks_times(asker.answers):
@@ -202,7 +202,7 @@ def _opened(
     """This process's backend, with the cache in front of a language model's."""
     if cache is not None:
         backend = _opened(card, device, dtype, batch_size, None)
-        return Cached(backend, cache) if isinstance(backend, Rendering) else backend
+        return cached(backend, card, cache)
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
