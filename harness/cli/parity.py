@@ -25,6 +25,7 @@ def command(
     from harness.coordination.operating_point import POINTS
     from harness.dataset import load
     from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import readout, versions
     from harness.training.parity import PASSES, compare
@@ -38,7 +39,7 @@ def command(
                 f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
             )
     data = load.load(load.find(dataset))
-    spec = Spec(reference, versions.load(prompt), data, tuple(POINTS.values()), (0,))
+    spec = Spec(reference, versions.load(prompt), FrozenSource(data), tuple(POINTS.values()), (0,))
     asked = list(requests(spec, data.scenes))
     asked = asked[:: max(1, len(asked) // prompts)][:prompts]
     letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]

@@ -5,7 +5,7 @@ import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,11 @@ class Dataset:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
         return tuple(self.manifest.actions)
+
+    @property
+    def delay_allowance_s(self) -> float:
+        """Needless delay that an episode is forgiven."""
+        return cast(float, self.manifest.parameters["delay_allowance_s"])
 
     @property
     def episodes(self) -> tuple[int, ...]:

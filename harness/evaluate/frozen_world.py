@@ -41,7 +41,7 @@ class FrozenSource:
         return FrozenScenes(
             name=self.dataset.name, sha256=self.dataset.sha256, scenes=len(scenes),
             episodes=len(self.dataset.episodes), limit=self.limit,
-            delay_allowance_s=float(self.dataset.manifest.parameters["delay_allowance_s"]),
+            delay_allowance_s=self.dataset.delay_allowance_s,
             path=str(self.dataset.path),
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -75,10 +75,10 @@ def evaluate(
     if resume and (out / "run.json").is_file():
         return finished(spec, out)
     refuse(spec, out, resume)
-    if isinstance(spec.source, FrozenSource):
-        done = _frozen(spec, spec.source, out, progress, cache, more)
-    else:
+    if isinstance(spec.source, LiveSource):
         done = _closed_loop(spec, spec.source, out, progress, cache, workers)
+    else:
+        done = _frozen(spec, cast("FrozenSource", spec.source), out, progress, cache, more)
     tidy(out)
     return done
 

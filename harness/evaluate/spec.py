@@ -26,15 +26,17 @@ TAG_CHARACTERS = 40
 
 
 class Source(Protocol):
-    """Which world is walked.
+    """Which world is walked."""
 
-    Attributes:
-        kind: what a run's manifest calls it.
-        command: that walks it: `eval` or `drive`.
-    """
+    @property
+    def kind(self) -> World:
+        """What a run's manifest calls it."""
+        ...
 
-    kind: World
-    command: str
+    @property
+    def command(self) -> str:
+        """The command that walks it: `eval` or `drive`."""
+        ...
 
     @property
     def name(self) -> str:

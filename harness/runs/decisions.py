@@ -115,7 +115,7 @@ class Decisions:
 
     def flags(self, name: str) -> Bools:
         """Whether it is known to be so, (n,)."""
-        return self[name] == 1.0
+        return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
         """A distribution, or what each action would lead to: (n, A)."""
