@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
+from harness.core.memory import uncollected
 from harness.evaluate.live_spec import FORMAT as DRIVEN
 from harness.report.compare.table import tables
 from harness.report.words import facts
@@ -68,6 +69,7 @@ class Pair:
     episodes: tuple[int, ...]
 
 
+@uncollected()
 def pair(a: Path, b: Path) -> Pair:
     """Read two runs.
 
