@@ -42,9 +42,10 @@ def compare(
     found = compared(pair(a, b))
     verdicts = [judge(one, found) for one in gates]
     if html:
-        from harness.report.compare.page import write
+        from harness.report.compare.page import render
+        from harness.report.page import save
 
-        write(found, verdicts, show, html)
+        save(render(found, verdicts, show), html, "--html")
     if as_json:
         typer.echo(json.dumps(text.mapping(found, verdicts, show), indent=1, allow_nan=False))
     else:
