@@ -15,6 +15,7 @@ from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate, whole
 from harness.parsing.mend import unreadable
 from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import ROLES
 
 __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
@@ -134,6 +135,10 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
 
 def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     """The answer if the text is nothing but that and needs no repair."""
+    return fitting(text, role, actions) or _unmended(text, role, actions)
+
+
+def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     candidate = whole(text, role, actions)
     if candidate is None:
         return None
