@@ -151,7 +151,7 @@ def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
 
 def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
-    text, zero_width = _INVISIBLE.subn(lambda found: " " if found.group().isspace() else "", text)
+    text, zero_width = _INVISIBLE.subn(lambda match: " " if match.group().isspace() else "", text)
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
     answer = _choose(candidates.candidates(text, role, actions, cut), role, actions)
@@ -160,22 +160,22 @@ def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Ans
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
 
 
-def _choose(found: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
+def _choose(offered: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
     """The one answer among the candidates. An echo of the template beside it is no second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
-    for candidate in found:
+    for candidate in offered:
         try:
             answers.append(read(candidate.members, candidate.repairs, role, actions))
         except Failure as failure:
             failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
-        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in found):
+        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in offered):
             raise unreadable()  # what is wrong in a guessed object need not be wrong in the text
         raise (serious or failures)[-1]
     last = answers[-1]
-    same = all(abs(p - q) <= _SAME for one in answers for p, q in zip(one.intent, last.intent, strict=True))
+    same = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
     if serious or not same:
         count = len(answers) + len(serious)
         raise Failure(Status.CONFLICTING_ANSWERS, f"{count} answers stand in the text and they differ")
