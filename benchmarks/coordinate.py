@@ -9,12 +9,12 @@ import argparse
 import json
 import statistics
 from time import process_time
-from typing import Any
 
 import numpy as np
 
+from harness.coordination.channel import Draws
 from harness.coordination.coordinate import coordinate
-from harness.coordination.exchange import Luck
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS
 
 AIM_S = 1.0
@@ -29,16 +29,16 @@ def main() -> None:
     given = arguments.parse_args()
     n = given.decisions
 
-    case = scenes(np.random.default_rng(0), n)
+    intents = decisions(np.random.default_rng(0), n)
     found: dict[str, list[float]] = {name: [] for name in ("limit", *POINTS)}
     for repeat in range(given.repeats):
         generator = np.random.default_rng(repeat)
         start = process_time()
-        luck = Luck(generator.random((n, HELPERS, 2)), generator.random((n, HELPERS)))
+        draws = Draws(generator.random((n, HELPERS, 2)), generator.random((n, HELPERS)))
         found["limit"].append(process_time() - start)
         for name, point in POINTS.items():
             start = process_time()
-            coordinate(point, **case, luck=luck)
+            coordinate(point, intents, draws)
             found[name].append(process_time() - start)
     medians = {name: statistics.median(values) for name, values in found.items()}
     print(f"CPU seconds for {n} decisions of {HELPERS} helpers, median of {given.repeats}; aim {AIM_S}")
@@ -47,22 +47,22 @@ def main() -> None:
     print(json.dumps({"decisions": n, "repeats": given.repeats, "cpu_s": medians}))
 
 
-def scenes(generator: np.random.Generator, n: int) -> dict[str, Any]:
-    """Made-up intents, distances and sizes of `n` decisions, as `coordinate` takes them.
+def decisions(generator: np.random.Generator, n: int) -> Intents:
+    """Made-up intents, distances and sizes of `n` decisions.
 
     One answer in twenty fails; half of the egos are unsure enough to ask.
     """
     own = generator.dirichlet(np.ones(ACTIONS), n)
     own[generator.random(n) < 0.05] = np.nan
-    return {
-        "own": own,
-        "helpers": generator.dirichlet(np.ones(ACTIONS), (n, HELPERS)),
-        "valid": generator.random((n, HELPERS)) < 0.95,
-        "distance_m": generator.uniform(0.0, 80.0, (n, 1 + HELPERS)),
-        "range_m": generator.uniform(5.0, 120.0, (n, HELPERS)),
-        "payload_bits": generator.uniform(800.0, 2400.0, (n, HELPERS)),
-        "infer_s": generator.uniform(0.1, 0.15, (n, 1 + HELPERS)),
-    }
+    return Intents(
+        own=own,
+        helpers=generator.dirichlet(np.ones(ACTIONS), (n, HELPERS)),
+        valid=generator.random((n, HELPERS)) < 0.95,
+        distance_m=generator.uniform(0.0, 80.0, (n, 1 + HELPERS)),
+        range_m=generator.uniform(5.0, 120.0, (n, HELPERS)),
+        payload_bits=generator.uniform(800.0, 2400.0, (n, HELPERS)),
+        inference_s=generator.uniform(0.1, 0.15, (n, 1 + HELPERS)),
+    )
 
 
 if __name__ == "__main__":

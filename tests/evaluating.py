@@ -14,7 +14,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import ask_all, requests
 from harness.evaluate.evaluate import Evaluated, evaluate
-from harness.evaluate.intents import Intents, intents
+from harness.evaluate.intents import Answered, intents
 from harness.evaluate.scoring import Scored, draw, score
 from harness.evaluate.spec import Spec
 from harness.evaluate.success import Table, table
@@ -81,7 +81,7 @@ def sure(action: str, role: str = "ego") -> str:
     return says([float(a == action) for a in ("SLOWER", "IDLE", "FASTER")], role)
 
 
-def ask(spec: Spec, backend: Backend, folder: Path) -> Intents:
+def ask(spec: Spec, backend: Backend, folder: Path) -> Answered:
     """Every answer asked for and read."""
     by_id = ask_all(
         spec, backend, requests(spec, spec.dataset.scenes), folder / "answers.jsonl", lambda done: None
@@ -90,11 +90,11 @@ def ask(spec: Spec, backend: Backend, folder: Path) -> Intents:
 
 
 def scored(
-    spec: Spec, known: Intents, point: OperatingPoint, seed: int = 0, infer_s: float = 0.1
+    spec: Spec, known: Answered, point: OperatingPoint, seed: int = 0, infer_s: float = 0.1
 ) -> tuple[Table, Scored]:
     laid = table(spec.dataset)
-    seconds = np.full((len(known.own), 1 + known.valid.shape[1]), infer_s)
-    return laid, score(laid, known, seconds, point, seed, draw(laid, seed, known.valid.shape))
+    timed = replace(known, inference_s=np.full(known.distance_m.shape, infer_s))
+    return laid, score(laid, timed, point, seed, draw(laid, seed, known.valid.shape))
 
 
 def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:

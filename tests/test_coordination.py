@@ -10,8 +10,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from harness.coordination.channel import Draws
 from harness.coordination.coordinate import Coordination, coordinate
-from harness.coordination.exchange import Luck
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
 
 DOUBT = (0.3, 0.4, 0.3)
@@ -25,24 +26,21 @@ def play(
     valid=(True, True, True),
     distance_m=(20.0, 10.0, 20.0, 5.0),
     range_m=(10.0, 20.0, 30.0),
-    infer_s=(0.145, 0.145, 0.145, 0.145),
+    inference_s=(0.145, 0.145, 0.145, 0.145),
     link=((0.9, 0.9), (0.9, 0.9), (0.9, 0.9)),
     jitter=(0.0, 0.5, 1.0),
-    merge=None,
+    fusion_call=None,
 ) -> Coordination:
-    luck = Luck(np.array(link), np.array(jitter))
-    return coordinate(
-        point,
+    intents = Intents(
         np.array(own),
         np.array(helpers),
         np.array(valid),
         np.array(distance_m),
         np.array(range_m),
         np.full(len(valid), 1000.0),
-        np.array(infer_s),
-        luck,
-        merge,
+        np.array(inference_s),
     )
+    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), fusion_call)
 
 
 def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
@@ -102,7 +100,7 @@ def test_an_ego_that_hears_nobody_falls_back_to_its_own_intent():
 
 def test_without_helpers_the_ego_asks_nobody_and_acts_at_once():
     none = {"helpers": np.zeros((0, 3)), "valid": np.zeros(0, bool), "range_m": (), "jitter": ()}
-    decision = play(V2X, distance_m=(20.0,), infer_s=(0.145,), link=np.zeros((0, 2)), **none)
+    decision = play(V2X, distance_m=(20.0,), inference_s=(0.145,), link=np.zeros((0, 2)), **none)
     assert decision.triggered
     assert decision.messages == 0
     assert decision.fused.tolist() == list(DOUBT)
@@ -132,7 +130,7 @@ def test_an_invalid_helper_sends_nothing_and_takes_no_slot():
         valid=(True, False, True),
         distance_m=(20.0, 10.0, unknown, 5.0),
         range_m=(10.0, unknown, 30.0),
-        infer_s=(0.145, 0.145, unknown, 0.145),
+        inference_s=(0.145, 0.145, unknown, 0.145),
     )
     assert decision.asked.tolist() == [True, False, True]
     assert decision.arrival_s == pytest.approx([0.1701, np.inf, 0.1952])
@@ -151,7 +149,7 @@ def test_only_the_nearest_in_the_radius_are_asked():
 
 
 def test_a_reply_leaves_only_when_the_helper_has_its_own_answer():
-    decision = play(SIXG, infer_s=(0.145, 0.100, 0.160, 0.250), jitter=(0.0, 0.0, 0.0))
+    decision = play(SIXG, inference_s=(0.145, 0.100, 0.160, 0.250), jitter=(0.0, 0.0, 0.0))
     assert decision.arrival_s == pytest.approx([0.150005, 0.165005, 0.255005])
     assert decision.on_time.tolist() == [True, True, False]
     assert decision.latency_s == pytest.approx(0.255005)
@@ -203,7 +201,7 @@ def test_helpers_on_demand_begin_when_they_are_asked():
     """145 ms of the ego, 145 of each helper, then slots of 25.1 ms one after another."""
     wide = replace(V2X, on_demand=True, window_s=0.4)
     assert play(wide).arrival_s == pytest.approx([0.3151, 0.3402, 0.3653])
-    slow = play(wide, infer_s=(0.145, 0.145, 0.100, 0.300))
+    slow = play(wide, inference_s=(0.145, 0.145, 0.100, 0.300))
     assert slow.arrival_s == pytest.approx([0.3151, 0.2701, 0.4701])
     assert slow.on_time.tolist() == [True, True, False]
     assert play(replace(V2X, on_demand=True)).fused.tolist() == list(DOUBT), "nobody is on time"
@@ -215,16 +213,16 @@ AGREED = (0.1, 0.2, 0.7)
 def asked_again(*heard: bool, answer=AGREED, seconds=0.160):
     """The ego's model is asked with the messages of exactly these helpers."""
 
-    def merge(on_time):
+    def fusion_call(on_time):
         assert on_time.tolist() == list(heard)
         return np.array(answer, dtype=float), np.float64(seconds)
 
-    return merge
+    return fusion_call
 
 
 def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
     """Over 6g the exchange ends at 151.905 ms; the second inference takes 160 ms more."""
-    decision = play(replace(SIXG, consensus="ego-prompt"), merge=asked_again(True, True, True))
+    decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=asked_again(True, True, True))
     assert decision.fused == pytest.approx(AGREED)
     assert decision.action == 2
     assert decision.exchange_s == pytest.approx(0.151905)
@@ -235,25 +233,25 @@ def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
 
 def test_ego_prompt_reads_only_what_came_in_time():
     """Over v2x the third reply ends at 220.3 ms: waited for, not read."""
-    decision = play(replace(V2X, consensus="ego-prompt"), merge=asked_again(True, True, False))
+    decision = play(replace(V2X, consensus="ego-prompt"), fusion_call=asked_again(True, True, False))
     assert decision.latency_s == pytest.approx(0.3803)
     assert decision.late == 1
 
 
 def test_ego_prompt_is_not_asked_by_an_ego_that_hears_nobody():
-    merge = asked_again(False, False, False, answer=(np.nan,) * 3, seconds=np.nan)
+    fusion_call = asked_again(False, False, False, answer=(np.nan,) * 3, seconds=np.nan)
     for point, own in ((replace(SIXG, loss=1.0), DOUBT), (SIXG, (0.9, 0.05, 0.05))):
-        decision = play(replace(point, consensus="ego-prompt"), own=own, merge=merge)
+        decision = play(replace(point, consensus="ego-prompt"), own=own, fusion_call=fusion_call)
         assert decision.fused.tolist() == list(own)
         assert decision.latency_s == decision.exchange_s
         assert decision.weights.tolist() == [1.0, 0.0, 0.0, 0.0]
-        assert not decision.merge_failed
+        assert not decision.fusion_failed
 
 
 def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_time():
     failed = asked_again(True, True, True, answer=(np.nan,) * 3)
-    decision = play(replace(SIXG, consensus="ego-prompt"), merge=failed)
-    assert decision.merge_failed
+    decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=failed)
+    assert decision.fusion_failed
     assert decision.fused.tolist() == list(DOUBT)
     assert decision.latency_s == pytest.approx(0.311905)
 
@@ -285,14 +283,8 @@ def test_block_fading_is_one_draw_for_all_steps_of_an_episode():
     ones = np.ones((2, 6, 3))
     decisions = coordinate(
         replace(SIXG, loss=0.4),
-        own,
-        helpers,
-        ones > 0,
-        np.ones((2, 6, 4)),
-        ones,
-        ones,
-        np.full((2, 6, 4), 0.145),
-        Luck(link, rng.random((2, 6, 3))),
+        Intents(own, helpers, ones > 0, np.ones((2, 6, 4)), ones, ones, np.full((2, 6, 4), 0.145)),
+        Draws(link, rng.random((2, 6, 3))),
     )
     assert decisions.messages.sum(axis=1).tolist() == [18, 18]
     assert np.array_equal(decisions.delivered, np.repeat(decisions.delivered[:, :1], 6, axis=1))
@@ -302,14 +294,16 @@ def test_every_array_of_a_batch_has_the_batch_in_front():
     rng = np.random.default_rng(1)
     decisions = coordinate(
         SIXG,
-        rng.dirichlet(np.ones(3), (5, 2)),
-        rng.dirichlet(np.ones(3), (5, 2, 4)),
-        rng.random((5, 2, 4)) < 0.5,
-        rng.random((5, 2, 5)),
-        rng.random((5, 2, 4)),
-        rng.random((5, 2, 4)),
-        rng.random((5, 2, 5)),
-        Luck(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
+        Intents(
+            rng.dirichlet(np.ones(3), (5, 2)),
+            rng.dirichlet(np.ones(3), (5, 2, 4)),
+            rng.random((5, 2, 4)) < 0.5,
+            rng.random((5, 2, 5)),
+            rng.random((5, 2, 4)),
+            rng.random((5, 2, 4)),
+            rng.random((5, 2, 5)),
+        ),
+        Draws(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
     )
     per_helper = {"asked", "delivered", "arrival_s", "on_time"}
     inner = {"own": (3,), "fused": (3,), "weights": (5,)} | dict.fromkeys(per_helper, (4,))

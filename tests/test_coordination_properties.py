@@ -2,20 +2,20 @@
 
 import math
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.coordination.channel import Draws
 from harness.coordination.consensus import RULES
 from harness.coordination.coordinate import Coordination, coordinate
-from harness.coordination.exchange import Luck
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
 
 COOPERATIVE = [POINTS["v2x"], POINTS["6g"], replace(POINTS["6g"], density_coupled=True)]
-Case = dict[str, Any]
+Case = tuple[Intents, Draws]
 
 
 @st.composite
@@ -27,16 +27,15 @@ def cases(draw: st.DrawFn) -> Case:
     valid = rng.random(shape) < draw(st.sampled_from([0.0, 0.5, 1.0]))
     intents = rng.dirichlet(np.full(actions, draw(st.sampled_from([0.05, 1.0, 50.0]))), (4, 1 + helpers))
     range_m = rng.uniform(0, 150, shape)
-    return {
-        "own": intents[:, 0],
-        "helpers": np.where(valid[..., None], intents[:, 1:], np.nan),
-        "valid": valid,
-        "distance_m": rng.uniform(0, 50, (4, 1 + helpers)),
-        "range_m": np.where(valid, range_m, np.nan),
-        "payload_bits": rng.uniform(0, 8000, shape),
-        "infer_s": rng.uniform(0.1, 0.2, (4, 1 + helpers)),
-        "luck": Luck(rng.random((*shape, 2)), rng.random(shape)),
-    }
+    return Intents(
+        own=intents[:, 0],
+        helpers=np.where(valid[..., None], intents[:, 1:], np.nan),
+        valid=valid,
+        distance_m=rng.uniform(0, 50, (4, 1 + helpers)),
+        range_m=np.where(valid, range_m, np.nan),
+        payload_bits=rng.uniform(0, 8000, shape),
+        inference_s=rng.uniform(0.1, 0.2, (4, 1 + helpers)),
+    ), Draws(rng.random((*shape, 2)), rng.random(shape))
 
 
 points = st.builds(
@@ -50,21 +49,14 @@ points = st.builds(
 )
 
 
-def rows(case: Case, index: Any) -> Case:
-    """The case with the batch dimension indexed."""
-    luck = Luck(case["luck"].link[index], case["luck"].jitter[index])
-    return {key: value[index] for key, value in case.items() if key != "luck"} | {"luck": luck}
-
-
 def shuffled(case: Case, order: list[int]) -> Case:
     """The case with its helpers in another order."""
+    intents, draws = case
     with_ego = [0, *(1 + i for i in order)]
-    return {
-        "own": case["own"],
-        "distance_m": case["distance_m"][:, with_ego],
-        "infer_s": case["infer_s"][:, with_ego],
-        "luck": Luck(case["luck"].link[:, order], case["luck"].jitter[:, order]),
-    } | {key: case[key][:, order] for key in ("helpers", "valid", "range_m", "payload_bits")}
+    per_helper = ("helpers", "valid", "range_m", "payload_bits")
+    changed = {name: getattr(intents, name)[:, order] for name in per_helper}
+    changed |= {name: getattr(intents, name)[:, with_ego] for name in ("distance_m", "inference_s")}
+    return replace(intents, **changed), Draws(draws.link[:, order], draws.jitter[:, order])
 
 
 def assert_same(a: Coordination, b: Coordination, *but: str) -> None:
@@ -75,7 +67,7 @@ def assert_same(a: Coordination, b: Coordination, *but: str) -> None:
 
 @given(points, cases())
 def test_weights_and_policy_are_distributions(point, case):
-    decision = coordinate(point, **case)
+    decision = coordinate(point, *case)
     for p in (decision.weights, decision.fused):
         assert np.all(p >= 0)
         assert np.sum(p, axis=-1) == pytest.approx(1.0, abs=1e-12)
@@ -83,18 +75,18 @@ def test_weights_and_policy_are_distributions(point, case):
 
 @given(points, cases())
 def test_only_who_is_heard_in_time_counts_and_hearing_nobody_leaves_the_ego_as_it_was(point, case):
-    decision = coordinate(point, **case)
+    decision = coordinate(point, *case)
     assert np.array_equal(decision.weights[:, 1:] > 0, decision.on_time)
     assert np.all(decision.on_time <= decision.delivered)
     assert np.all(decision.delivered <= decision.asked)
-    assert np.all(decision.asked <= case["valid"])
+    assert np.all(decision.asked <= case[0].valid)
     alone = ~decision.on_time.any(axis=-1)
-    assert np.array_equal(decision.fused[alone], case["own"][alone])
+    assert np.array_equal(decision.fused[alone], case[0].own[alone])
 
 
 @given(points, cases())
 def test_every_scheduled_reply_is_on_time_late_or_lost(point, case):
-    decision = coordinate(point, **case)
+    decision = coordinate(point, *case)
     heard = decision.on_time.sum(axis=-1)
     assert np.array_equal(decision.messages, heard + decision.late + decision.lost)
     assert np.all(decision.messages <= point.max_helpers)
@@ -102,16 +94,16 @@ def test_every_scheduled_reply_is_on_time_late_or_lost(point, case):
 
 @given(points, cases())
 def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case):
-    decision = coordinate(point, **case)
-    assert np.all(decision.latency_s >= case["infer_s"][:, 0])
+    decision = coordinate(point, *case)
+    assert np.all(decision.latency_s >= case[0].inference_s[:, 0])
     arrived = np.where(decision.delivered, decision.arrival_s, 0.0)
     assert np.all(decision.latency_s[:, None] >= arrived)
 
 
 @given(points, cases(), st.data())
 def test_the_order_of_helpers_changes_nothing(point, case, data):
-    order = data.draw(st.permutations(range(case["valid"].shape[1])))
-    decision, other = coordinate(point, **case), coordinate(point, **shuffled(case, order))
+    order = data.draw(st.permutations(range(case[0].valid.shape[1])))
+    decision, other = coordinate(point, *case), coordinate(point, *shuffled(case, order))
     assert_same(decision, other, "asked", "delivered", "arrival_s", "on_time", "weights")
     assert np.array_equal(decision.on_time[:, order], other.on_time)
 
@@ -119,27 +111,27 @@ def test_the_order_of_helpers_changes_nothing(point, case, data):
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
 def test_more_loss_never_hears_more_helpers_with_the_same_luck(point, case, one, other):
     low, high = sorted((one, other))
-    less, more = (coordinate(replace(point, loss=loss), **case) for loss in (low, high))
+    less, more = (coordinate(replace(point, loss=loss), *case) for loss in (low, high))
     assert np.all(more.on_time <= less.on_time)
     assert np.array_equal(more.latency_s, less.latency_s)
 
 
 @given(points, cases())
 def test_a_single_decision_is_a_row_of_the_batch(point, case):
-    batch = coordinate(point, **case)
+    batch = coordinate(point, *case)
     for i in range(4):
         row = Coordination(**{f.name: getattr(batch, f.name)[i] for f in fields(batch)})
-        assert_same(coordinate(point, **rows(case, i)), row)
+        assert_same(coordinate(point, *(each.take(i) for each in case)), row)
 
 
 @given(points, cases())
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
-    never = replace(point, tau_nats=math.log(case["own"].shape[-1]) + 1e-9)
-    assert_same(coordinate(never, **case), coordinate(POINTS["single-local"], **case), "loss")
+    never = replace(point, tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
+    assert_same(coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss")
 
 
 @given(cases(), st.floats(0, 1.2), st.floats(0, 1.2))
 def test_a_higher_threshold_never_asks_more(case, one, other):
     low, high = sorted((one, other))
-    eager, calm = (coordinate(OperatingPoint("x", "v2x", tau_nats=tau), **case) for tau in (low, high))
+    eager, calm = (coordinate(OperatingPoint("x", "v2x", tau_nats=tau), *case) for tau in (low, high))
     assert np.all(calm.messages <= eager.messages)

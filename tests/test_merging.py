@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from evaluating import FILES, Scripted, ask, decisions, figure, rows_of, run, says, spec_of, sure
 
-from harness.coordination.exchange import Luck
+from harness.coordination.channel import Draws
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -24,9 +24,9 @@ MERGE = named_point("6g:consensus=ego-prompt")
 LANGUAGE_MODEL = "swarm-tiny"  # its card: answers come from a script, or from itself
 
 
-def clear(n: int, helpers: int = 3) -> Luck:
+def clear(n: int, helpers: int = 3) -> Draws:
     """Every message crosses."""
-    return Luck(np.full((n, helpers, 2), 0.9), np.zeros((n, helpers)))
+    return Draws(np.full((n, helpers, 2), 0.9), np.zeros((n, helpers)))
 
 
 def first_scene(small: Dataset) -> Dataset:
@@ -42,10 +42,10 @@ def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset, tmp_pat
         f"{scene.id}/v1": says((0.3, 0.4, 0.3)),
         f"{scene.id}/v2": says((0.8, 0.1, 0.1), "helper").replace("clear", "one comes fast"),
     }
-    known = ask(spec, Scripted(lines), tmp_path)
-    luck = clear(1)
-    luck.link[0, 1] = 0.0
-    codes = merging.delivered(known, np.full((1, 4), 0.1), [MERGE, POINTS["v2x"]], [luck])
+    known = replace(ask(spec, Scripted(lines), tmp_path), inference_s=np.full((1, 4), 0.1))
+    draws = clear(1)
+    draws.link[0, 1] = 0.0
+    codes = merging.delivered(known, [MERGE, POINTS["v2x"]], [draws])
     assert codes.tolist() == [0b101]
     [request] = merging.requests(spec, known, codes)
     assert request.id == f"{scene.id}/v1+v2+v4"
@@ -60,15 +60,15 @@ def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset, tmp_pat
 def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset, tmp_path: Path) -> None:
     unsure = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
     spec = spec_of(small, LANGUAGE_MODEL, points=(MERGE,))
-    known = ask(spec, Scripted(unsure), tmp_path)
     n = len(small.scenes)
-    seconds, all_cross = np.full((n, 4), 0.1), clear(n)
+    known = replace(ask(spec, Scripted(unsure), tmp_path), inference_s=np.full((n, 4), 0.1))
+    all_cross = clear(n)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
-    once = merging.delivered(known, seconds, [MERGE], [all_cross])
+    once = merging.delivered(known, [MERGE], [all_cross])
     assert len(once) == n
-    assert merging.delivered(known, seconds, [MERGE, slow], [all_cross, all_cross]).tolist() == once.tolist()
-    nobody = Luck(np.zeros((n, 3, 2)), all_cross.jitter)
-    assert merging.delivered(known, seconds, [MERGE], [nobody]).size == 0
+    assert merging.delivered(known, [MERGE, slow], [all_cross, all_cross]).tolist() == once.tolist()
+    nobody = Draws(np.zeros((n, 3, 2)), all_cross.jitter)
+    assert merging.delivered(known, [MERGE], [nobody]).size == 0
 
 
 def test_who_was_heard_has_one_code_a_decision() -> None:

@@ -285,11 +285,11 @@ def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path)
     spec = spec_of(played, points=(ALONE, CLEAR), seeds=(0,))
     lines = {f"{s.id}/v1": failed(f"{s.id}/v1", "context overflow") for s in played.scenes}
     known = ask(spec, Scripted({**SAID, **lines}), tmp_path)
-    seconds = inference_s({"inference_s": None}, known.answers)
-    assert np.isnan(seconds[:, 0]).all()
+    known = replace(known, inference_s=inference_s({"inference_s": None}, known.answers))
+    assert np.isnan(known.inference_s[:, 0]).all()
     laid = table(spec.dataset)
     drawn = draw(laid, 0, known.valid.shape)
-    runs = [score(laid, known, seconds, point, 0, drawn) for point in spec.points]
+    runs = [score(laid, known, point, 0, drawn) for point in spec.points]
     told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
     for metric in ("latency_proxy_ms", "deadline_miss_rate"):
         row = told.loc[("single-local", metric, "episodes")]

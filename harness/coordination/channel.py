@@ -7,11 +7,29 @@ stays blocked.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The channel's draws in [0, 1); every operating point has the same.
+
+    Attributes:
+        link: request and reply of each helper, `(..., H, 2)`. Equal for all steps of an episode under
+            block fading.
+        jitter: delay of each reply, `(..., H)`.
+    """
+
+    link: Floats
+    jitter: Floats
+
+    def take(self, at: Any) -> "Draws":
+        """The draws at these places of the leading dimension."""
+        return Draws(self.link[at], self.jitter[at])
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 In seconds from the start of the decision:
 
     0                     every vehicle sees the scene; the ego infers, and the helpers in parallel with it
-    infer_s[0]            the ego has its own intent. Sure enough, or nobody to ask: it acts now.
+    inference_s[0]        the ego has its own intent. Sure enough, or nobody to ask: it acts now.
                           Unsure: it broadcasts its request to the nearest helpers in its radius.
                           Where helpers infer on demand, they see and begin only now
     ready                 a helper has the request and its own intent, and its reply can leave:
-                          max(infer_s[0], infer_s[1+h]); on demand infer_s[0] + infer_s[1+h]
+                          max(inference_s[0], inference_s[1+h]); on demand their sum
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
                           nominal latency + payload / bandwidth + jitter, twice over a roadside edge
     arrival_s[h]          the end of the helper's slot, if request and reply crossed; else inf
@@ -26,28 +26,16 @@ import numpy as np
 from harness.coordination.channel import (
     NO_CHANNEL,
     PROFILES,
+    Draws,
     Profile,
     density_coupled_loss,
     link_up,
     reply_delay_s,
 )
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
-
-
-@dataclass(frozen=True)
-class Luck:
-    """The channel's draws in [0, 1); one operating point sees the same as another.
-
-    Attributes:
-        link: request and reply of each helper, `(..., H, 2)`. Equal for all steps of an episode under
-            block fading.
-        jitter: delay of each reply, `(..., H)`.
-    """
-
-    link: Floats
-    jitter: Floats
 
 
 @dataclass(frozen=True)
@@ -104,47 +92,29 @@ class Exchange:
         return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
 
 
-def exchange(
-    point: OperatingPoint,
-    own: Floats,
-    helpers: Floats,
-    valid: Bools,
-    range_m: Floats,
-    payload_bits: Floats,
-    infer_s: Floats,
-    luck: Luck,
-) -> Exchange:
-    """Trigger and channel for decisions `(...)` with up to H helpers and A actions each.
-
-    Args:
-        point: the operating point.
-        own: the ego's intent, `(..., A)`; a row with a NaN is a failed answer.
-        helpers: helpers' intents, `(..., H, A)`.
-        valid: the helper exists and its answer parsed, `(..., H)`. Any other sends nothing, takes no
-            slot, and may hold NaN in every array.
-        range_m: distance to the ego, `(..., H)`.
-        payload_bits: size of the reply, `(..., H)`.
-        infer_s: seconds of inference, `(..., 1+H)`, the ego first.
-        luck: the channel's draws.
-    """
+def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
+    """Trigger and channel for decisions `(...)` with up to H helpers. An unknown time counts as none."""
     profile = NO_CHANNEL if point.profile is None else PROFILES[point.profile]
     if point.profile is not None and point.latency_s is not None:
         profile = replace(profile, latency_s=point.latency_s)
-    own_failed = np.any(np.isnan(own), axis=-1)
-    own = np.where(own_failed[..., None], fallback_intent(point.fallback, own.shape[-1]), own)
+    own_failed = np.any(np.isnan(intents.own), axis=-1)
+    fallback = fallback_intent(point.fallback, intents.own.shape[-1])
+    own = np.where(own_failed[..., None], fallback, intents.own)
     entropy = entropy_nats(own)
     asks = (entropy > point.tau_nats) & (point.profile is not None)
 
-    in_radius = valid & (range_m <= point.radius_m)
-    asked = asks[..., None] & nearest(in_radius, range_m, point.max_helpers)
-    unsure = triggered(helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(valid)
+    in_radius = intents.valid & (intents.range_m <= point.radius_m)
+    asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
+    unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
     loss = crossing_loss(point, profile, in_radius, unsure)
-    delivered = asked & link_up(luck.link, loss, point.roadside_edge)
+    delivered = asked & link_up(draws.link, loss, point.roadside_edge)
 
-    request_s = infer_s[..., :1]
-    infers_s = infer_s[..., 1:]
-    ready_s = infers_s if point.on_demand else np.maximum(infers_s - request_s, 0.0)
-    delay_s = reply_delay_s(profile, asked, ready_s, range_m, payload_bits, luck.jitter, point.roadside_edge)
+    inference_s = np.nan_to_num(intents.inference_s)
+    request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
+    ready_s = helpers_s if point.on_demand else np.maximum(helpers_s - request_s, 0.0)
+    delay_s = reply_delay_s(
+        profile, asked, ready_s, intents.range_m, intents.payload_bits, draws.jitter, point.roadside_edge
+    )
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)
     ends_s = np.where(asked, slot_end_s, request_s)
@@ -158,7 +128,7 @@ def exchange(
         delivered=delivered,
         arrival_s=arrival_s,
         on_time=arrival_s <= point.window_s,
-        exchange_s=np.maximum(infer_s[..., 0], np.max(ends_s, axis=-1, initial=0.0)),
+        exchange_s=np.maximum(inference_s[..., 0], np.max(ends_s, axis=-1, initial=0.0)),
     )
 
 

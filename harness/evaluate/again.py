@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import Answer, ask_all, read_kept
-from harness.evaluate.intents import Intents
+from harness.evaluate.intents import Answered
 from harness.evaluate.merging import Merged, merged, requests
 from harness.evaluate.spec import Spec
 from harness.evaluate.timing import merge_latency, merge_s
@@ -37,7 +37,7 @@ class Asking:
 def second_answers(
     run: Run,
     dataset: Dataset,
-    known: Intents,
+    known: Answered,
     points: Sequence[OperatingPoint],
     codes: Ints,
     latency: dict[str, Any],

@@ -4,21 +4,20 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.backends.cache import cached
 from harness.backends.registry import open_backend
-from harness.coordination.exchange import Luck
-from harness.core.arrays import Floats
+from harness.coordination.channel import Draws
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json, digest, write_whole
 from harness.core.memory import uncollected
 from harness.evaluate import merging
 from harness.evaluate.asking import Answer, ask_all, requests
-from harness.evaluate.intents import Intents, intents
+from harness.evaluate.intents import Answered, intents
 from harness.evaluate.merging import Merged
 from harness.evaluate.scoring import draw, score
 from harness.evaluate.spec import FORMAT, Spec, versions
@@ -45,12 +44,11 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Told:
-    """What the answers say, laid out to be scored: episodes, intents, seconds (n, 1+H), luck by seed."""
+    """What the answers say, laid out to be scored: episodes, intents, draws by seed."""
 
     laid: Table
-    known: Intents
-    inference_s: Floats
-    lucks: Mapping[int, Luck]
+    known: Answered
+    draws: Mapping[int, Draws]
 
 
 def evaluate(
@@ -88,7 +86,7 @@ def evaluate(
         latency = settled(spec, backend, latency, by_id, work / "latency.json")
         with uncollected():
             told = _told(spec, by_id, latency)
-        codes = merging.delivered(told.known, told.inference_s, spec.points, told.lucks.values())
+        codes = merging.delivered(told.known, spec.points, told.draws.values())
         again = list(merging.requests(spec, told.known, codes))
         more(len(again))
         by_id = ask_all(spec, asked, again, kept, progress) if again else by_id
@@ -107,8 +105,8 @@ def evaluate(
 
 def _told(spec: Spec, by_id: Mapping[str, Answer], latency: Mapping[str, Any]) -> Told:
     laid, known = table(spec.dataset), intents(spec.dataset, by_id, spec.answer, spec.thinking)
-    lucks = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
-    return Told(laid, known, inference_s(latency, known.answers), lucks)
+    draws = {seed: draw(laid, seed, known.valid.shape) for seed in spec.seeds}
+    return Told(laid, replace(known, inference_s=inference_s(latency, known.answers)), draws)
 
 
 @uncollected()
@@ -116,7 +114,7 @@ def _scored(spec: Spec, out: Path, told: Told, second: Merged, begun: Mapping[st
     """Score the answers and write the run's files; `begun` is what its manifest says of its making."""
     laid, known = told.laid, told.known
     runs = [
-        score(laid, known, told.inference_s, point, seed, told.lucks[seed], second)
+        score(laid, known, point, seed, told.draws[seed], second)
         for point in spec.points for seed in spec.seeds
     ]  # fmt: skip
     result = summary(spec, laid, known, runs, second)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats
+from harness.coordination.intents import Intents
 from harness.core.files import canonical_json
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import Answer
@@ -13,32 +13,20 @@ from harness.parsing.parse import Parsed, parse
 
 
 @dataclass(frozen=True)
-class Intents:
-    """What every viewer of every scene intends; n scenes, H helpers, A actions.
+class Answered(Intents):
+    """What every viewer of every scene intends, (n, ...), with the answers that say so.
 
     Attributes:
         answers: raw answers, n lists of 1+H; None where nobody was asked.
         parsed: what each says, in the same places.
-        own: the ego's intent, (n, A); NaN where its answer failed.
-        helpers: helpers' intents, (n, H, A); NaN where there is none.
-        valid: the helper answered and its answer parsed, (n, H).
-        distance_m: distance to the centroid of the conflict zone, (n, 1+H).
-        range_m: distance to the ego, (n, H).
-        payload_bits: size of the helper's message, (n, H).
     """
 
     answers: list[list[Answer | None]]
     parsed: list[list[Parsed | None]]
-    own: Floats
-    helpers: Floats
-    valid: Bools
-    distance_m: Floats
-    range_m: Floats
-    payload_bits: Floats
 
 
-def intents(dataset: Dataset, by_id: Mapping[str, Answer], answer: str, thinking: bool) -> Intents:
-    """Parse every answer. A failed one is NaN and keeps its status.
+def intents(dataset: Dataset, by_id: Mapping[str, Answer], answer: str, thinking: bool) -> Answered:
+    """Parse every answer. A failed one is NaN and keeps its status. `inference_s` is unknown as yet: NaN.
 
     Args:
         dataset: the scenes.
@@ -79,7 +67,9 @@ def intents(dataset: Dataset, by_id: Mapping[str, Answer], answer: str, thinking
                 reach[i, j - 1] = np.hypot(x_m - ego_x_m, y_m - ego_y_m)
                 bits[i, j - 1] = payload_bits(viewer, at[viewer], said) if said else 0
     valid = ~np.isnan(p[:, 1:]).any(axis=-1)
-    return Intents(answers, parsed, p[:, 0], p[:, 1:], valid, distance, reach, bits)
+    return Answered(
+        p[:, 0], p[:, 1:], valid, distance, reach, bits, np.full(distance.shape, np.nan), answers, parsed
+    )
 
 
 def payload_bits(viewer: str, xy_m: tuple[float, float], said: Parsed) -> int:

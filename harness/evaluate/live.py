@@ -15,18 +15,20 @@ import numpy as np
 
 from harness.backends.base import Backend
 from harness.backends.registry import capabilities
+from harness.coordination.channel import Draws
 from harness.coordination.coordinate import coordinate
-from harness.coordination.exchange import Luck, exchange
+from harness.coordination.exchange import exchange
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.core import noise as luck
-from harness.core.arrays import Floats, Ints
+from harness.core import noise
+from harness.core.arrays import Ints
 from harness.core.files import digest
 from harness.dataset.freeze import moment
 from harness.dataset.load import Scene
 from harness.evaluate import merging
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.branches import Decision, Episode, Trajectory
-from harness.evaluate.intents import Intents, intents
+from harness.evaluate.intents import Answered, intents
 from harness.evaluate.live_spec import Drive
 from harness.evaluate.merging import Merged
 from harness.evaluate.timing import inference_s, merge_s
@@ -105,9 +107,9 @@ def _decide(
     by_id = {r.id: answer_of(r, c) for r, c in zip(asked, backend.complete(asked), strict=True)}
     live_scenes = replace(spec.dataset, scenes=scenes)
     known = intents(live_scenes, by_id, spec.answer, spec.thinking)
-    seconds = inference_s(latency, known.answers)
+    known = replace(known, inference_s=inference_s(latency, known.answers))
     rounds = [
-        _Round(point, step, scenes, known, seconds, places)
+        _Round(point, step, scenes, known, places)
         for point in spec.points
         if (places := [(n, e) for n, (_, free) in enumerate(deciding) for e in free if e.point is point])
     ]
@@ -125,8 +127,7 @@ class _Round:
     point: OperatingPoint
     step: int
     scenes: Sequence[Scene]
-    known: Intents
-    seconds: Floats
+    known: Answered
     places: Sequence[tuple[int, Episode]]
 
     @cached_property
@@ -135,27 +136,22 @@ class _Round:
         return np.array([n for n, _ in self.places])
 
     @cached_property
-    def inputs(self) -> dict[str, Any]:
+    def inputs(self) -> tuple[OperatingPoint, Intents, Draws]:
         """What `exchange` wants."""
-        at, known = self.at, self.known
-        helpers = known.valid.shape[1]
-        drawn = [_luck(e.seed, self.scenes[n].state.episode_seed, helpers) for n, e in self.places]
-        luck = Luck(np.array([d[:2].T for d in drawn]), np.array([d[2 + self.step] for d in drawn]))
-        return {
-            "point": self.point, "own": known.own[at], "helpers": known.helpers[at], "valid": known.valid[at],
-            "range_m": known.range_m[at], "payload_bits": known.payload_bits[at],
-            "infer_s": np.nan_to_num(self.seconds[at]), "luck": luck,
-        }  # fmt: skip
+        helpers = self.known.valid.shape[1]
+        drawn = [_draws(e.seed, self.scenes[n].state.episode_seed, helpers) for n, e in self.places]
+        draws = Draws(np.array([d[:2].T for d in drawn]), np.array([d[2 + self.step] for d in drawn]))
+        return self.point, self.known.take(self.at), draws
 
     def codes(self) -> Ints:
         """Sets of messages that the ego's model is to merge."""
-        on_time = exchange(**self.inputs).on_time
+        on_time = exchange(*self.inputs).on_time
         return merging.codes_of(on_time, self.at)[on_time.any(axis=1)]
 
     def decide(self, actions: Sequence[str], second: Merged | None) -> None:
         """Open every decision."""
-        merge = partial(second, at=self.at) if second else None
-        result = coordinate(**self.inputs, distance_m=self.known.distance_m[self.at], merge=merge)
+        fusion_call = partial(second, at=self.at) if second else None
+        result = coordinate(*self.inputs, fusion_call)
         begun = round(self.step * P.decision_period_s * P.simulation_hz)
         viewers = [self.scenes[n].viewers[1:] for n, _ in self.places]
         made = record.decisions(result, self.point, [e.seed for _, e in self.places], viewers, actions)
@@ -167,7 +163,7 @@ class _Round:
 
 
 def _asked_again(
-    spec: Drive, backend: Backend, latency: Mapping[str, Any], known: Intents, rounds: Sequence[_Round]
+    spec: Drive, backend: Backend, latency: Mapping[str, Any], known: Answered, rounds: Sequence[_Round]
 ) -> Merged | None:
     """The ego's second answers, where a condition has its model merge messages; empty if nobody was heard."""
     found = [one.codes() for one in rounds if one.point.asks_again]
@@ -181,9 +177,9 @@ def _asked_again(
 
 
 @lru_cache(maxsize=4096)
-def _luck(seed: int, layout_seed: int, helpers: int) -> Any:
+def _draws(seed: int, layout_seed: int, helpers: int) -> Any:
     """The channel's draws for an episode, (2 + decisions, helpers): the very ones of a frozen run."""
-    return luck.uniforms((2 + P.decisions, helpers), "channel", seed, layout_seed)
+    return noise.uniforms((2 + P.decisions, helpers), "channel", seed, layout_seed)
 
 
 def _ended(spec: Drive, arrived: Sequence[Trajectory]) -> list[record.Row]:

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from harness.backends.base import Request
-from harness.coordination.exchange import Luck, exchange
+from harness.coordination.channel import Draws
+from harness.coordination.exchange import exchange
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.asking import Answer, most_tokens
-from harness.evaluate.intents import Intents
+from harness.evaluate.intents import Answered
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import Parsed, parse
 
@@ -67,23 +69,18 @@ def places_of(code: int, helpers: int) -> list[int]:
     return [1 + h for h in range(helpers) if code >> h & 1]
 
 
-def delivered(
-    known: Intents, inference_s: Floats, points: Iterable[OperatingPoint], lucks: Iterable[Luck]
-) -> Ints:
+def delivered(intents: Intents, points: Iterable[OperatingPoint], draws: Iterable[Draws]) -> Ints:
     """Codes of all sets of messages that points delivered where the ego's model is asked again, ascending."""
     found: Ints = np.empty(0, dtype=int)
-    lucks = list(lucks)
+    draws = list(draws)
     for point in points:
-        for luck in lucks if point.asks_again else ():
-            heard = exchange(
-                point, known.own, known.helpers, known.valid, known.range_m, known.payload_bits,
-                np.nan_to_num(inference_s), luck,
-            ).on_time  # fmt: skip
+        for one in draws if point.asks_again else ():
+            heard = exchange(point, intents, one).on_time
             found = np.union1d(found, codes_of(heard)[heard.any(axis=1)])
     return found
 
 
-def requests(spec: Spec, known: Intents, codes: Ints) -> Iterator[Request]:
+def requests(spec: Spec, known: Answered, codes: Ints) -> Iterator[Request]:
     """What the ego's model is asked the second time, one request a code."""
     helpers = known.valid.shape[1]
     for code in codes.tolist():

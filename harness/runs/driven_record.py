@@ -10,7 +10,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import known_mean
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Episode, Trajectory
-from harness.evaluate.intents import Intents
+from harness.evaluate.intents import Answered
 from harness.evaluate.live_spec import Drive
 from harness.evaluate.merging import Merged
 from harness.runs.record import by_scene, by_viewer, number
@@ -30,7 +30,7 @@ MEANS = (
 
 
 def moments(
-    scenes: Sequence[Scene], known: Intents, made: Sequence[list[Row]], second: Merged | None
+    scenes: Sequence[Scene], known: Answered, made: Sequence[list[Row]], second: Merged | None
 ) -> list[Row]:
     """A row a moment: its answers, and what each condition and seed that was there made of them.
 
@@ -66,7 +66,7 @@ def decisions(
         "triggered": c.triggered, "effective_loss": np.where(c.triggered, c.loss, np.nan),
         "observed_loss": c.observed_loss, "own_weight": c.weights[:, 0].round(6),
         "fusion_ms": (c.fusion_s * 1000).round(3),
-        "merge_failed": np.where(c.on_time.any(axis=1) & point.asks_again, c.merge_failed, np.nan),
+        "merge_failed": np.where(c.on_time.any(axis=1) & point.asks_again, c.fusion_failed, np.nan),
     }  # fmt: skip
     columns: dict[str, list[Any]] = {name: values.tolist() for name, values in table.items()}
     arrival_ms = (c.arrival_s * 1000).round(3).tolist()

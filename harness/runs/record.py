@@ -10,7 +10,7 @@ from harness.core.files import canonical_json
 from harness.core.statistics import known_mean
 from harness.dataset.load import Scene
 from harness.evaluate.asking import Answer
-from harness.evaluate.intents import Intents
+from harness.evaluate.intents import Answered
 from harness.evaluate.merging import Merged, places_of, request_id
 from harness.evaluate.scoring import Scored
 from harness.evaluate.spec import Spec
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def rows(
-    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
+    spec: Spec, laid: Table, known: Answered, runs: Sequence[Scored], second: Merged | None = None
 ) -> Iterator[str]:
     """Lines of `rows.jsonl`: a decision point, its answers, and what each condition and seed made of it.
 
@@ -46,7 +46,7 @@ def rows(
         }) + "\n"  # fmt: skip
 
 
-def by_viewer(scene: Scene, known: Intents, i: int) -> dict[str, dict[str, Any]]:
+def by_viewer(scene: Scene, known: Answered, i: int) -> dict[str, dict[str, Any]]:
     """The answers of a scene, the i-th of `known`, by who gave them."""
     said = zip(scene.viewers, known.answers[i], known.parsed[i], strict=False)
     return {
@@ -55,7 +55,7 @@ def by_viewer(scene: Scene, known: Intents, i: int) -> dict[str, dict[str, Any]]
     }  # fmt: skip
 
 
-def by_scene(scenes: Sequence[Scene], known: Intents, second: Merged) -> dict[int, dict[str, Any]]:
+def by_scene(scenes: Sequence[Scene], known: Answered, second: Merged) -> dict[int, dict[str, Any]]:
     """The ego's second answers by place of the scene and by whose messages it had."""
     found: dict[int, dict[str, Any]] = {}
     helpers = known.valid.shape[1]

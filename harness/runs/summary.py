@@ -25,7 +25,7 @@ from harness.core.statistics import (
     seed_interval,
 )  # fmt: skip
 from harness.evaluate.asking import Answer
-from harness.evaluate.intents import Intents
+from harness.evaluate.intents import Answered
 from harness.evaluate.merging import Merged
 from harness.evaluate.scoring import Scored, statuses
 from harness.evaluate.spec import Spec
@@ -69,14 +69,14 @@ PER_DECISION: dict[str, Callable[[Table, Scored], Any]] = {  # values (n,), of w
     "fallback_rate": lambda laid, r: r.coordination.own_failed,
     "fusion_ms": lambda laid, r: r.coordination.fusion_s * 1000,
     "merge_failed_rate": lambda laid, r: np.where(
-        r.coordination.on_time.any(axis=1) & r.point.asks_again, r.coordination.merge_failed, np.nan
+        r.coordination.on_time.any(axis=1) & r.point.asks_again, r.coordination.fusion_failed, np.nan
     ),
 }
 METRICS = (*PER_EPISODE, *PER_DECISION)
 
 
 def summary(
-    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
+    spec: Spec, laid: Table, known: Answered, runs: Sequence[Scored], second: Merged | None = None
 ) -> "pd.DataFrame":
     """The long table of `summary.csv`."""
     return long_table(spec, _estimates(spec, laid, known, runs, second))
@@ -98,7 +98,7 @@ def long_table(spec: Spec, estimates: Iterable[tuple[str, str, Estimate, str]]) 
 
 
 def _estimates(
-    spec: Spec, laid: Table, known: Intents, runs: Sequence[Scored], second: Merged | None = None
+    spec: Spec, laid: Table, known: Answered, runs: Sequence[Scored], second: Merged | None = None
 ) -> Iterator[tuple[str, str, Estimate, str]]:
     by_condition: dict[str, dict[str, Floats]] = {}
     for point in spec.points:

@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from harness.coordination.channel import Draws
 from harness.coordination.coordinate import fuse
-from harness.coordination.exchange import Luck, exchange
+from harness.coordination.exchange import exchange
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.core import noise as luck
+from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
-from harness.evaluate.intents import Intents
 from harness.evaluate.scoring import Scored, outcome
 from harness.evaluate.success import Table
 from harness.studies.entropies import ACTIONS, peaked, spread
@@ -99,7 +100,7 @@ class _Drawn:
     known: Intents
     told: Floats
     witness: Bools
-    links: Luck
+    links: Draws
 
 
 class Calibrated:
@@ -140,24 +141,18 @@ class Calibrated:
     def _scored(self, point: OperatingPoint, vehicles: int, seed: int, first: int) -> tuple[Table, Scored]:
         """An ego that has fused the witness's message knows from its next decision on."""
         drawn = self._draw(seed, vehicles - 1, first)
-        known, infer_s = drawn.known, np.full(drawn.known.distance_m.shape, self.parameters.inference_s)
-        heard = exchange(
-            point, known.own, known.helpers, known.valid, known.range_m, known.payload_bits, infer_s,
-            drawn.links,
-        )  # fmt: skip
+        heard = exchange(point, drawn.known, drawn.links)
         # Who asks and who is heard depends on entropies, which knowing does not change.
         told = np.any(heard.on_time & drawn.witness, axis=1).reshape(-1, STEPS)
         knew = np.insert(np.logical_or.accumulate(told, axis=1)[:, :-1], 0, False, axis=1).reshape(-1, 1)
         heard = replace(heard, own=np.where(knew, drawn.told, heard.own))
-        return drawn.laid, outcome(
-            drawn.laid, point, seed, fuse(point, heard, known.helpers, known.distance_m)
-        )
+        return drawn.laid, outcome(drawn.laid, point, seed, fuse(point, heard, drawn.known))
 
     def _drawn(self, seed: int, helpers: int, first: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""
         p, e = self.parameters, min(CHUNK, self.episodes - first)
         n = e * STEPS
-        base = luck.generator("calibrated", seed, first)
+        base = noise.generator("calibrated", seed, first)
         approach = np.searchsorted(np.cumsum([p.left_share, p.right_share]), base.random(e), side="right")
         skill = base.random(e)
         right = base.integers(ACTIONS, size=e)
@@ -168,7 +163,7 @@ class Calibrated:
 
         link, jitter, unsure = np.empty((n, helpers, 2)), np.empty((n, helpers)), np.empty((n, helpers))
         for h in range(helpers):
-            own = luck.generator("calibrated", seed, first, h)
+            own = noise.generator("calibrated", seed, first, h)
             link[:, h] = np.repeat(own.random((e, 2)), STEPS, axis=0)
             jitter[:, h], unsure[:, h] = own.random((2, n))
         witness = np.repeat(approach[:, None] == np.arange(helpers), STEPS, axis=0)
@@ -176,17 +171,17 @@ class Calibrated:
         guessed, knew = (np.repeat(top, STEPS) for top in (guess, know))
         top = np.where(witness, knew[:, None], guessed[:, None])
         known = Intents(
-            answers=[], parsed=[],
             own=peaked(ego_nats, guessed), helpers=peaked(nats, top), valid=np.ones((n, helpers), dtype=bool),
             distance_m=np.insert(np.where(witness, WITNESS_M, OTHERS_M), 0, EGO_M, axis=1),
             range_m=np.broadcast_to(FIRST_RANGE_M + RANGE_STEP_M * np.arange(helpers), (n, helpers)),
             payload_bits=np.full((n, helpers), PAYLOAD_BITS),
+            inference_s=np.full((n, 1 + helpers), p.inference_s),
         )  # fmt: skip
         laid = Table(
             index=np.arange(n).reshape(e, STEPS), episodes=first + np.arange(e), seeds=np.full(e, seed),
             safe=_safe(right), delay_s=np.zeros((n, ACTIONS)), allowance_s=0.0,
         )  # fmt: skip
-        return _Drawn(laid, known, peaked(ego_nats, knew), witness, Luck(link, jitter))
+        return _Drawn(laid, known, peaked(ego_nats, knew), witness, Draws(link, jitter))
 
 
 def _safe(right: Ints) -> Bools:

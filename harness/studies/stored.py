@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.exchange import Luck, nearest
+from harness.coordination.channel import Draws
+from harness.coordination.exchange import nearest
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools
 from harness.core.errors import UserError, printable
 from harness.evaluate.again import Asking, second_answers
-from harness.evaluate.intents import Intents, intents
+from harness.evaluate.intents import Answered, intents
 from harness.evaluate.merging import Merged, delivered
 from harness.evaluate.scoring import Scored, draw, score
 from harness.evaluate.success import Table, table
@@ -52,10 +53,10 @@ class Stored:
         }
         self._dataset = dataset
         self._second: Merged | None = None
-        self._known = intents(dataset, by_id, self.run.answer, bool(config["thinking"]))
+        known = intents(dataset, by_id, self.run.answer, bool(config["thinking"]))
         self._laid = table(dataset)
         self._latency = PAPER if latency == "paper" else dict(config["latency"])
-        self._infer_s = inference_s(self._latency, self._known.answers)
+        self._known = replace(known, inference_s=inference_s(self._latency, known.answers))
         self.vehicles = self._known.distance_m.shape[1]
         self._draw = lru_cache(maxsize=64)(self._drawn)
 
@@ -70,10 +71,8 @@ class Stored:
     def prepare(self, settings: Iterable[Setting], seeds: Sequence[int], asking: Asking) -> None:
         """Ask the model what these grid points need beyond the run's answers, if they need anything."""
         asked_again = [s for s in settings if s.point.asks_again]
-        lucks = [self._draw(seed) for seed in seeds]
-        codes = [
-            delivered(self._with(s.vehicles), self._infer_s, [s.point], lucks) for s in asked_again
-        ]  # fmt: skip
+        draws = [self._draw(seed) for seed in seeds]
+        codes = [delivered(self._with(s.vehicles), [s.point], draws) for s in asked_again]
         if asked_again:
             points, every = [s.point for s in asked_again], np.unique(np.concatenate(codes))
             self._second, self._latency = second_answers(
@@ -83,14 +82,14 @@ class Stored:
     def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
         """Every decision at one operating point, with the ego and so many of the nearest vehicles."""
         known = self._with(vehicles)
-        yield self._laid, score(self._laid, known, self._infer_s, point, seed, self._draw(seed), self._second)
+        yield self._laid, score(self._laid, known, point, seed, self._draw(seed), self._second)
 
-    def _with(self, vehicles: int) -> Intents:
+    def _with(self, vehicles: int) -> Answered:
         return replace(self._known, valid=self._known.valid & self._there(vehicles - 1))
 
     def _there(self, helpers: int) -> Bools:
         reach = np.nan_to_num(self._known.range_m, nan=np.inf)
         return nearest(np.isfinite(reach), reach, helpers)
 
-    def _drawn(self, seed: int) -> Luck:
+    def _drawn(self, seed: int) -> Draws:
         return draw(self._laid, seed, self._known.valid.shape)

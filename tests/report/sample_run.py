@@ -7,8 +7,9 @@ from dataclasses import asdict
 
 import numpy as np
 
+from harness.coordination.channel import Draws
 from harness.coordination.coordinate import coordinate
-from harness.coordination.exchange import Luck
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS
 from harness.core import noise as luck
 from harness.core.statistics import episode_interval, rate_interval, seed_interval
@@ -127,14 +128,16 @@ def _decide(name, seed, dataset, answers):
     keys = [("sample", seed, s.record["episode"]) for s in scenes]
     return coordinate(
         POINTS[name],
-        own=intents[:, 0],
-        helpers=intents[:, 1:],
-        valid=~np.isnan(intents[:, 1:]).any(axis=-1),
-        distance_m=np.array([list(s.record["distance_m"].values()) for s in scenes]),
-        range_m=np.hypot(*np.moveaxis(place[:, 1:] - place[:, :1], -1, 0)),
-        payload_bits=np.full((len(scenes), helpers), 2400.0),
-        infer_s=np.full((len(scenes), 1 + helpers), INFERENCE_S),
-        luck=Luck(
+        Intents(
+            own=intents[:, 0],
+            helpers=intents[:, 1:],
+            valid=~np.isnan(intents[:, 1:]).any(axis=-1),
+            distance_m=np.array([list(s.record["distance_m"].values()) for s in scenes]),
+            range_m=np.hypot(*np.moveaxis(place[:, 1:] - place[:, :1], -1, 0)),
+            payload_bits=np.full((len(scenes), helpers), 2400.0),
+            inference_s=np.full((len(scenes), 1 + helpers), INFERENCE_S),
+        ),
+        Draws(
             link=np.array([luck.uniforms((helpers, 2), "link", *key) for key in keys]),
             jitter=np.array([luck.uniforms((helpers,), "jitter", *key) for key in keys]),
         ),
