@@ -109,7 +109,7 @@ def test_the_order_of_helpers_changes_nothing(point, case, data):
 
 
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
-def test_more_loss_never_hears_more_helpers_with_the_same_luck(point, case, one, other):
+def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one, other):
     low, high = sorted((one, other))
     less, more = (coordinate(replace(point, loss=loss), *case) for loss in (low, high))
     assert np.all(more.on_time <= less.on_time)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.coordination.channel import CHANNELS, Channel, Delivery, Draws, Links, Radio, link_up
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Delivery, Draws, Links, Radio, link_up
 from harness.coordination.consensus import RULES, Fused, Messages, Rule, linear_pool
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
@@ -67,8 +67,9 @@ def step(
 
 
 def test_a_rule_with_memory_is_driven_step_by_step():
-    """What is heard makes .75, then nobody is heard, then .25: means of now and before are .75, .625, .4375.
+    """Now it is .75, then .5 as nobody is heard, then .25: means with what was before are .75, .625, .4375.
 
+    The ego that hears nobody acts on its own intent, and the rule remembers that it did.
     A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
     """
     point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
@@ -76,7 +77,8 @@ def test_a_rule_with_memory_is_driven_step_by_step():
     assert first.fused.tolist() == [[0.75, 0.25], [0.5, 0.5]]
     second = step(point, [(1.0, 0.0), (0.5, 0.5)], [False, True], first.state)
     assert second.lost.tolist() == [1, 0]
-    assert second.fused.tolist() == [[0.625, 0.375], [0.5, 0.5]]
+    assert second.fused.tolist() == [[0.5, 0.5], [0.5, 0.5]]
+    assert second.state.tolist() == [[0.625, 0.375], [0.5, 0.5]]
     third = step(point, [(0.0, 1.0), (0.5, 0.5)], [True, True], second.state)
     assert third.fused.tolist() == [[0.4375, 0.5625], [0.5, 0.5]]
     assert third.action.tolist() == [1, 0]
@@ -92,12 +94,13 @@ def test_an_episode_takes_its_memory_along_wherever_its_row_is():
 
 
 def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
-    """Sure of the first action, it does not ask: half of (.9, .1) and half of (.25, .75)."""
+    """Sure of the first action, it does not ask. The rule keeps half of (.9, .1) and half of (.25, .75)."""
     point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
     doubt = step(point, (0.0, 1.0), True)
     sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
     assert not sure.triggered
-    assert sure.fused == pytest.approx([0.575, 0.425])
+    assert sure.fused.tolist() == [0.9, 0.1]
+    assert sure.state == pytest.approx([0.575, 0.425])
 
 
 def test_a_rule_without_memory_leaves_no_state():
@@ -126,11 +129,11 @@ def test_a_channel_may_lose_each_link_by_itself():
 
 def test_a_points_overrides_are_fields_of_its_channel():
     point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
-    assert point.channel == Fog(latency_s=0.05)
+    assert point.channel() == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
     v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
-    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
-    assert OperatingPoint("x", None, loss=0.5).channel == OperatingPoint("y", None).channel
+    assert v2x.channel() == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel() == NO_CHANNEL
 
 
 @pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
@@ -184,7 +187,7 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         heard = rng.random((20, 3)) < 0.6
         weights = np.insert(heard, 0, True, axis=-1) * rng.uniform(0.1, 1, (20, 4))
         weights /= weights.sum(axis=-1, keepdims=True)
-        intents = rng.dirichlet(np.ones(4), (20, 4))
+        intents = np.where((weights > 0)[..., None], rng.dirichlet(np.ones(4), (20, 4)), np.nan)
         messages = Messages(
             intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3))
         )
@@ -194,6 +197,13 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         row = Messages(**{field: getattr(messages, field)[7] for field in messages.__dataclass_fields__})
         single = rule.fuse(row, alone)
         assert single.policy == pytest.approx(fused.policy[7])
+        order = [2, 0, 1]
+        with_ego = [0, 3, 1, 2]
+        shuffled = replace(
+            messages, intents=intents[:, with_ego], weights=weights[:, with_ego], heard=heard[:, order]
+        )
+        if state.shape[-1] == 0:  # a rule with memory may remember who said what
+            assert rule.fuse(shuffled, state).policy == pytest.approx(fused.policy)
         state, alone = fused.state, single.state
 
 
@@ -221,8 +231,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    assert OperatingPoint("x", "slow-radio").channel.latency_s == 0.5
-    assert OperatingPoint("x", "v2x").channel.latency_s == 0.025
+    assert OperatingPoint("x", "slow-radio").channel().latency_s == 0.5
+    assert OperatingPoint("x", "v2x").channel().latency_s == 0.025
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
         UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"
@@ -240,7 +250,7 @@ def test_a_package_adds_a_channel_and_replaces_none():
         ),
         (
             "odd",
-            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair or uninst",
+            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair",
         ),
     ],
 )

@@ -86,7 +86,8 @@ def closed_loop(
     from harness.cli.sweep import tables
     from harness.core.errors import printable
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.evaluate.live_spec import spec_of
+    from harness.evaluate.live_world import LiveSource
+    from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
     from harness.studies.closed_loop import panels, run_closed_loop
 
@@ -94,10 +95,10 @@ def closed_loop(
     in_range("--first-seed", first_seed, 0, LAST_SEED)
     in_range("--workers", workers, 1, MOST_WORKERS)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
-    spec = spec_of(
-        cards.resolve(model), prompts.load(prompt), tuple(points.values()), parse_seeds(seeds),
-        answer=cast("AnswerMode", answer), batch_size=batch_size, latency=cast("Latency | None", latency),
-        first_seed=first_seed, episodes=episodes,
+    spec = Spec(
+        cards.resolve(model), prompts.load(prompt), LiveSource(first_seed, episodes),
+        tuple(points.values()), parse_seeds(seeds), answer=cast("AnswerMode", answer),
+        batch_size=batch_size, latency=cast("Latency | None", latency),
     )  # fmt: skip
     where = out or Path("reports") / f"closed-loop-{file_name(spec.card.name)}-{prompt}"
     with bar("layouts", episodes, quiet=as_json or quiet) as progress:

@@ -152,7 +152,7 @@ def _table(done: "Evaluated") -> None:
         success = figures[name, "success_rate"]
         table.add_row(
             name,
-            interval(success.value, success.ci_low, success.ci_high, 100),
+            interval(success.value, success.low, success.high, 100),
             cell("collision_rate", 100, " %"),
             cell("late_rate", 100, " %"),
             cell("latency_proxy_ms", 1, " ms"),

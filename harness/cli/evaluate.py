@@ -143,7 +143,7 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
     return {
         "run": str(done.out),
         "manifest": msgspec.to_builtins(done.manifest),
-        "summary": [{**done.manifest.of_run, **msgspec.structs.asdict(score)} for score in done.scores],
+        "summary": [{**done.manifest.of_run, **msgspec.to_builtins(score)} for score in done.scores],
     }
 
 
@@ -166,7 +166,7 @@ def _table(done: "Evaluated") -> None:
             r = figures.get((name, metric))
             if r is None or r.value is None:
                 return "-"
-            return interval(r.value, r.ci_low, r.ci_high, scale) if ends else f"{r.value * scale:.1f}"
+            return interval(r.value, r.low, r.high, scale) if ends else f"{r.value * scale:.1f}"
 
         table.add_row(
             name,
@@ -183,7 +183,7 @@ def _table(done: "Evaluated") -> None:
     console.print(table)
     n = m.world.episodes
     console.print(
-        f"n = {n} episodes × {len(m['seeds'])} channel seeds; intervals over episodes; msgs an episode;"
+        f"n = {n} episodes × {len(m.seeds)} channel seeds; intervals over episodes; msgs an episode;"
     )
     console.print("gain is over single-local, paired by episode")
     tell_answers(console, m, figures)

@@ -29,6 +29,6 @@ def write(runs: list[Path], out: Path | None = None, quiet: bool = False) -> Pat
     from harness.report.runs import gather
 
     found = gather(runs)
-    scenes = len({row["scene"] for run in found.runs for row in run.rows})
+    scenes = len({scene for run in found.runs for scene in run.decisions.scenes})
     with bar("packing decisions", scenes, quiet) as progress:
         return write_report(found, out or runs[0] / "report.html", progress=progress)

@@ -35,7 +35,7 @@ def sweep(
     condition: list[str] = typer.Option(
         ["6g"], help="Operating point that is varied, or a change of one: 6g:on_demand=true. Repeatable."
     ),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel's luck. Default: the run's."),
+    seeds: str | None = typer.Option(None, help="Seeds of the channel's draws. Default: the run's."),
     latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
     proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
     out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
@@ -46,7 +46,6 @@ def sweep(
     from harness.cli.evaluate import parse_seeds
     from harness.cli.progress import bar
     from harness.core.errors import UserError, printable, unknown
-    from harness.evaluate.again import Asking
     from harness.studies.axes import axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
@@ -60,21 +59,18 @@ def sweep(
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*grid, *[None] * len(axes)], strict=False)]
-    runs_read = [Stored(run, latency) for run in runs]
     conditions = list(dict.fromkeys(condition))
-    panels = {
-        axis.name: settings(runs_read, axis, values, conditions)
-        for axis, values in zip(axes, grids, strict=True)
-    } or usual(runs_read, conditions)
-    luck = parse_seeds(seeds) if seeds else runs_read[0].seeds
-    where = out or runs[0] / f"sweep-{'-'.join(panels)}"
-    points = [setting for panel in panels.values() for setting in panel]
-    with bar("asking with messages", 0, quiet=as_json or quiet) as asked:
-        for run in runs_read:
-            run.prepare(points, luck, Asking(asked.more, asked))
-    sources: list[Source] = [*runs_read, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
-    with bar("grid points", len(sources) * len(points), quiet=as_json or quiet) as progress:
-        summary = run_sweep(sources, panels, luck, where, progress)
+    with bar("grid points", 0, quiet=as_json or quiet) as progress:
+        runs_read = [Stored(run, latency, progress.more, progress) for run in runs]
+        panels = {
+            axis.name: settings(runs_read, axis, values, conditions)
+            for axis, values in zip(axes, grids, strict=True)
+        } or usual(runs_read, conditions)
+        draws = parse_seeds(seeds) if seeds else runs_read[0].seeds
+        where = out or runs[0] / f"sweep-{'-'.join(panels)}"
+        sources: list[Source] = [*runs_read, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
+        progress.more(len(sources) * sum(map(len, panels.values())))
+        summary = run_sweep(sources, panels, draws, where, progress)
     if as_json:
         typer.echo(summary.to_json(orient="records"))
     if as_json or quiet:

@@ -35,15 +35,14 @@ def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:
     from harness.cli.progress import bar
     from harness.evaluate.replay import played
     from harness.report.drawing.video import formats, write_video
-    from harness.runs.driven_folder import read
+    from harness.runs.folder import read
 
     found = read(run)
-    last, seeds = found.conditions[-1], found.config["seeds"]
+    last = found.conditions[-1]
     failed: dict[int, int] = {}
-    for episode in range(found.config["episodes"]):
-        wrong = [seed for seed in seeds if found.ends[last, seed, episode]["result"] != "cleared"]
-        if wrong and len(failed) < most:
-            failed[episode] = wrong[0]
+    for one in sorted(found.episodes, key=lambda one: one.episode):
+        if one.condition == last and not one.success and len(failed) < most:
+            failed.setdefault(one.episode, one.seed)
     files = []
     with bar("drawing failed episodes", len(failed), quiet) as progress:
         for episode, seed in failed.items():

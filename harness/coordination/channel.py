@@ -110,10 +110,9 @@ class Radio:
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""
-        loss = density_coupled_loss(1 + np.sum(links.rounds, axis=-1, keepdims=True))
-        loss = np.maximum(self.loss, loss)
-        if self.density_coupled:
-            loss = density_coupled_loss(1 + np.sum(links.in_radius, axis=-1, keepdims=True))
+        active = links.in_radius if self.density_coupled else links.rounds
+        loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
+        loss = loss if self.density_coupled else np.maximum(self.loss, loss)
         slot_s = (2 if self.roadside_edge else 1) * (self.latency_s + links.payload_bits / self.bandwidth_bps)
         slot_s = np.where(links.asked, slot_s + self.jitter_s * draws.jitter, 0.0)
         ready_s = np.where(links.asked, links.ready_s, np.inf)

@@ -56,8 +56,8 @@ class Fused(NamedTuple):
 class Rule(Protocol):
     """A pure function of arrays, with a memory of its own for each episode.
 
-    Steps of an episode are fused in order, each from the state that the last one left. Steps in which the ego
-    asks or hears nobody are fused as well; the paper's fall-back is the ego's own intent.
+    Steps of an episode are fused in order, each from the state that the last one left, those in which the ego
+    hears nobody as well. In those it acts on its own intent, whatever the rule says.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
@@ -78,10 +78,8 @@ class Pool:
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """An ego that heard nobody keeps its own intent to the last bit."""
-        heard = np.any(messages.heard, axis=-1, keepdims=True)
-        policy = np.where(heard, self.pool(messages.intents, messages.weights), messages.intents[..., 0, :])
-        return Fused(policy, messages.weights, state)
+        """Whatever the state."""
+        return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:

@@ -81,14 +81,13 @@ def fuse(
     fusion = fusion or Fusion()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     weights = inverse_distance_weights(intents.distance_m, heard.on_time, point.min_distance_m)
+    anybody = np.any(heard.on_time, axis=-1)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus == EGO_PROMPT:
         if fusion.call is None:
             raise ValueError(f"consensus {point.consensus} needs a fusion call")
-        anybody = np.any(heard.on_time, axis=-1)
-        answer, seconds = fusion.call(heard.on_time)
-        failed = anybody & np.any(np.isnan(answer), axis=-1)
-        fused = np.where((anybody & ~failed)[..., None], answer, heard.own)
+        fused, seconds = fusion.call(heard.on_time)
+        failed = anybody & np.any(np.isnan(fused), axis=-1)
         weights = np.where(anybody[..., None], np.nan, weights)
         latency_s = latency_s + np.where(anybody, seconds, 0.0)
         state = np.zeros((*failed.shape, 0))
@@ -97,6 +96,7 @@ def fuse(
         messages = Messages(p, weights, heard.on_time, heard.arrival_s, intents.distance_m, intents.range_m)
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
         fused, weights, state = rule.fuse(messages, state)
+    fused = np.where((anybody & ~failed)[..., None], fused, heard.own)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,

@@ -98,11 +98,11 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
     unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
 
-    inference_s = np.nan_to_num(intents.inference_s)
+    inference_s = np.where(np.isnan(intents.inference_s), 0.0, intents.inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
     ready_s = helpers_s if point.on_demand else np.maximum(helpers_s - request_s, 0.0)
     links = Links(asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure)
-    up, delay_s, loss = point.channel.deliver(links, draws)
+    up, delay_s, loss = point.channel().deliver(links, draws)
     delivered = asked & up
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)

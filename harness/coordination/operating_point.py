@@ -77,9 +77,7 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
-        for key in self._overrides:
-            if key not in {field.name for field in fields(self._profile)}:
-                raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
+        self.channel()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
@@ -95,24 +93,23 @@ class OperatingPoint:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
-    @property
     def channel(self) -> Channel:
-        """The profile's, with the point's overrides."""
-        return replace(self._profile, **self._overrides)
-
-    @property
-    def _profile(self) -> Channel:
-        return NO_CHANNEL if self.profile is None else CHANNELS[self.profile]
-
-    @property
-    def _overrides(self) -> dict[str, Any]:
-        """Settings in place of the profile's. Without a channel there is nothing to override."""
-        values = {key: getattr(self, key) for key in OVERRIDES if self.profile is not None}
-        return {key: value for key, value in values.items() if value is not None and value is not False}
+        """The profile's, with the point's overrides. Raises UserError for one that the profile has not."""
+        if self.profile is None:
+            return NO_CHANNEL
+        profile = CHANNELS[self.profile]
+        settings = {key: getattr(self, key) for key in OVERRIDES}
+        overrides = {
+            key: value for key, value in settings.items() if value is not None and value is not False
+        }
+        for key in overrides:
+            if key not in {field.name for field in fields(profile)}:
+                raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
+        return replace(profile, **overrides)
 
     @property
     def asks_again(self) -> bool:
-        """Whether the ego's model merges the messages, and so is asked a second time."""
+        """Whether fusion asks the ego's model a second time, with the messages."""
         return self.profile is not None and self.consensus == EGO_PROMPT
 
     def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:

@@ -108,6 +108,7 @@ class Asker:
     """Asks what has no answer yet, and lays answers out as intents.
 
     Attributes:
+        spec: the evaluation.
         answers: by request id, in the order in which they were asked.
         latency: how long inference takes.
     """
@@ -133,7 +134,7 @@ class Asker:
             progress: called with the number of answers just there, those kept from before included.
             more: called with the number of fusion calls, once it is known how many there are.
         """
-        self._spec, self._backend, self._kept = spec, backend, kept
+        self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency = latency
         self.answers = {**(answers or {}), **(read_kept(kept) if kept else {})}
@@ -142,7 +143,7 @@ class Asker:
         """Ask what is still owed, and keep each answer at once."""
         # Chunks begin at the same places in a resumed run, and a torn one is asked again whole: an engine may
         # answer with an eye on a request's company.
-        size = self._spec.batch_size * math.ceil(CHUNK / self._spec.batch_size)
+        size = self.spec.batch_size * math.ceil(CHUNK / self.spec.batch_size)
         for start in range(0, len(asked), size):
             chunk = asked[start : start + size]
             if any(request.id not in self.answers for request in chunk):
@@ -155,9 +156,9 @@ class Asker:
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN where nobody was asked or the answer failed."""
-        viewers = [(scene.id, self._spec.viewers(scene)) for scene in moments]
+        viewers = [(scene.id, self.spec.viewers(scene)) for scene in moments]
         if any(f"{scene}/{viewer}" not in self.answers for scene, some in viewers for viewer in some):
-            self.ask(list(requests(self._spec, moments)))
+            self.ask(list(requests(self.spec, moments)))
         answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
         return self._laid_out(moments, answers)
 
@@ -170,13 +171,13 @@ class Asker:
             scene = moments[moment]
             of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
             senders = [scene.viewers[1 + h] for h in heard]
-            asked.append(fusion_request(self._spec, scene, of_viewers, senders))
+            asked.append(fusion_request(self.spec, scene, of_viewers, senders))
         self._more(len(asked))
         self.ask(asked)
         answers = [self.answers[request.id] for request in asked]
         if asked and self._lacks_fusion_time(answers):
             self.latency = with_fusion(self.latency, self._backend(), asked)
-        nothing = [np.nan] * len(self._spec.actions)
+        nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(asked), len(nothing))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers, self.answers)).at
 
@@ -185,7 +186,7 @@ class Asker:
         return self.latency.fusion_s is None and not own
 
     def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
-        width, actions = max(map(len, answers)), len(self._spec.actions)
+        width, actions = max(map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
         distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
         bits = np.zeros((len(moments), width - 1))

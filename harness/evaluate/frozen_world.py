@@ -9,7 +9,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Ints
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.success import judge_choices, table
+from harness.evaluate.success import Verdict, judge_choices, table
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
@@ -77,7 +77,7 @@ class FrozenWorld:
         n, helpers = len(scenes), max(len(scene.viewers) for scene in scenes) - 1
         at, seed = np.tile(np.arange(n), len(self._seeds)), np.repeat(self._seeds, n)
         draws = channel_draws(seed, self._laid.seeds[there][at], np.full(len(at), self._step), steps, helpers)
-        self._due = Due(at, seed, draws)
+        self._due = Due(at, self._laid.episodes[there][at], seed, draws)
         return scenes
 
     def due(self, point: OperatingPoint) -> Due:
@@ -102,6 +102,15 @@ class FrozenWorld:
     def columns(self) -> dict[str, Any]:
         """What came of each decision, and what each action would have led to, in the order of decisions."""
         return {name: np.concatenate([each[name] for each in self._columns]) for name in self._columns[0]}
+
+    @property
+    def numbers(self) -> Ints:
+        """Of the episodes, (E,)."""
+        return self._laid.episodes
+
+    def verdicts(self, point: OperatingPoint) -> list[Verdict]:
+        """How the episodes ended under a condition, arrays (E,) for each seed."""
+        return [judge_choices(self._laid, chosen) for chosen in self._chosen[point.name]]
 
     def episodes(self) -> list[Episode]:
         """How each episode ended under each condition and seed."""

@@ -103,15 +103,13 @@ class LiveWorld:
     def due(self, point: OperatingPoint) -> Due:
         """Each episode of the condition that has no open decision."""
         places = self._places(point)
-        at, seed = (
-            np.array([n for n, _ in places], dtype=int),
-            np.array([c.seed for _, c in places], dtype=int),
-        )
-        layouts = np.array([scene.record["episode_seed"] for scene in self._moments])
+        at = np.array([n for n, _ in places], dtype=int)
+        seed = np.array([course.seed for _, course in places], dtype=int)
+        episode = np.array([one.number for one in self._deciding])[at]
         helpers = max(len(scene.viewers) for scene in self._moments) - 1
-        return Due(
-            at, seed, channel_draws(seed, layouts[at], np.full(len(at), self._step), P.decisions, helpers)
-        )
+        step = np.full(len(at), self._step)
+        draws = channel_draws(seed, self._first_seed + episode, step, P.decisions, helpers)
+        return Due(at, episode, seed, draws)
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Open every decision, and live until the next are due."""

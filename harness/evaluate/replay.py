@@ -1,16 +1,17 @@
 """A driven episode, played again from its record: the same actions in the same frames give the same world."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Trajectory
-from harness.evaluate.live import P, look
-from harness.runs.driven_folder import read
-from harness.runs.folder import Row, Run
+from harness.evaluate.live_world import P, look
+from harness.runs.folder import Run, read
+from harness.runs.records import ClosedLoop, Decision, Manifest
 from harness.world.state import WorldState
 from harness.world.world import World
 
@@ -22,20 +23,20 @@ class Played:
     """One episode of a finished live run.
 
     Attributes:
-        config: the run's manifest.
+        manifest: the run's.
         condition: the operating point.
-        seed: seed of the channel's luck.
+        seed: seed of the channel's draws.
         episode: its number.
-        moments: rows of its decisions, by step.
-        decisions: what it made of them, in the same order.
+        layout_seed: of its layout.
+        decisions: by step.
     """
 
-    config: Mapping[str, Any]
+    manifest: Manifest
     condition: str
     seed: int
     episode: int
-    moments: list[Row]
-    decisions: list[Row]
+    layout_seed: int
+    decisions: list[Decision]
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Still:
 
     state: WorldState
     seen: WorldState
-    decision: Row
+    decision: Decision
     since_s: float
     open: bool
     outcome: str
@@ -66,60 +67,69 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
         UserError: the folder is no live run, or has no such episode, condition or seed.
     """
     run = read(path)
-    names, seeds = run.conditions, run.config["seeds"]
+    if not isinstance(run.manifest.world, ClosedLoop):
+        raise UserError(
+            f"{printable(path)} was made by `harness eval`; give a folder made by `harness drive`"
+        )
+    names, seeds, n = run.conditions, run.manifest.seeds, run.manifest.world.episodes
     condition, seed = condition or names[-1], seeds[0] if seed is None else seed
     if condition not in names:
         raise unknown("condition", condition, names)
     if seed not in seeds:
         raise unknown("seed", str(seed), list(map(str, seeds)))
-    if not 0 <= episode < run.config["episodes"]:
-        raise UserError(
-            f"episode {episode} is not in {printable(path)}; give 0 to {run.config['episodes'] - 1}"
-        )
+    if not 0 <= episode < n:
+        raise UserError(f"episode {episode} is not in {printable(path)}; give 0 to {n - 1}")
     return played(run, episode, condition, seed)
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> Played:
     """An episode that the run has."""
-    found = [
-        (row, made)
-        for row in run.rows
-        if row["episode"] == episode
-        for made in row["decisions"]
-        if (made["condition"], made["seed"]) == (condition, seed)
-    ]
-    return Played(
-        run.config, condition, seed, episode, [row for row, _ in found], [made for _, made in found]
-    )
+    world, d = run.manifest.world, run.decisions
+    assert isinstance(world, ClosedLoop)
+    here = (d.whole("episode") == episode) & (d.whole("seed") == seed)
+    here &= d.codes("condition", run.conditions) == run.conditions.index(condition)
+    mine = d.take(np.flatnonzero(here))
+    decisions = sorted(mine.records(0, len(mine)), key=lambda decision: decision.step)
+    return Played(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
-def scene_of(run: Run, row: Row) -> Scene:
-    """What there was to be seen in a moment, had by playing one of the episodes in it again.
+def scene_of(run: Run, name: str) -> Scene:
+    """What there was to be seen in a moment, by playing one of the episodes in it again.
 
-    Its id is the row's only where this simulator does what the run's did.
+    Its id is the moment's only where this simulator does what the run's did.
     """
-    mine, hz = row["decisions"][0], P.simulation_hz
-    episode = played(run, row["episode"], mine["condition"], mine["seed"])
-    begins = round(row["step"] * P.decision_period_s * hz)
-    world = World.start(run.config["first_seed"] + row["episode"])
+    rows = run.decisions.scenes[name]
+    [mine] = run.decisions.records(rows.start, rows.start + 1)
+    episode = played(run, mine.episode, mine.condition, mine.seed)
+    begins = _begins(mine)
+    world = World.start(episode.layout_seed)
     for frame, action in _acts(episode).items():
         if frame <= begins:
             world.advance(frame)
             world.take(action)
     world.advance(begins)
-    return look(run.config["model"]["engine"], Trajectory(row["episode"], world, []), row["step"])
+    alone = run.manifest.model.get("engine") == "driver"
+    return look(Trajectory(mine.episode, world, []), mine.step, alone)
+
+
+def _begins(decision: Decision) -> int:
+    return round(decision.step * P.decision_period_s * P.simulation_hz)
 
 
 def _acts(played: Played) -> dict[int, str]:
     """Actions by the frame in which they were taken."""
-    return {round(d["acts_at_s"] * P.simulation_hz): d["action"] for d in played.decisions if d["acted"]}
+    return {_acts_in(d): d.action for d in played.decisions if d.acted}
+
+
+def _acts_in(decision: Decision) -> int:
+    return round((decision.acts_at_s or 0.0) * P.simulation_hz)
 
 
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """The episode, ten stills a second, and one a frame while a decision is open."""
     hz = P.simulation_hz
-    world = World.start(played.config["first_seed"] + played.episode)
-    begins = [round(row["step"] * P.decision_period_s * hz) for row in played.moments]
+    world = World.start(played.layout_seed)
+    begins = [_begins(decision) for decision in played.decisions]
     acts = _acts(played)
     place, seen = 0, world.state()
     while True:
@@ -127,7 +137,7 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
             place += 1
             seen = world.state()
         decision = played.decisions[place]
-        thinking = world.frame < round(decision["acts_at_s"] * hz)
+        thinking = world.frame < _acts_in(decision)
         outcome = world.outcome
         told = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
         told += f" with {outcome.partner}" if outcome.partner else ""

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.coordination.channel import Draws
-from harness.coordination.coordinate import Coordination, FusionCall, coordinate
+from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
-from harness.core.arrays import Ints
+from harness.core.arrays import Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import codes_of
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
@@ -32,11 +32,13 @@ class Due:
 
     Attributes:
         at: the moment of each, a position among those the world shows, (n,).
+        episode: number of the episode of each, (n,).
         seed: seed of the channel's draws of each, (n,).
         draws: those draws, (n, ...).
     """
 
     at: Ints
+    episode: Ints
     seed: Ints
     draws: Draws
 
@@ -90,32 +92,51 @@ def walk(
     world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
 ) -> Iterator[Sequence[Decided[Moment]]]:
     """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
+    memories: dict[str, _Memory] = {point.name: _Memory() for point in points}
     while moments := world.observe():
         intents = ask(moments)
-        due = [world.due(point) for point in points]
-        calls = _fusion_calls(points, due, moments, intents, ask)
-        decided = [
-            Decided(point, moments, each, coordinate(
-                point, intents.take(each.at), each.draws, calls(each.at) if point.asks_again else None
-            ))
-            for point, each in zip(points, due, strict=True)
-            if len(each.at)
-        ]  # fmt: skip
+        due = {point: each for point in points if len((each := world.due(point)).at)}
+        calls = _fusion_calls(due, moments, intents, ask)
+        decided = []
+        for point, each in due.items():
+            call = calls(each.at) if calls and point.asks_again else None
+            fusion = Fusion(call, memories[point.name].recall(each))
+            result = coordinate(point, intents.take(each.at), each.draws, fusion)
+            decided.append(Decided(point, moments, each, result))
+        for part in decided:
+            memories[part.point.name].keep(part.due, part.result.state)
         yield decided
         world.step(decided)
 
 
+class _Memory:
+    """What a condition's consensus rule remembers of each episode and seed."""
+
+    def __init__(self) -> None:
+        self._state: dict[tuple[int, int], Floats] = {}
+
+    def recall(self, due: Due) -> Floats | None:
+        """The state of each decision's episode, (n, K); None at the first step."""
+        places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
+        return np.array([self._state[place] for place in places]) if self._state else None
+
+    def keep(self, due: Due, state: Floats) -> None:
+        """The state for the next step, (n, K), if the rule has any."""
+        if state.shape[-1]:
+            places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
+            self._state |= dict(zip(places, state, strict=True))
+
+
 def _fusion_calls(
-    points: Sequence[OperatingPoint], due: Sequence[Due], moments: Sequence[Moment], intents: Intents,
-    ask: Ask[Moment],
-) -> Callable[[Ints], FusionCall]:  # fmt: skip
+    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
+) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
     """Who is heard depends on no fusion call: each set of messages that any condition hears is asked once."""
-    codes = [np.empty(0, dtype=int)]
-    for point, each in zip(points, due, strict=True):
+    codes = []
+    for point, each in due.items():
         if point.asks_again:
             on_time = exchange(point, intents.take(each.at), each.draws).on_time
             codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
-    return ask.fusion_call(moments, np.unique(np.concatenate(codes)))
+    return ask.fusion_call(moments, np.unique(np.concatenate(codes))) if codes else None
 
 
 @lru_cache(maxsize=1 << 16)

@@ -5,19 +5,18 @@ from typing import Any
 from harness.report import words
 from harness.report.library import picture
 from harness.report.runs import Runs
-from harness.runs.driven_folder import Driven
-from harness.runs.folder import Run, answers_of
+from harness.runs import metrics
+from harness.runs.folder import Run
 
 EXAMPLES = 3  # of each status of answers
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
     """A run's summary: a metric a line, with its value in each condition."""
-    meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
     return [
         {
-            "name": words.metric_name(metric),
-            "meaning": meanings.get(metric, ""),
+            "name": metrics.label(metric),
+            "meaning": metrics.meaning(metric, run.world),
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
         for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
@@ -26,10 +25,10 @@ def summary(run: Run) -> list[dict[str, Any]]:
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
     """What does not depend on the condition: a metric a line, with its value in each run."""
-    metrics = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
+    names = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
     return [
-        (words.metric_name(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
-        for m in metrics
+        (metrics.label(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
+        for m in names
     ]
 
 
@@ -37,12 +36,11 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
     """The first answers of each status but strict, and where each stands."""
     found: dict[str, list[dict[str, Any]]] = {}
     for n, run in enumerate(runs.runs):
-        for row in run.rows:
-            for viewer, answer in answers_of(row).items():
-                if answer["status"] != "strict":
-                    of = found.setdefault(answer["status"], [])
-                    if len(of) < EXAMPLES:
-                        of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
+        for answer in run.answers:
+            if answer.status != "strict":
+                of = found.setdefault(answer.status, [])
+                if len(of) < EXAMPLES:
+                    of.append({"run": n, "answer": answer})
     return [{"status": status, "answers": of} for status, of in found.items()]
 
 

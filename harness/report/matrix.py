@@ -6,11 +6,12 @@ from statistics import median
 
 import numpy as np
 
-from harness.core.errors import UserError, printable
 from harness.core.paired import SuccessTest, success_test
 from harness.report.runs import Runs
-from harness.report.words import LATENCY, SUCCESS, success_of
-from harness.runs.folder import Run, Score, answers_of, table
+from harness.report.words import success_of
+from harness.runs.folder import Run
+from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.records import Score
 
 P_VALUE = 0.05
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
@@ -95,9 +96,18 @@ def lines(runs: Runs) -> list[Line]:
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                model, prompt = str(run.config["model"].get("name")), str(run.config["prompt"]["version"])
+                model, prompt = run.manifest.of_run["model"], run.manifest.of_run["prompt"]
                 found.append(
-                    Line(runs.names[n], model, prompt, run.answer, condition, scores, lengths[n], *marks[n])
+                    Line(
+                        runs.names[n],
+                        model,
+                        prompt,
+                        run.manifest.answer,
+                        condition,
+                        scores,
+                        lengths[n],
+                        *marks[n],
+                    )
                 )
     return found
 
@@ -125,9 +135,9 @@ def _score(run: Run, condition: str, metric: str) -> Score | None:
 
 
 def _tokens(run: Run) -> tuple[float | None, float | None]:
-    answers = [a for row in run.rows for a in answers_of(row).values()]
     counts = [
-        [a[key] for a in answers if a.get(key) is not None] for key in ("prompt_tokens", "completion_tokens")
+        [count for a in run.answers if (count := getattr(a, key)) is not None]
+        for key in ("prompt_tokens", "completion_tokens")
     ]
     sent, answered = (float(median(of)) if of else None for of in counts)
     return sent, answered
@@ -135,16 +145,9 @@ def _tokens(run: Run) -> tuple[float | None, float | None]:
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
     """Success, 0 or 1, by condition and, in each, by episode and seed."""
-
-    def one(line: Mapping[str, str]) -> tuple[str, tuple[int, int], float]:
-        return line["condition"], (int(line["episode"]), int(line["seed"])), float(line["success"] == "True")
-
-    file = run.path / "episodes.csv"
     found: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
-    for condition, key, success in table(file, one):
-        if condition not in found:
-            raise UserError(f"{printable(file)} has another condition than its run; make the run again")
-        found[condition][key] = success
+    for episode in run.episodes:
+        found[episode.condition][episode.episode, episode.seed] = float(episode.success)
     return found
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
@@ -21,6 +22,7 @@ from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, roads
 from harness.report.panels import panels
 from harness.report.runs import Runs
+from harness.runs.records import Latency
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -101,11 +103,11 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "inference_s": run.config["latency"]["inference_s"],
-                "merge_s": run.config["latency"].get("merge_s"),
+                "inference_s": inference_s(run.manifest.latency),
+                "merge_s": run.manifest.latency.fusion_s,
                 "points": {
                     c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}
-                    for c in run.config["conditions"]
+                    for c in run.manifest.conditions
                 },
             }
             for run in runs.runs
@@ -121,6 +123,11 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def inference_s(latency: Latency) -> dict[str, float | None] | None:
+    """Seconds of one inference by role; None where each answer has its own time."""
+    return None if latency.each_its_own else {"ego": latency.ego_s, "helper": latency.helper_s}
+
+
 def environment(*more: Path) -> Environment:
     """The report's templates, and those of other folders: everything is escaped and made `visible`."""
     found = Environment(
@@ -132,7 +139,7 @@ def environment(*more: Path) -> Environment:
     )
     found.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown,
-        "latency_source": words.latency_source, "columns": _table,
+        "latency_source": words.latency_source, "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
     return found
 

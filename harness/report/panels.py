@@ -42,8 +42,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             for row in of(run)
         ]
 
-    laid = {run.path: statistics.decisions(run) for run in runs.runs}
-    points = [c for run in runs.runs for c in run.config["conditions"] if c.get("profile")]
+    points = [c for run in runs.runs for c in run.manifest.conditions if c.get("profile")]
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
@@ -65,7 +64,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "the others gave no distribution.",
             charts.statuses(rows),
         )  # fmt: skip
-    if rows := joined(lambda run: statistics.reliability(run, laid[run.path])):
+    if rows := joined(statistics.reliability):
         yield Panel(
             "reliability", "answers", "Is the policy as safe as it is sure?",
             "Each point is the decisions whose fused probability of the action taken lies in one tenth: "
@@ -81,7 +80,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "One count an answer that could be read. Dashed: τ, above which the ego asks for help.",
             charts.entropies(rows, tau_nats, statistics.ENTROPY_NATS),
         )  # fmt: skip
-    if rows := joined(lambda run: statistics.errors(run, laid[run.path])):
+    if rows := joined(statistics.errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
@@ -114,13 +113,13 @@ def _references(runs: Runs) -> dict[str, float]:
     """Success of the reference drivers: on frozen scenes by the rule, live where a run was driven by one."""
     if runs.dataset is None:
         found = {
-            run.config["model"]["name"]: run
+            run.manifest.model["name"]: run
             for run in runs.runs
-            if run.config["model"].get("engine") == "driver"
+            if run.manifest.model.get("engine") == "driver"
         }
         scores = {name: run.score(run.conditions[0], "success_rate") for name, run in found.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}
-    episodes = {row["episode"] for run in runs.runs for row in run.rows}
+    episodes = {number for run in runs.runs for number in run.grid.episodes}
     driven = replace(
         runs.dataset, scenes=tuple(s for s in runs.dataset.scenes if s.record["episode"] in episodes)
     )

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,6 +14,7 @@ import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import replacing
+from harness.runs.records import Decision, Message
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,6 +28,7 @@ COLUMNS = {
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
 }  # fmt: skip
+NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and what each action would lead to.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
 # A column a message's place, from 1: who was asked, and what became of the reply.
@@ -105,10 +109,8 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Whole numbers (n,). ValueError if one is unknown."""
-        if self.table[name].null_count:
-            raise ValueError(f"{name} is unknown")
-        return cast(Ints, self.table[name].to_numpy())
+        """Whole numbers (n,)."""
+        return self[name].astype(np.int64)
 
     def flags(self, name: str) -> Bools:
         """Whether it is known to be so, (n,)."""
@@ -116,7 +118,10 @@ class Decisions:
 
     def of_actions(self, name: str) -> Floats:
         """A distribution, or what each action would lead to: (n, A)."""
-        return np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
+        key = f"{name} of actions"
+        if key not in self._arrays:
+            self._arrays[key] = np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
+        return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
         """Numbers or flags of messages, (n, H); NaN where nobody was asked."""
@@ -141,6 +146,37 @@ class Decisions:
         """Name of a column with an infinite number; None if there is none."""
         numbers = [one.name for one in self.table.schema if one.type == NUMBER]
         return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
+
+    @cached_property
+    def scenes(self) -> dict[str, range]:
+        """The rows of each decision point, in order. Raises ValueError unless they stand together."""
+        codes = self.table["scene"].combine_chunks()
+        changes = np.flatnonzero(np.diff(codes.indices.to_numpy(zero_copy_only=False))) + 1
+        starts = [0, *changes.tolist(), len(self)]
+        names = codes.dictionary.to_pylist()
+        found = {
+            names[codes.indices[start].as_py()]: range(start, stop)
+            for start, stop in pairwise(starts)
+            if stop > start
+        }
+        if len(found) < len(starts) - 1:
+            raise ValueError("the decisions of one decision point do not stand together")
+        return found
+
+    def records(self, start: int, stop: int) -> list[Decision]:
+        """Some rows, one by one."""
+        rows = self.table.slice(start, stop - start).to_pylist()
+        return [self._record(row) for row in rows]
+
+    def _record(self, row: Mapping[str, Any]) -> Decision:
+        messages = tuple(
+            Message(sender, *(row[f"{name}_{place}"] for name in OF_MESSAGES if name != "helper"))
+            for place in range(1, self.helpers + 1)
+            if (sender := row[f"helper_{place}"]) is not None
+        )
+        plain = {name: row[name] for name in Decision.__struct_fields__ if name in COLUMNS}
+        fused = tuple(row[f"fused_{action}"] for action in self.actions)
+        return Decision(**{**plain, "fused": fused, "messages": messages})
 
     def take(self, which: Any) -> "Decisions":
         """Some of the decisions, by their positions."""
@@ -178,6 +214,9 @@ class Decisions:
         wanted = schema(actions, helpers)
         if missing := [name for name in wanted.names if name not in table.column_names]:
             raise ValueError(f"it lacks {', '.join(missing)}")
+        for name in NEVER_UNKNOWN:
+            if table[name].null_count:
+                raise ValueError(f"{name} is unknown in some rows")
         return cls(table.select(wanted.names).cast(wanted).unify_dictionaries(), tuple(actions), helpers)
 
     def frame(self) -> "pd.DataFrame":

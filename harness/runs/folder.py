@@ -122,12 +122,12 @@ class Run:
 
     def _decisions(self, file: Path) -> Decisions:
         decisions = Decisions.read(file, self.actions)
-        if (decisions.codes("action", self.actions) < 0).any():
-            raise ValueError("a decision has no action")
+        decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
-        places, step = self.grid.places(decisions), decisions.whole("step")
-        if len(np.unique(np.stack([places, step]), axis=1).T) != len(decisions):
+        places = self.grid.places(decisions)
+        steps, step = np.unique(decisions.whole("step"), return_inverse=True)
+        if len(np.unique(places * len(steps) + step)) != len(decisions):
             raise ValueError("a decision is there twice")
         begun = np.bincount(places, minlength=len(self.episodes))
         if (begun != [episode.decisions for episode in self.episodes]).any():
@@ -223,7 +223,7 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*of_run, *kind.__struct_fields__])
+    writer.writerow([*of_run, *kind.__struct_encode_fields__])
     for record in records:
         values = (getattr(record, name) for name in kind.__struct_fields__)
         writer.writerow([*of_run.values(), *("" if value is None else value for value in values)])
@@ -233,10 +233,11 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     with file.open(encoding="utf-8", newline="") as lines:
         reader = csv.DictReader(lines, strict=True)
-        if missing := [name for name in kind.__struct_fields__ if name not in (reader.fieldnames or ())]:
+        if missing := [n for n in kind.__struct_encode_fields__ if n not in (reader.fieldnames or ())]:
             raise ValueError(f"it lacks {', '.join(missing)}")
         rows = list(reader)
-    optional = {name for name, hint in get_type_hints(kind).items() if type(None) in get_args(hint)}
+    hints = zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True)
+    optional = {name for name, hint in hints if type(None) in get_args(hint)}
     return tuple(
         msgspec.convert(
             {k: None if v == "" and k in optional else v for k, v in row.items()}, kind, strict=False

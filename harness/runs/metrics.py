@@ -42,6 +42,7 @@ class Metric:
         meaning: for people.
         decisions: its values (n,), of which an episode has the mean; None for a metric of episodes.
         episodes: an episode's value; None for a metric of decisions.
+        total: an episode has the sum over its decisions, not the mean.
         world: where it is known; None for everywhere.
         yes_or_no: an episode has it or has not.
         closed_loop: what it means in the closed loop, where that differs.
@@ -51,6 +52,7 @@ class Metric:
     meaning: str
     decisions: Callable[[Any], Floats] | None = None
     episodes: Callable[[Episode], Any] | None = None
+    total: bool = False
     world: World | None = None
     yes_or_no: bool = False
     closed_loop: str | None = None
@@ -82,13 +84,13 @@ METRICS = {
         _ends("unsafe_rate", "episodes with a decision that leads to a collision or a forced failure",
               lambda e: not e.success and e.failure != "late",
               closed_loop="episodes that end in a collision, by time-out or off the road"),
+        _ends("collision_rate", "episodes that end in a collision", _fails("collision"), "closed-loop"),
+        _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
+              lambda e: e.fault == "ego", "closed-loop"),
         _ends("late_rate", "episodes with all decisions safe, but delays beyond the allowance",
               _fails("late"),
               closed_loop="episodes cleared, but too long after the full-view driver, whose decisions act at "
               "once"),
-        _ends("collision_rate", "episodes that end in a collision", _fails("collision"), "closed-loop"),
-        _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
-              lambda e: e.fault == "ego", "closed-loop"),
         _ends("time_out_rate", "episodes in which the ego does not clear the intersection in time",
               _fails("time_out"), "closed-loop"),
         _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road"),
@@ -107,7 +109,8 @@ METRICS = {
                episodes=_field("skipped"), world="closed-loop"),
         Metric("never_acted_per_episode", "decisions that were not ready before the episode ended",
                episodes=_field("never_acted"), world="closed-loop"),
-        Metric("messages_per_episode", "replies scheduled; the request is none", episodes=_field("messages")),
+        Metric("messages_per_episode", "replies scheduled; the request is none", _column("messages"),
+               total=True),
         Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
                "included", _column("latency_ms")),
         Metric("deadline_miss_rate", "decisions that took longer than the decision window",
@@ -195,7 +198,7 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Each metric's values, (C, S, E): a mean over an episode's decisions, or what the episode's record says.
+    """Each metric's values, (C, S, E): of an episode's decisions, or what the episode's record says.
 
     Args:
         metrics: which.
@@ -206,20 +209,31 @@ def by_episode(
     places = grid.places(decisions)
 
     def values(metric: Metric) -> Floats:
-        if metric.episodes:
-            found = [metric.episodes(episode) for episode in episodes]
-            return np.array([np.nan if v is None else float(v) for v in found])
-        assert metric.decisions
-        return mean_by_place(metric.decisions(decisions), places, len(episodes))
+        if not metric.episodes:
+            return of_decisions(metric, decisions, places, len(episodes))
+        found = [metric.episodes(episode) for episode in episodes]
+        return np.array([np.nan if v is None else float(v) for v in found])
 
     return {metric.name: values(metric).reshape(grid.shape) for metric in metrics}
+
+
+def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
+    """A metric of n episodes, (n,), from their decisions, each at its episode's place."""
+    assert metric.decisions
+    values = np.asarray(metric.decisions(decisions), dtype=float)
+    return sum_by_place(values, places, n) if metric.total else mean_by_place(values, places, n)
+
+
+def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
+    """Sum of what is known at each of n places, (n,)."""
+    return np.bincount(places, weights=np.nan_to_num(values), minlength=n)
 
 
 def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
     """Mean of what is known at each of n places, (n,); NaN where nothing is."""
     known = ~np.isnan(values)
     count = np.bincount(places[known], minlength=n)
-    total = np.bincount(places[known], weights=values[known], minlength=n)
+    total = sum_by_place(values[known], places[known], n)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

@@ -98,6 +98,62 @@ class Latency(Struct, frozen=True, omit_defaults=True):
         return self.ego_s is None and self.helper_s is None
 
 
+class Message(Struct, frozen=True, rename={"sender": "from"}):
+    """A helper's reply: whether it arrived, when (None if lost), and its weight in the policy."""
+
+    sender: str
+    delivered: bool
+    on_time: bool
+    arrival_ms: float | None
+    weight: float | None
+
+
+class Decision(Struct, frozen=True, kw_only=True):
+    """One decision: a row of `decisions.parquet`, for people and pages; None where unknown.
+
+    Attributes:
+        scene: id of the decision point.
+        episode: its number.
+        step: its number in the episode.
+        danger: where the hidden danger comes from; None without one.
+        condition: name of the operating point.
+        seed: of the channel's draws.
+        action: what was decided.
+        fused: the policy, in the order of the actions.
+        entropy_nats: of the ego's own intent.
+        triggered: whether the ego asked.
+        own_failed: the ego's own answer could not be read.
+        own_weight: weight of its intent in the policy; None where a fusion call answered.
+        latency_ms: from seeing to acting.
+        deadline_missed: it took longer than the window.
+        messages: replies scheduled.
+        safe: whether the action is safe; known of frozen scenes.
+        delay_s: its needless delay; known of frozen scenes.
+        acts_at_s: when it acts; in the closed loop.
+        acted: whether the episode lasted until then; in the closed loop.
+    """
+
+    scene: str
+    episode: int
+    step: int
+    danger: str | None
+    condition: str
+    seed: int
+    action: str
+    fused: tuple[float, ...]
+    entropy_nats: float | None
+    triggered: bool
+    own_failed: bool
+    own_weight: float | None
+    latency_ms: float | None
+    deadline_missed: bool | None
+    messages: tuple[Message, ...]
+    safe: bool | None
+    delay_s: float | None
+    acts_at_s: float | None
+    acted: bool | None
+
+
 class Episode(Struct, frozen=True, kw_only=True):
     """How one layout ended under one condition and seed: a line of `episodes.csv`.
 
@@ -152,15 +208,15 @@ class Episode(Struct, frozen=True, kw_only=True):
     never_acted: int | None = None
 
 
-class Score(Struct, frozen=True):
+class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     """An estimate of a metric: a line of `summary.csv`.
 
     Attributes:
         condition: name of the operating point, or `all` for what does not depend on it.
         metric: name of the metric, its unit at the end.
         value: the mean; None if there was nothing to average.
-        ci_low: lower end of the 95 % interval; None where the data cannot bound it.
-        ci_high: upper end.
+        low: lower end of the 95 % interval; None where the data cannot bound it.
+        high: upper end.
         n: units behind it.
         n_excluded: units without a value.
         interval: what the units are: `episodes`, `seed means` or `answers`.
@@ -169,8 +225,8 @@ class Score(Struct, frozen=True):
     condition: str
     metric: str
     value: float | None
-    ci_low: float | None
-    ci_high: float | None
+    low: float | None
+    high: float | None
     n: int
     n_excluded: int
     interval: str

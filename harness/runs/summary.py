@@ -24,6 +24,7 @@ from harness.runs.metrics import (
     over_episodes,
     over_seeds,
     percentiles,
+    sum_by_place,
 )
 from harness.runs.records import Answer, Episode, Role, Score
 
@@ -102,7 +103,7 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     n = len(ordered)
 
     def total(values: Floats) -> list[int]:
-        return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(int).tolist()
+        return sum_by_place(values, places, n).astype(int).tolist()
 
     def mean(name: str) -> list[Any]:
         return [None if v != v else v for v in mean_by_place(decisions[name], places, n).tolist()]

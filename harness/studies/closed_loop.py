@@ -14,20 +14,20 @@ import numpy as np
 from harness.coordination.channel import density_coupled_loss
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.files import write_whole
-from harness.evaluate.drive import run
-from harness.evaluate.live_spec import Drive
+from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.spec import Spec
+from harness.runs.records import Score
 from harness.studies import figures
 from harness.studies.axes import AXES, grid
 from harness.studies.episode_tables import write_table
-from harness.studies.play import METRICS
+from harness.studies.play import ENDS, PER_DECISION
 from harness.studies.setting import CORE, Setting, described
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from harness.evaluate.evaluate import Evaluated
-
 FORMAT = "swarmdrive-closed-loop/1"
+SHOWN = (*ENDS, *PER_DECISION)
 VEHICLES = 4  # the ego and the scenario's three helpers
 RUN = "run"  # the live run's folder
 
@@ -56,7 +56,7 @@ def _coupled(vehicles: int) -> float:
 
 
 def run_closed_loop(
-    spec: Drive, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
+    spec: Spec, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
 ) -> "pd.DataFrame":
     """Drive all grid points, and draw Figures A and B. What a kill left in `out` is gone on with.
 
@@ -73,7 +73,7 @@ def run_closed_loop(
     Returns:
         The summary: a row a grid point and metric.
     """
-    done = run(spec, out / RUN, (out / RUN).exists(), workers, progress, cache)
+    done = evaluate(spec, out / RUN, (out / RUN).exists(), progress, cache, workers=workers)
     grids = panels()
     summary = _summary(done, grids)
     by_panel = {name: summary[summary.panel == name] for name in grids}
@@ -84,25 +84,26 @@ def run_closed_loop(
         "format": FORMAT,
         "run": RUN,
         "panels": described(grids),
-        "versions": done.manifest["versions"],
+        "versions": done.manifest.versions,
     }
     write_whole(out / "closed-loop.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     return summary
 
 
-def _summary(done: "Evaluated", grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":
+def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":
     """The live run's figures as a study has them."""
     import pandas as pd
 
-    m, told = done.manifest, done.summary
-    source = f"{m['model']['name']} · {m['prompt']['version']} · {m['answer']}, driven"
-    told = told[told.metric.isin(METRICS) | told.metric.str.startswith(("latency_p", "collision"))]
-    by_point = dict(iter(told.groupby("condition")))
+    source = f"{' · '.join(done.manifest.of_run.values())}, driven"
+    by_point: dict[str, list[Score]] = {}
+    for score in done.scores:
+        if score.metric in SHOWN or score.metric.startswith(("latency_p", "collision")):
+            by_point.setdefault(score.condition, []).append(score)
     return pd.DataFrame([
         {
             "source": source, "panel": panel, "condition": s.condition, "variable": s.variable,
-            "value": s.value, "metric": r.metric, "mean": r.value, "ci_low": r.ci_low, "ci_high": r.ci_high,
+            "value": s.value, "metric": r.metric, "mean": r.value, "ci_low": r.low, "ci_high": r.high,
             "n": r.n, "interval": r.interval,
         }
-        for panel, settings in grids.items() for s in settings for r in by_point[s.point.name].itertuples()
+        for panel, settings in grids.items() for s in settings for r in by_point[s.point.name]
     ])  # fmt: skip

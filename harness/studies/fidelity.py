@@ -4,7 +4,6 @@ Runs on frozen scenes and live runs of the same model, prompt and answer mode ar
 episode by episode: the same layout, condition and seed of the channel's luck.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.statistics import episode_interval
-from harness.evaluate.live_spec import FORMAT as DRIVEN
-from harness.evaluate.spec import FORMAT as FROZEN
-from harness.evaluate.success import table
-from harness.runs.folder import dataset_of, read
-from harness.runs.summary import over_episodes
+from harness.runs.folder import read
+from harness.runs.metrics import World, over_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,14 +51,17 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
     """
     import pandas as pd
 
-    told: dict[str, list[pd.DataFrame]] = {FROZEN: [], DRIVEN: []}
+    by_world: dict[World, list[pd.DataFrame]] = {"frozen": [], "closed-loop": []}
     for run in runs:
-        kind, episodes = _episodes(run)
-        told[kind].append(episodes)
-    for kind, name in ((FROZEN, "frozen scenes (harness eval)"), (DRIVEN, "live episodes (harness drive)")):
-        if not told[kind]:
-            raise UserError(f"no run on {name} among {len(runs)} folders; give at least one of each kind")
-    frozen, closed = (pd.concat(told[kind], ignore_index=True) for kind in (FROZEN, DRIVEN))
+        world, episodes = _episodes(run)
+        by_world[world].append(episodes)
+    made_by = {"frozen": "frozen scenes (harness eval)", "closed-loop": "live episodes (harness drive)"}
+    for world, tables in by_world.items():
+        if not tables:
+            raise UserError(
+                f"no run on {made_by[world]} among {len(runs)} folders; give at least one of each kind"
+            )
+    frozen, closed = (pd.concat(tables, ignore_index=True) for tables in by_world.values())
     for each in (frozen, closed):
         if each.duplicated(list(KEY)).any():
             raise UserError("two of the runs have the same episodes; give one run of each model and prompt")
@@ -85,27 +84,14 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
     return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
 
 
-def _episodes(run: Path) -> "tuple[str, pd.DataFrame]":
-    """The kind of a run, and the result of each of its episodes."""
+def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
+    """The world of a run, and the result of each of its episodes."""
     import pandas as pd
 
-    try:
-        config: dict[str, Any] = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        kind = config["format"]
-        text = dict.fromkeys((*WHO, "condition", "failure"), str)
-        episodes = pd.read_csv(run / "episodes.csv", dtype=text, keep_default_na=False)
-        if kind == FROZEN:
-            laid = table(dataset_of(read(run)))
-            seeds = dict(zip(laid.episodes.tolist(), laid.seeds.tolist(), strict=True))
-            episodes["layout_seed"] = episodes["episode"].map(seeds)
-        elif kind != DRIVEN:
-            raise ValueError(f"format {kind}")
-        return kind, episodes[[*KEY, "success", "failure"]].astype({"success": bool})
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{printable(run)} is no finished run ({printable(error)}); give folders made by harness eval "
-            "and harness drive"
-        ) from None
+    run = read(path)
+    columns = ("condition", "seed", "layout_seed", "success", "failure")
+    rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
+    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(**run.manifest.of_run)
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:

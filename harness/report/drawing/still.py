@@ -64,7 +64,7 @@ class Canvas:
             bar.remove()
         slow = ", thinking (slowed)" if still.open else ""
         self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
-        decision = f"decision {still.decision['action']} at {still.decision['acts_at_s']:.2f} s"
+        decision = f"decision {still.decision.action} at {still.decision.acts_at_s:.2f} s"
         self.lines[3].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
         for line in self.lines[2:]:
             self.figure.draw_artist(line)
@@ -108,26 +108,26 @@ def _outline(name: str) -> Outline:
 
 def _messages(played: Played, still: Still) -> Iterator[Artist]:
     """Each reply on its way from its helper to the ego; one that was lost goes half of it."""
-    latency = played.config["latency"]["inference_s"]
-    sent_s = max(latency.values())
+    latency = played.manifest.latency
+    sent_s = max(latency.ego_s or 0.0, latency.helper_s or 0.0)
     ego = still.state.ego
-    for message in still.decision["messages"] if still.open else ():
-        end_s = (message["arrival_ms"] or still.decision["latency_ms"]) / 1000
+    for message in still.decision.messages if still.open else ():
+        end_s = (message.arrival_ms or still.decision.latency_ms or 0.0) / 1000
         share = np.clip((still.since_s - sent_s) / max(end_s - sent_s, 1e-9), 0.0, 1.0)
-        lost = not message["delivered"]
+        lost = not message.delivered
         share = min(share, 0.5) if lost else share
-        helper = still.state.vehicle(message["from"])
+        helper = still.state.vehicle(message.sender)
         path = north_up(np.array([[helper.x_m, helper.y_m], [ego.x_m, ego.y_m]]))
         place = path[0] + share * (path[1] - path[0])
         yield Line2D(*path.T, color=GREY, linewidth=0.8, linestyle=":")
         if still.since_s >= sent_s:
-            colour = VERMILLION if lost or not message["on_time"] else INK
+            colour = VERMILLION if lost or not message.on_time else INK
             yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
 
 
 def _bars(still: Still) -> Iterator[Artist]:
     """The policy of the last decision, pale until it is ready."""
     decision = still.decision
-    for n, (action, p) in enumerate(zip(ACTIONS, decision["fused"], strict=True)):
-        colour = VERMILLION if action == decision["action"] else "#BBBBBB"
+    for n, (action, p) in enumerate(zip(ACTIONS, decision.fused, strict=True)):
+        colour = VERMILLION if action == decision.action else "#BBBBBB"
         yield Rectangle((0.0, n - 0.4), p, 0.8, color=colour, alpha=0.35 if still.open else 1.0)
