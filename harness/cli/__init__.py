@@ -16,6 +16,7 @@ from harness.cli import (
     doctor,
     drive,
     evaluate,
+    export,
     fidelity,
     init,
     ls,
@@ -54,6 +55,7 @@ app.command("distill")(distill.distill)
 app.command("sweep")(sweep.sweep)
 app.command("fidelity")(fidelity.fidelity)
 app.command("compare")(compare.compare)
+app.command("export")(export.export)
 app.command("doctor")(doctor.doctor)
 app.add_typer(campaign.app, name="campaign")
 app.command("parity")(parity.parity)
