@@ -20,6 +20,7 @@ from msgspec import Struct
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
 from harness.runs.formats import FORMAT, READ_BY
@@ -132,7 +133,7 @@ class Run:
             raise ValueError(f"{infinite} is infinite")
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
-        decided = np.sort(places * len(steps) + step)
+        decided = np.sort(places * len(steps) + step, kind="stable")
         if (decided[1:] == decided[:-1]).any():
             raise ValueError("a decision is there twice")
         begun = np.bincount(places, minlength=len(self.episodes))
@@ -236,6 +237,7 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     return text.getvalue()
 
 
+@uncollected()
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     with file.open(encoding="utf-8", newline="") as lines:
         names, *rows = csv.reader(lines, strict=True)
@@ -251,6 +253,7 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     return tuple(msgspec.convert(lines_by_name, list[kind], strict=False))  # type: ignore[valid-type]
 
 
+@uncollected()
 def _answers(file: Path, actions: int) -> list[Answer]:
     answers = _ANSWER.decode_lines(file.read_bytes())
     for answer in answers:
