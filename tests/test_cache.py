@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from misbehaving import completion, serving
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Rendering, Request
-from harness.backends.cache import NOT_IN_KEY, Cached, default_file, key
+from harness.backends.base import Completion, Request
+from harness.backends.cache import NOT_IN_KEY, Cached, CompletionFile, cached, default_file, key
 from harness.backends.cards import Latency
-from harness.backends.completion_file import CompletionFile
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
@@ -364,8 +363,9 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
 
 def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:
     for model in ("proxy", "local-view"):
-        backend: Backend = open_backend(cards.load(model))
-        assert not isinstance(backend, Rendering)
+        card = cards.load(model)
+        backend = open_backend(card)
+        assert cached(backend, card, file) is backend
         evaluate(spec_of(small, model), tmp_path / model, False, lambda done: None, file)
     assert not file.exists()
-    assert isinstance(Talker(), Rendering)
+    assert isinstance(cached(Talker(), cards.load("openai-example"), file), Cached)

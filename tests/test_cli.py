@@ -14,7 +14,8 @@ from evaluating import spec_of
 from tokenizers import Tokenizer, models
 
 from harness import cli
-from harness.cli.evaluate import default_out, parse_seeds
+from harness.cli.options import parse_seeds
+from harness.cli.run import default_out
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 

@@ -11,10 +11,9 @@ from scipy.stats import binom
 
 from harness.backends import cards
 from harness.backends.base import Request
-from harness.backends.failures import Failures
+from harness.backends.failures import Failures, drawn, spoilt
 from harness.backends.proxy import answer
 from harness.backends.registry import open_backend
-from harness.backends.spoiling import drawn, spoilt
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
@@ -82,7 +81,7 @@ def test_failures_come_as_often_as_declared() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_never_is_never_and_always_is_always(share: float) -> None:
-    failures = Failures(nan=share, slow_tail=share, slow_s=0.4)
+    failures = Failures(nan=share, slow_tail=share, slow_s=0.4 * share)
     expected = ("nan", 0.4) if share else (None, 0.0)
     assert {drawn(failures, name) for name in made_up(2000)} == {expected}
 

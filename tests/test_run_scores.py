@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from evaluating import Scripted, ask, failed, says, scored, spec_of, sure, with_outcomes
 from hypothesis import HealthCheck, given, settings
@@ -58,7 +57,7 @@ def played(small: Dataset) -> Dataset:
 
 
 @pytest.fixture
-def told(played: Dataset, tmp_path: Path) -> pd.DataFrame:
+def told(played: Dataset, tmp_path: Path) -> Any:
     """The summary of three conditions, one seed, 0.1 s an answer."""
     spec = spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,))
     known = ask(spec, Scripted(SAID), tmp_path)
@@ -68,14 +67,12 @@ def told(played: Dataset, tmp_path: Path) -> pd.DataFrame:
     return table.set_index(["condition", "metric", "interval"])
 
 
-def value(
-    told: pd.DataFrame, condition: str, metric: str, interval: str = "episodes"
-) -> tuple[float, int, int]:
+def value(told: Any, condition: str, metric: str, interval: str = "episodes") -> tuple[float, int, int]:
     row = told.loc[(condition, metric, interval)]
     return float(row.value), int(row.n), int(row.n_excluded)
 
 
-def test_success_unsafe_and_late_by_hand(told: pd.DataFrame) -> None:
+def test_success_unsafe_and_late_by_hand(told: Any) -> None:
     """Episode 0 is just in time, 1 hangs on its helpers, 2 is late, 3 could not be helped."""
     assert value(told, "single-local", "success_rate") == (2 / 4, 4, 0)
     assert value(told, "single-local", "unsafe_rate") == (1 / 4, 4, 0)
@@ -85,7 +82,7 @@ def test_success_unsafe_and_late_by_hand(told: pd.DataFrame) -> None:
     assert value(told, "deaf", "success_rate") == (2 / 4, 4, 0)
 
 
-def test_the_gain_over_single_local_is_paired_by_episode(told: pd.DataFrame) -> None:
+def test_the_gain_over_single_local_is_paired_by_episode(told: Any) -> None:
     """Differences 0, 1, 0, 0: mean 0.25, standard error 0.25, times t(3) = 3.182."""
     row = told.loc[("clear", "success_gain_over_single-local", "episodes")]
     assert (row.value, row.n) == (0.25, 4)
@@ -94,7 +91,7 @@ def test_the_gain_over_single_local_is_paired_by_episode(told: pd.DataFrame) -> 
     assert ("single-local", "success_gain_over_single-local", "episodes") not in told.index
 
 
-def test_messages_triggers_and_loss_by_hand(told: pd.DataFrame) -> None:
+def test_messages_triggers_and_loss_by_hand(told: Any) -> None:
     """One decision of seven is unsure; it schedules three replies whether or not they come through."""
     for condition in ("clear", "deaf"):
         assert value(told, condition, "message_count", "seed means")[0] == 3
@@ -110,7 +107,7 @@ def test_messages_triggers_and_loss_by_hand(told: pd.DataFrame) -> None:
     assert (unknown.n, unknown.n_excluded) == (0, 4)
 
 
-def test_latency_by_hand(told: pd.DataFrame, played: Dataset, tmp_path: Path) -> None:
+def test_latency_by_hand(told: Any, played: Dataset, tmp_path: Path) -> None:
     """100 ms everywhere; three V2X replies add 25 ms each, and their bits at 10 Mbit/s."""
     spec = spec_of(played)
     known = ask(spec, Scripted(SAID), tmp_path)
@@ -123,7 +120,7 @@ def test_latency_by_hand(told: pd.DataFrame, played: Dataset, tmp_path: Path) ->
     assert value(told, "clear", "deadline_miss_rate")[0] == 0
 
 
-def test_percentiles_are_over_all_decisions(told: pd.DataFrame) -> None:
+def test_percentiles_are_over_all_decisions(told: Any) -> None:
     """Seven decisions of 100 ms, one of which consults: the median is 100 ms, the 99th almost the longest."""
     longest = 4 * 2 * value(told, "clear", "latency_proxy_ms")[0] - 700
     assert value(told, "clear", "latency_p50_ms", "seed means") == (pytest.approx(100), 1, 0)
@@ -132,7 +129,7 @@ def test_percentiles_are_over_all_decisions(told: pd.DataFrame) -> None:
     assert value(told, "clear", "fusion_ms")[0] == 0
 
 
-def test_brier_and_likelihood_by_hand(told: pd.DataFrame) -> None:
+def test_brier_and_likelihood_by_hand(told: Any) -> None:
     """Decisions in which no action is safe have no score, and an episode of such is excluded."""
     # Two safe actions, sure of one: 1/4 + 1/4. Three safe, sure of one: 4/9 + 1/9 + 1/9.
     sure_of_one_of_two, sure_of_one_of_three = 1 / 2, 2 / 3
@@ -147,13 +144,13 @@ def test_brier_and_likelihood_by_hand(told: pd.DataFrame) -> None:
     assert value(told, "clear", "brier")[0] < value(told, "single-local", "brier")[0]
 
 
-def test_entropy_by_hand(told: pd.DataFrame) -> None:
+def test_entropy_by_hand(told: Any) -> None:
     unsure = -(0.4 * math.log(0.4) + 0.6 * math.log(0.3))
     assert value(told, "deaf", "entropy_nats")[0] == pytest.approx(unsure / 2 / 4)
     assert value(told, "deaf", "normalised_entropy")[0] == pytest.approx(unsure / math.log(3) / 2 / 4)
 
 
-def test_answers_are_counted_by_role_whatever_the_condition(told: pd.DataFrame) -> None:
+def test_answers_are_counted_by_role_whatever_the_condition(told: Any) -> None:
     assert value(told, "all", "strict_rate_ego", "answers") == (1.0, 7, 0)
     assert value(told, "all", "strict_rate_helper", "answers") == (1.0, 21, 0)
     assert value(told, "all", "failed_rate_helper", "answers") == (0.0, 21, 0)
@@ -195,7 +192,7 @@ def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset, tm
     known = ask(spec, Scripted(lines), tmp_path)
     runs = [scored(spec, known, lossy, seed)[1] for seed in seeds]
     laid = scored(spec, known, lossy)[0]
-    told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
+    told: Any = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
     table = record.episodes(spec, laid, runs)
     by_seed = table.groupby("seed").success.mean().to_numpy()
     assert len(set(by_seed)) > 1, "seeds that all agree would not show the interval"
@@ -212,7 +209,7 @@ def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset, tm
     assert (row.ci_low, row.ci_high, row.n) == (0.0, pytest.approx(high), 4)
 
 
-def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: pd.DataFrame) -> None:
+def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: Any) -> None:
     """2 of 4: centre 1/2, half-width z sqrt(1/16 + z^2/64) / (1 + z^2/4)."""
     row = told.loc[("single-local", "success_rate", "episodes")]
     z = stats.norm.ppf(0.975)
@@ -235,7 +232,7 @@ def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset, tmp_path: 
     assert c.own[failing] == pytest.approx(1 / 3)
     assert c.entropy_nats[failing] == pytest.approx(math.log(3))
     assert c.triggered.tolist() == [i in failing for i in range(7)]
-    told = summary(spec, laid, known, [result]).set_index(["condition", "metric", "interval"])
+    told: Any = summary(spec, laid, known, [result]).set_index(["condition", "metric", "interval"])
     assert value(told, "clear", "fallback_rate")[0] == (1 / 2 + 1 / 2) / 4
     assert value(told, "all", "failed_rate_ego", "answers") == (2 / 7, 7, 0)
     assert value(told, "all", "strict_rate_ego", "answers") == (5 / 7, 7, 0)
@@ -290,13 +287,13 @@ def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path)
     laid = table(spec.dataset)
     drawn = draw(laid, 0, known.valid.shape)
     runs = [score(laid, known, point, 0, drawn) for point in spec.points]
-    told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
+    told: Any = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
     for metric in ("latency_proxy_ms", "deadline_miss_rate"):
         row = told.loc[("single-local", metric, "episodes")]
         assert math.isnan(row.value)
         assert (row.n, row.n_excluded) == (0, 4)
-    for row in map(row_of, record.rows(spec, laid, known, runs)):
-        assert all(d["latency_ms"] is None and d["deadline_missed"] is None for d in row["decisions"])
+    for scene in map(row_of, record.rows(spec, laid, known, runs)):
+        assert all(d["latency_ms"] is None and d["deadline_missed"] is None for d in scene["decisions"])
     assert record.episodes(spec, laid, runs).latency_ms.isna().all()
 
 

@@ -5,7 +5,10 @@ A backend batches, threads or loops inside as suits its engine; nothing else in 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+if TYPE_CHECKING:
+    from harness.runs.records import Latency
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -92,7 +95,6 @@ class Backend(Protocol):
         ...
 
 
-@runtime_checkable
 class Rendering(Backend, Protocol):
     """A backend of a language model, which can say what its model is sent."""
 
@@ -102,4 +104,12 @@ class Rendering(Backend, Protocol):
         Raises:
             UserError: the chat template refuses the messages.
         """
+        ...
+
+
+class Timed(Backend, Protocol):
+    """A backend whose answers were timed before, so that they are not timed again."""
+
+    def latency(self) -> "Latency":
+        """What the decisions of the replayed run were made with."""
         ...

@@ -4,15 +4,18 @@ The cache is a help and nothing else. A run's rows hold its answers, and where t
 goes on without it.
 """
 
+import json
 import sqlite3
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from harness.backends.base import Completion, Rendering, Request
-from harness.backends.completion_file import CompletionFile
+from harness.backends.base import Backend, Completion, Rendering, Request
+from harness.backends.cards import Card
+from harness.backends.registry import capabilities
 from harness.core import kept
 from harness.core.errors import printable
 from harness.core.files import digest
@@ -26,6 +29,12 @@ NOT_IN_KEY = {
     "view": "no language model reads it",
     "truth": "no language model reads it",
 }
+# What a completion has of its own asking, and not of its answer.
+_NOT_KEPT = ("request_id", "seconds", "error", "retries", "cached")
+_KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
+_WAIT_S = 30.0  # for another process that is writing
+_AT_ONCE = 500  # keys of one look-up; SQLite has a limit
+_TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
 # The program's own part in an answer, how it is asked for and put into text: other code finds no old answers.
 _CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
@@ -43,6 +52,58 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)})
+
+
+class CompletionFile:
+    """The file. It is opened anew for every call, so that one that was deleted is simply empty again.
+
+    Both methods raise sqlite3.Error or OSError where it cannot be read or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def find(self, keys: Sequence[str]) -> dict[str, Completion]:
+        """The completions that are there, by key. They have no seconds, and their request's id is empty."""
+        rows: list[tuple[str, str]] = []
+        with self._open() as file:
+            for start in range(0, len(keys), _AT_ONCE):
+                some = keys[start : start + _AT_ONCE]
+                marks = ",".join("?" * len(some))
+                rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", some)
+        try:
+            return {key: _completion(json.loads(answer)) for key, answer in rows}
+        except (ValueError, TypeError) as error:
+            raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
+
+    def add(self, completions: Mapping[str, Completion]) -> None:
+        """Keep completions by key; one that is there already stays."""
+        # ASCII, since a completion may hold a lone surrogate, which no file takes.
+        rows = [(key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()]
+        with self._open() as file:
+            file.execute("BEGIN IMMEDIATE")
+            file.executemany("INSERT OR IGNORE INTO completions VALUES (?, ?)", rows)
+            file.execute("COMMIT")
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(sqlite3.connect(self.path, timeout=_WAIT_S, isolation_level=None)) as file:
+            file.execute("PRAGMA journal_mode = WAL")
+            file.execute("PRAGMA synchronous = NORMAL")
+            file.execute(_TABLE)
+            yield file
+
+
+def _completion(kept: dict[str, Any]) -> Completion:
+    return Completion(request_id="", seconds=None, cached=True, **kept)
+
+
+def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
+    """A card's backend with a cache before it, if there is a file and its prompts are known."""
+    if file is None or not capabilities(card.engine).renders:
+        return backend
+    return Cached(cast("Rendering", backend), file)
 
 
 class Cached:
@@ -70,7 +131,6 @@ class Cached:
         return done
 
     def identity(self) -> dict[str, Any]:
-        """The backend's: what was kept was said by the same model."""
         return self._identity
 
     def _try(self, work: Callable[[CompletionFile], T]) -> T | None:

@@ -25,7 +25,6 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:

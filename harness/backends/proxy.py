@@ -11,8 +11,7 @@ from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request
 from harness.backends.cards import Card
-from harness.backends.failures import Failures
-from harness.backends.spoiling import drawn, spoilt
+from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.world.planner import plan
@@ -39,7 +38,6 @@ class Proxy:
         self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._completion(request) for request in requests]
 
     def _completion(self, request: Request) -> Completion:

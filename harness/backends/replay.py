@@ -6,6 +6,7 @@ from typing import Any
 
 from harness.backends.base import Completion, Request
 from harness.backends.cards import Card
+from harness.backends.registry import find
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
@@ -19,7 +20,8 @@ def open(card: Card, **_: Any) -> "Replay":
         UserError: it is no finished run, or a driver's, which is asked for the ego alone.
     """
     run = read(Path(card.weights or ""))
-    if run.manifest.model.get("engine") == "driver":
+    of = find(str(run.manifest.model.get("engine")))
+    if of and not of.capabilities.asks_helpers:
         raise UserError(
             f"{printable(run.path)} is a run of a driver; "
             f"run it again with --model {printable(run.manifest.model['name'])}"
@@ -34,13 +36,7 @@ class Replay:
         self._run = run
         self._answers = {answer.id: answer for answer in run.answers}
 
-    @property
-    def latency(self) -> Latency:
-        """Whatever the decisions replayed were made with."""
-        return self._run.manifest.latency
-
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._completion(request) for request in requests]
 
     def _completion(self, request: Request) -> Completion:
@@ -66,6 +62,9 @@ class Replay:
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
             answer.label_mass, answer.retries, answer.cached, answer.slow_s,
         )  # fmt: skip
+
+    def latency(self) -> Latency:
+        return self._run.manifest.latency
 
     def identity(self) -> dict[str, Any]:
         """The run and the digest of its answers."""

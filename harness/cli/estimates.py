@@ -1,16 +1,23 @@
-"""Estimates and runs as people and as machines read them, and numbers held to their range."""
+"""Numbers, tables and JSON as people and machines read them."""
 
+import json
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
-from harness.core.errors import UserError, printable
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from harness.core.statistics import Estimate
-    from harness.runs.records import Manifest, Score
+
+WIDTH = 80  # columns of a terminal
+
+
+def echo_json(value: Any, indent: int | None = 1) -> None:
+    """Print JSON."""
+    typer.echo(json.dumps(value, indent=indent))
 
 
 def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
@@ -26,38 +33,26 @@ def shown(estimate: "Estimate", scale: float = 100.0) -> str:
 
 def interval(value: float | None, low: float | None, high: float | None, scale: float) -> str:
     """`value [low, high]`, one decimal; a dash for what is not known."""
-    known = (math.nan if number is None else scale * number for number in (value, low, high))
-    return "{} [{}, {}]".format(*("–" if math.isnan(number) else f"{number:.1f}" for number in known))
+    known = (math.nan if number is None else number for number in (value, low, high))
+    numbers = ("–" if math.isnan(number) else f"{scale * number:.1f}" for number in known)
+    return "{} [{}, {}]".format(*numbers)
 
 
-def in_range(option: str, value: int, least: int, most: int) -> None:
-    """Raises UserError unless `least` <= `value` <= `most`."""
-    if not least <= value <= most:
-        raise UserError(f"{option} {value} is out of range; give {least} to {most}")
+def console() -> "Console":
+    """Plain text in 80 columns."""
+    from rich.console import Console
+
+    return Console(width=WIDTH, markup=False, highlight=False)
 
 
-def tell_answers(
-    console: "Console", manifest: "Manifest", figures: Mapping[tuple[str, str], "Score"]
-) -> None:
-    """Say below the table of a run where times come from and how answers were read.
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], tight: bool = False) -> None:
+    """Print columns, the first folded and the others aligned right; `tight` ones are one space apart."""
+    from rich.table import Table
 
-    `figures` has its scores by condition and metric.
-    """
-    latency = manifest.latency
-    console.print(f"latency: {latency.source} ({printable(latency.basis)})")
-    if (latency.load_a_core or 0) > 1:
-        console.print(
-            f"timed on a busy machine ({latency.load_a_core} processes a core): "
-            "let it run alone, or use --latency card or paper"
-        )
-    if manifest.cached_answers:
-        console.print(f"{manifest.cached_answers} answers came from the cache (--no-cache asks anew)")
-    if manifest.engine_errors:
-        console.print(
-            f"{manifest.engine_errors} answers are errors of the engine; answers.jsonl has its messages"
-        )
-    for role in ("ego", "helper", "merge"):
-        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
-        if shares[0] is not None:
-            values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
-            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
+    drawn = Table(box=None, width=WIDTH, pad_edge=False, padding=(0, 1, 0, 0) if tight else (0, 1))
+    drawn.add_column(heads[0], overflow="fold")
+    for head in heads[1:]:
+        drawn.add_column(head, justify="right", no_wrap=True)
+    for row in rows:
+        drawn.add_row(*row)
+    console().print(drawn)

@@ -8,7 +8,7 @@ import typer
 from harness.core.errors import UserError, printable
 
 
-def export(
+def command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
     as_csv: Annotated[bool, typer.Option("--csv", help="Write decisions.csv and answers.csv.")] = False,
     as_jsonl: Annotated[
@@ -16,7 +16,7 @@ def export(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder to write to. Default: the run's.")] = None,
 ) -> None:
-    """Write a run's decisions and answers as text, for spreadsheets and other programs."""
+    """Write a run's decisions and answers as text. Spreadsheets and other programs read it."""
     from harness.runs.export import answers_csv, decisions_csv, decisions_jsonl
     from harness.runs.folder import read
 

@@ -9,8 +9,10 @@ from harness.core.errors import UserError, printable
 PROMPT = "v2"  # what one's own prompt begins as
 
 
-def init(folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do.")) -> None:
-    """Make a project: a prompt and a model card to change, found by name by commands typed in its folder."""
+def command(
+    folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do."),
+) -> None:
+    """Make a project with a prompt and a model card to change. Commands typed there find them by name."""
     from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory
 

@@ -15,12 +15,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from harness import __version__
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes, write_whole
 from harness.core.parallel import spread
 from harness.dataset.freeze import Behaviour, freeze
-from harness.dataset.schema import FILE_NAME, manifest_schema, record_schema, record_validator
+from harness.dataset.schema import FILE_NAME, Record, manifest_schema, record_schema
 from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
 
 WORK = ".building"
@@ -123,10 +125,7 @@ def _shard(episode: int) -> str:
 def _freeze_to_file(work: Path, seed: int, episode: int) -> None:
     lines = [canonical_json(record) + "\n" for record in freeze(seed + episode, episode, Behaviour())]
     for line in lines:
-        for error in record_validator(ACTIONS).iter_errors(json.loads(line)):
-            raise AssertionError(
-                f"episode {episode} breaks its own schema at {error.json_path}: {error.message}"
-            )
+        msgspec.json.decode(line, type=Record)  # a record that breaks its own form is a bug
     write_whole(work / _shard(episode), "".join(lines))
 
 

@@ -40,8 +40,8 @@ class FrozenSource:
         scenes = self.dataset.scenes
         return FrozenScenes(
             name=self.dataset.name, sha256=self.dataset.sha256, scenes=len(scenes),
-            episodes=len({scene.record["episode"] for scene in scenes}), limit=self.limit,
-            delay_allowance_s=float(self.dataset.manifest["parameters"]["delay_allowance_s"]),
+            episodes=len(self.dataset.episodes), limit=self.limit,
+            delay_allowance_s=self.dataset.delay_allowance_s,
             path=str(self.dataset.path),
         )  # fmt: skip
 

@@ -4,14 +4,14 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from harness.backends.base import Backend, Request
-from harness.backends.replay import Replay
+from harness.backends.base import Backend, Request, Timed
+from harness.backends.registry import capabilities
 from harness.core.arrays import Floats
 from harness.core.files import write_whole
 from harness.evaluate.spec import Spec
@@ -25,8 +25,8 @@ def declared(spec: Spec, backend: Backend) -> Latency | None:
     """The latency that the paper, the run replayed or the card declares; None where it is to be measured."""
     if spec.latency == "paper":
         return PAPER
-    if isinstance(backend, Replay):  # whatever the decisions replayed were made with
-        return backend.latency
+    if capabilities(spec.card.engine).own_latency:
+        return cast("Timed", backend).latency()
     card = spec.card.latency
     if (spec.latency or card.source) == "card":
         return Latency("card", card.basis, card.inference_s, card.inference_s, card.inference_s)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Trajectory
@@ -108,7 +109,7 @@ def scene_of(run: Run, name: str) -> Scene:
             world.advance(frame)
             world.take(action)
     world.advance(begins)
-    alone = run.manifest.model.get("engine") == "driver"
+    alone = not capabilities(run.manifest.model["engine"]).asks_helpers
     return look(Trajectory(mine.episode, world, []), mine.step, alone)
 
 

@@ -9,12 +9,12 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend, Rendering
-from harness.backends.cache import Cached
+from harness.backends.base import Backend
+from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError, printable
@@ -75,10 +75,10 @@ def evaluate(
     if resume and (out / "run.json").is_file():
         return finished(spec, out)
     refuse(spec, out, resume)
-    if isinstance(spec.source, FrozenSource):
-        done = _frozen(spec, spec.source, out, progress, cache, more)
-    else:
+    if isinstance(spec.source, LiveSource):
         done = _closed_loop(spec, spec.source, out, progress, cache, workers)
+    else:
+        done = _frozen(spec, cast("FrozenSource", spec.source), out, progress, cache, more)
     tidy(out)
     return done
 
@@ -109,7 +109,7 @@ def _frozen(
         trial = partial(requests, spec, latencies.sample(scenes))
         if latency is None:
             latency = latencies.measured(spec, backend, list(trial()))
-        asked = Cached(backend, cache) if cache and isinstance(backend, Rendering) else backend
+        asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
         asker.ask(list(requests(spec, scenes)))
         if latency.each_its_own and latencies.lacks_times(asker.answers):
@@ -117,8 +117,7 @@ def _frozen(
         latencies.keep(work / "latency.json", asker.latency)
         with uncollected():
             walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
-        episodes = tuple(dict.fromkeys(scene.record["episode"] for scene in scenes))
-        return _written(spec, out, work, episodes, walked, backend.identity(), asker.latency)
+        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), asker.latency)
 
 
 def _closed_loop(
@@ -203,7 +202,7 @@ def _opened(
     """This process's backend, with the cache in front of a language model's."""
     if cache is not None:
         backend = _opened(card, device, dtype, batch_size, None)
-        return Cached(backend, cache) if isinstance(backend, Rendering) else backend
+        return cached(backend, card, cache)
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 

@@ -12,7 +12,8 @@ import msgspec
 
 from harness import __version__
 from harness.backends.base import AnswerMode
-from harness.backends.cards import WEIGHTED, Card, load, names
+from harness.backends.cards import Card, argument
+from harness.backends.registry import capabilities, registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
@@ -25,15 +26,17 @@ TAG_CHARACTERS = 40
 
 
 class Source(Protocol):
-    """Which world is walked.
+    """Which world is walked."""
 
-    Attributes:
-        kind: what a run's manifest calls it.
-        command: that walks it: `eval` or `drive`.
-    """
+    @property
+    def kind(self) -> World:
+        """What a run's manifest calls it."""
+        ...
 
-    kind: World
-    command: str
+    @property
+    def command(self) -> str:
+        """The command that walks it: `eval` or `drive`."""
+        ...
 
     @property
     def name(self) -> str:
@@ -99,17 +102,23 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        served = self.card.engine == "openai" and self.card.thinking != "none"
-        if self.thinking and not (served or self.card.engine in (*WEIGHTED, "replay")):
+        can = capabilities(self.card.engine)
+        if self.source.kind == "closed-loop" and not can.closed_loop:
+            raise UserError(
+                f"--model {printable(self.card.name)}: a replay has answers to frozen scenes alone; "
+                "give the model that it replays"
+            )
+        thinks = can.thinks == "always" or (can.thinks == "card" and self.card.thinking != "none")
+        if self.thinking and not thinks:
             raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
         if self.answer not in get_args(AnswerMode):
             raise unknown("answer mode", self.answer, get_args(AnswerMode))
-        if self.answer != "json" and self.card.engine in ("proxy", "driver"):
-            raise UserError(
-                f"--answer {self.answer}: {printable(self.card.name)} is no language model; use json"
-            )
+        if self.answer not in can.answer_modes:
+            reason = "cannot answer so" if can.language_model else "is no language model"
+            modes = " or ".join(can.answer_modes)
+            raise UserError(f"--answer {self.answer}: {printable(self.card.name)} {reason}; use {modes}")
         if self.answer != "json" and self.thinking:
             raise UserError(
                 f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
@@ -117,7 +126,7 @@ class Spec:
             )
         self._check_latency()
         for point in self.points:
-            if point.asks_again and (self.card.engine in ("proxy", "driver") or self.answer == "readout"):
+            if point.asks_again and (not can.language_model or self.answer == "readout"):
                 raise UserError(
                     f"condition {printable(point.name)}: "
                     + ("a readout gives no messages to merge; use --answer json or constrained"
@@ -125,21 +134,22 @@ class Spec:
                        else f"{printable(self.card.name)} is no language model and cannot merge messages")
                 )  # fmt: skip
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
-            if value is not None and self.card.engine not in WEIGHTED:
+            if value is not None and not can.has_weights:
+                able = [name for name, engine in registrations().items() if engine.capabilities.has_weights]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
-                    f"(engines {' and '.join(WEIGHTED)} have); leave it out"
+                    f"(engines {' and '.join(able)} have); leave it out"
                 )
 
     def _check_latency(self) -> None:
-        shown, engine = f"--latency {printable(self.latency)}", self.card.engine
+        shown, can = f"--latency {printable(self.latency)}", capabilities(self.card.engine)
         if self.latency is None:
             return
         if self.latency not in get_args(Latency):
             raise unknown("--latency", self.latency, get_args(Latency))
-        if engine == "replay" and self.latency != "paper":
+        if can.own_latency and self.latency != "paper":
             raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
-        if self.latency == "measured" and engine in ("proxy", "driver"):
+        if self.latency == "measured" and not can.language_model:
             raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
         if self.latency == "card" and self.card.latency.inference_s is None:
             raise UserError(
@@ -159,7 +169,7 @@ class Spec:
     @property
     def ego_alone(self) -> bool:
         """Whether helpers are not asked, as a driver's are not."""
-        return self.card.engine == "driver"
+        return not capabilities(self.card.engine).asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
         """Who is asked in a scene, the ego first."""
@@ -185,7 +195,7 @@ class Spec:
     def command(self, out: Path) -> str:
         """A command line that runs this again, quoted for a shell."""
         options = [
-            ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
+            ("--model", argument(self.card)), ("--prompt", self.prompt.version),
             *self.source.options(), ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
@@ -194,13 +204,6 @@ class Spec:
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         command = ["harness", self.source.command, *parts, *(["--thinking"] if self.thinking else [])]
         return shlex.join(command)
-
-
-def model_argument(card: Card) -> str:
-    """What `--model` was given, or anything that resolves to the same card."""
-    if card.name.partition(":")[0] in names() and load(card.name) == card:
-        return card.name
-    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 
 
 def versions(

@@ -100,7 +100,7 @@ def table(dataset: Dataset) -> Table:
         index[row, : len(positions)] = positions
     safe, delay_s = dataset.outcome_arrays()
     seeds = [dataset.scenes[p[0]].record["episode_seed"] for p in places.values()]
-    allowance_s = float(dataset.manifest["parameters"]["delay_allowance_s"])
+    allowance_s = dataset.manifest.number("delay_allowance_s")
     return Table(index, np.array(list(places)), np.array(seeds), safe, delay_s, allowance_s)
 
 

@@ -24,6 +24,7 @@ from harness.evaluate.fusion import codes_of
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 Moment = TypeVar("Moment")
+AskedMoment = TypeVar("AskedMoment", contravariant=True)
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,14 @@ class World(Protocol[Moment]):
         ...
 
 
-class Ask(Protocol[Moment]):
+class Ask(Protocol[AskedMoment]):
     """Where intents come from."""
 
-    def __call__(self, moments: Sequence[Moment]) -> Intents:
+    def __call__(self, moments: Sequence[AskedMoment]) -> Intents:
         """What every vehicle intends in these moments, (n, ...)."""
         ...
 
-    def fusion_call(self, moments: Sequence[Moment], codes: Ints) -> Callable[[Ints], FusionCall]:
+    def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,)."""
         ...
 
@@ -237,5 +238,5 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
 
 def _labels(of_scenes: Sequence[str | None], at: Ints, there: Any = True) -> Labels:
     names = list(dict.fromkeys(label for label in of_scenes if label is not None))
-    code = {None: -1, **{name: place for place, name in enumerate(names)}}
+    code: dict[str | None, int] = {None: -1, **{name: place for place, name in enumerate(names)}}
     return Labels(np.where(there, np.array([code[label] for label in of_scenes])[at], -1), names)

@@ -15,9 +15,10 @@ from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
-from harness.report.decision_charts import policies, timeline
+from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, roads
 from harness.report.panels import panels
@@ -64,6 +65,7 @@ def save(page: str, out: Path, option: str) -> None:
         ) from None
 
 
+@uncollected()
 def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:

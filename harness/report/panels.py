@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from harness.backends.registry import find
 from harness.evaluate.success import reference_success
 from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
@@ -115,7 +116,7 @@ def _references(runs: Runs) -> dict[str, float]:
         found = {
             run.manifest.model["name"]: run
             for run in runs.runs
-            if run.manifest.model.get("engine") == "driver"
+            if (engine := find(str(run.manifest.model.get("engine")))) and engine.capabilities.reference
         }
         scores = {name: run.score(run.conditions[0], "success_rate") for name, run in found.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.core.errors import UserError, printable
+from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.folder import Run, dataset_of, read
 from harness.runs.records import FrozenScenes
@@ -42,8 +43,13 @@ class Runs:
         return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
 
 
-def gather(paths: Sequence[Path]) -> Runs:
+@uncollected()
+def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
     """Read runs to be reported together.
+
+    Args:
+        paths: their folders.
+        dataset: one that was read already; it is read again where it is not that of the runs.
 
     Raises:
         UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
@@ -57,7 +63,11 @@ def gather(paths: Sequence[Path]) -> Runs:
                 f"{printable(first.path)} and {printable(other.path)} are not of the same scenes "
                 f"({_shown(first)} and {_shown(other)}); report them apart"
             )
-    dataset = dataset_of(first) if first.world == "frozen" else None
+    world = first.manifest.world
+    if not isinstance(world, FrozenScenes):
+        dataset = None
+    elif dataset is None or dataset.sha256 != world.sha256:
+        dataset = dataset_of(first)
     return Runs(tuple(found), _names(found), dataset)
 
 

@@ -114,7 +114,7 @@ class Decisions:
 
     def flags(self, name: str) -> Bools:
         """Whether it is known to be so, (n,)."""
-        return self[name] == 1.0
+        return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
         """A distribution, or what each action would lead to: (n, A)."""
@@ -141,11 +141,6 @@ class Decisions:
     def labels(self, name: str) -> list[str | None]:
         """Labels (n,)."""
         return cast("list[str | None]", self.table[name].to_pylist())
-
-    def infinite(self) -> str | None:
-        """Name of a column with an infinite number; None if there is none."""
-        numbers = [one.name for one in self.table.schema if one.type == NUMBER]
-        return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
 
     @cached_property
     def scenes(self) -> dict[str, range]:
@@ -177,6 +172,11 @@ class Decisions:
         plain = {name: row[name] for name in Decision.__struct_fields__ if name in COLUMNS}
         fused = tuple(row[f"fused_{action}"] for action in self.actions)
         return Decision(**{**plain, "fused": fused, "messages": messages})
+
+    def infinite(self) -> str | None:
+        """Name of a column with an infinite number; None if there is none."""
+        numbers = [one.name for one in self.table.schema if one.type == NUMBER]
+        return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
 
     def take(self, which: Any) -> "Decisions":
         """Some of the decisions, by their positions."""

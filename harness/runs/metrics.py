@@ -226,7 +226,7 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
     """Sum of what is known at each of n places, (n,)."""
-    return np.bincount(places, weights=np.nan_to_num(values), minlength=n)
+    return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
 
 
 def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:

@@ -103,7 +103,7 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     n = len(ordered)
 
     def total(values: Floats) -> list[int]:
-        return sum_by_place(values, places, n).astype(int).tolist()
+        return [int(total) for total in sum_by_place(values, places, n)]
 
     def mean(name: str) -> list[Any]:
         return [None if v != v else v for v in mean_by_place(decisions[name], places, n).tolist()]

@@ -11,7 +11,7 @@ The intents go through trigger, channel, consensus and scoring like any model's.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +29,7 @@ from harness.studies.play import Walked, walk_through
 
 VERSION = "2"
 STEPS = 6  # decisions an episode: 18 messages are three replies each
+INTENTS = tuple(field.name for field in fields(Intents))
 CHUNK = 2000  # episodes that are played together
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
@@ -129,9 +130,8 @@ class CalibratedWorld:
 
     def __call__(self, moments: Sequence[int]) -> Intents:
         """What every vehicle intends at this step."""
-        now = {f.name: self._now(lambda d, f=f: getattr(d.intents, f.name)) for f in fields(Intents)}
-        own = np.where(self._knows[:, None], self._now(lambda d: d.knowing), now["own"])
-        return Intents(**{**now, "own": own})
+        now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in INTENTS))  # noqa: B023
+        return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
 
     def fusion_call(self, moments: Sequence[int], codes: Ints) -> Callable[[Ints], FusionCall]:
         """Nobody calls: no point of the study has its model fuse."""

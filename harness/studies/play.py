@@ -142,7 +142,7 @@ def _metric(name: str, walked: Walked, seeds: int) -> Floats:
 
 def _of_seed(walked: Walked, place: int) -> Floats:
     """Latencies of the decisions of the seed at this place."""
-    return walked.columns["latency_ms"][walked.places // len(walked.episodes) == place]
+    return np.asarray(walked.columns["latency_ms"][walked.places // len(walked.episodes) == place])
 
 
 def _estimates(

@@ -41,7 +41,7 @@ def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dic
         UserError: the dataset was built from another scenario than the one that would be driven.
     """
     for what, here in settings().items():
-        if dataset.manifest[what] != here:
+        if getattr(dataset.manifest, what) != here:
             raise UserError(
                 f"dataset {printable(dataset.path)} was built with other {what} than are driven here; "
                 "build it again to compare"

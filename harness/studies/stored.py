@@ -8,17 +8,16 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend, Rendering
-from harness.backends.cache import Cached, default_file
-from harness.backends.cards import Card, Latency
-from harness.backends.failures import Failures
+from harness.backends.base import AnswerMode, Backend
+from harness.backends.cache import cached, default_file
+from harness.backends.cards import Card
 from harness.backends.registry import open_backend
-from harness.backends.servers import Server
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import nearest
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Ints
+from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Scene
@@ -121,8 +120,8 @@ class Stored:
                 f"{shown}: prompt {printable(version)} has changed since; restore it or run again"
             )
         return Spec(
-            _card(manifest.model, shown), prompt, FrozenSource(self._dataset), (), manifest.seeds,
-            thinking=manifest.thinking, answer=cast("AnswerMode", manifest.answer),
+            convert(manifest.model, Card, f"{shown}: its model"), prompt, FrozenSource(self._dataset), (),
+            manifest.seeds, thinking=manifest.thinking, answer=cast("AnswerMode", manifest.answer),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
         )  # fmt: skip
 
@@ -136,7 +135,7 @@ class Stored:
                 f"{printable(self.run.path)}: the model is not what it was "
                 f"({printable(', '.join(other))}); run again"
             )
-        return Cached(backend, default_file()) if isinstance(backend, Rendering) else backend
+        return cached(backend, spec.card, default_file())
 
 
 class _Nearest:
@@ -152,11 +151,3 @@ class _Nearest:
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         return self._stored.fusion_call(moments, codes)
-
-
-def _card(stored: dict[str, Any], shown: str) -> Card:
-    inner = {"latency": Latency, "server": Server, "failures": Failures}
-    try:
-        return Card(**{k: inner[k](**v) if k in inner and v is not None else v for k, v in stored.items()})
-    except (TypeError, KeyError) as error:
-        raise UserError(f"{shown}: run.json is of another version ({printable(error)}); run again") from None

@@ -55,8 +55,8 @@ def distill(
     student = Student(dataset, prompts, plan, work, device)
     curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
-        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest["seed"],
-                    "episodes": dataset.manifest["episodes"], "scenes": len(dataset.scenes)},
+        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest.seed,
+                    "episodes": dataset.manifest.episodes, "scenes": len(dataset.scenes)},
         "prompts": {p.version: p.sha256 for p in prompts},
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),

@@ -4,6 +4,7 @@ transformers in float32 is the reference. llama.cpp is held to it twice: with th
 exported on the spot, and with the GGUF file that the model's card names.
 """
 
+import json
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +19,8 @@ from harness.backends.cards import Card
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
-from harness.backends.transformers import checkpoint
 from harness.backends.transformers import engine as transformers_engine
+from harness.backends.weights import find_checkpoint
 from harness.core.arrays import Floats
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export
@@ -85,8 +86,8 @@ def compare(
     Raises:
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
-    where = checkpoint.find(reference)
-    rows = checkpoint.vocabulary(where)
+    where = find_checkpoint(reference)
+    rows = int(json.loads((where / "config.json").read_bytes())["vocab_size"])  # padding included
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
     known = _hear(plain(batch_size=1), asked, letters, rows)
     progress(1)

@@ -22,8 +22,8 @@ def laid(made: list[tuple[int, float]]) -> Decided:
 def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
     data: st.DataObject, n: int
 ) -> None:
-    sides = [[laid(data.draw(DECISIONS)) for _ in range(n)] for _ in "ab"]
-    found = list(differences(*sides, 4))
+    first, second = sides = [[laid(data.draw(DECISIONS)) for _ in range(n)] for _ in "ab"]
+    found = list(differences(first, second, 4))
     by_seed, met = [], set()
     for one, other in zip(*sides, strict=True):
         known = [{int(p) for p, v in zip(*side, strict=True) if v == v} for side in (one, other)]

@@ -197,6 +197,8 @@ def test_messages_that_the_egos_model_merges_take_a_second_inference():
 
 @pytest.mark.slow
 def test_a_language_model_in_float32_drives_alike_in_any_company():
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("transformers", reason="needs the transformers extra")
     points = [ALONE, named_point("6g:consensus=ego-prompt")]
     tiny = spec("swarm-tiny:transformers", points, (0,), first_seed=FROM_LEFT, latency="paper")
     together = driven(tiny, (0, 1), infer_s=0.145)

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -38,6 +39,7 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
     found = fidelity(runs)
     assert len(found.table) == 3 * 3
     assert len(found.episodes) == 3 * 3 * 2 * 4
+    row: Any
     for row in found.table.itertuples():
         frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))
         assert row.frozen == pytest.approx(frozen.mean())

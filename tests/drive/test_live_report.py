@@ -112,6 +112,7 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, text):
 
 @pytest.mark.slow
 def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path):
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     point = named_point("6g:consensus=ego-prompt")
     of = spec("swarm-tiny", points=[point], seeds=(0,), first_seed=FROM_LEFT, latency="paper")
     run(of, tmp_path / "run", False, 1, lambda done: None)

@@ -4,8 +4,8 @@ import json
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-import imageio_ffmpeg
 import pandas as pd
 import pytest
 from driving import FROM_LEFT, spec
@@ -26,6 +26,7 @@ def out(tmp_path_factory):
 
 
 def test_an_episode_played_again_ends_as_it_did(out):
+    row: Any
     for row in pd.read_csv(out / "episodes.csv", keep_default_na=False).itertuples():
         seen = list(stills(find(out, row.episode, row.condition, row.seed)))
         assert seen[-1].state.time_s == row.time_s
@@ -62,6 +63,7 @@ def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, tmp_path, monkey
 
 
 def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
     assert typed(monkeypatch, capsys, "video", out, 0, "--out", film) == (0, f"wrote {film}\n", "")
     assert film.read_bytes()[4:8] == b"ftyp"
@@ -98,6 +100,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
 
 
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"

@@ -47,14 +47,14 @@ def write_run(folder, dataset, model="rule-of-thumb", change=lambda scene, viewe
         "prompt": {"version": "v2", "sha256": "00" * 32},
         "dataset": {
             "name": dataset.name, "path": str(dataset.path), "sha256": dataset.sha256,
-            "scenes": len(dataset.scenes), "episodes": dataset.manifest["episodes"],
+            "scenes": len(dataset.scenes), "episodes": dataset.manifest.episodes,
         },
         "actions": list(dataset.actions),
         "conditions": [asdict(point) for point in POINTS.values()],
         "seeds": list(SEEDS),
         "latency": {"source": "paper", "inference_s": {"ego": INFERENCE_S}, "basis": "the paper's 145 ms"},
         "delay_allowance_s": 1.0,
-        "versions": dataset.manifest["versions"],
+        "versions": dataset.manifest.versions,
     }  # fmt: skip
     rows = [
         {

@@ -4,6 +4,8 @@ import base64
 import hashlib
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -214,7 +216,8 @@ def test_a_lone_surrogate_in_an_answer_does_not_break_the_page(dataset, tmp_path
 
 
 def scored(run, *scores):
-    return replace(run, scores=tuple(Score(*s, n=2, n_excluded=0, interval="episodes") for s in scores))
+    named = (dict(zip(("condition", "metric", "value", "low", "high"), s, strict=True)) for s in scores)
+    return replace(run, scores=tuple(Score(**s, n=2, n_excluded=0, interval="episodes") for s in named))
 
 
 def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run):
@@ -329,3 +332,13 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     ):
         with pytest.raises(UserError, match=message):
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+
+
+def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(run, tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from harness.cli.report import write;"
+        f"write([Path({str(run)!r})], Path({str(tmp_path / 'page.html')!r}), quiet=True);"
+        "print(sorted({'matplotlib', 'highway_env', 'gymnasium', 'pandas', 'torch'} & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert said.stdout == "[]\n"

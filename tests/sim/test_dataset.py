@@ -80,7 +80,7 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
 
 def test_a_built_dataset_is_sound_and_has_all_its_decision_points(small, small_folder):
     assert check(small_folder) == []
-    assert (small.manifest["episodes"], small.manifest["decisions"], len(small.scenes)) == (6, 36, 36)
+    assert (small.manifest.episodes, small.manifest.decisions, len(small.scenes)) == (6, 36, 36)
     assert [s.id for s in small.scenes[:7]] == [f"00000-{n}" for n in range(6)] + ["00001-0"]
     assert {s.record["episode_seed"] for s in small.scenes} == set(range(FIRST_SEED, FIRST_SEED + 6))
 
@@ -323,7 +323,7 @@ def test_a_record_that_is_not_what_it_should_be_is_named_by_line_and_never_used(
         load(copy)
 
 
-HOSTILE_MANIFESTS = {
+HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "a path upwards": {"files": {"../../etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "an absolute path": {"files": {"/etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "a folder": {"files": {"..": "0" * 64, "scenes.jsonl": "0" * 64}},

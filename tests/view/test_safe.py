@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import quote
 
@@ -204,7 +205,7 @@ def test_what_a_run_holds_is_shown_in_a_sandbox(page: str, browser: TestClient) 
     common(answer.headers)
 
 
-def common(headers: dict[str, str]) -> None:
+def common(headers: Mapping[str, str]) -> None:
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["referrer-policy"] == "no-referrer"
     assert headers["cross-origin-resource-policy"] == "same-origin"

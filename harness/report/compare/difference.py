@@ -142,7 +142,7 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     differences += [
         Difference(f"latency_p{percent}_ms", before, after, change)
         for percent, before, after, change in percentiles.differences(
-            *(pair.latencies(side, condition) for side in (pair.a, pair.b)), len(pair.episodes)
+            pair.latencies(pair.a, condition), pair.latencies(pair.b, condition), len(pair.episodes)
         )
     ]
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))

@@ -78,7 +78,7 @@ class Pair:
         grid = side.run.grid
         seeds, episodes = map(grid.seeds.index, self.seeds), map(grid.episodes.index, self.episodes)
         of_condition = side.values[metric][grid.conditions.index(condition)]
-        return of_condition[np.ix_(list(seeds), list(episodes))].T
+        return np.asarray(of_condition[np.ix_(list(seeds), list(episodes))].T)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
         """Of each seed, the episodes' places in `episodes` and the latencies in ms of their decisions."""

@@ -27,12 +27,10 @@ def terminal(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
 
 def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
     pair = found.pair
-    for name, side in (("A", pair.a), ("B", pair.b)):
-        yield f"{name}: {side.run.path}: {words.who(side)}"
+    yield from (f"{name}: {side}" for name, side in words.sides(pair))
     yield f"paired: {words.paired(pair)}"
     yield words.differing(found)
-    for setting, a, b in found.settings:
-        yield f"  {setting}: {_setting(a)} → {_setting(b)}"
+    yield from (f"  {setting}" for setting in words.settings(found))
     for c in found.conditions:
         label = printable(c.condition)
         if len(label) > 25:
@@ -42,19 +40,13 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
         for one in map(words.line, c.differences):
             yield f"{one.metric:<26}{one.a:>11}{one.b:>11}{one.change:>10} {one.interval:>21}"
         yield words.success(c, pair)
-        for name, some in (("gained", c.gained), ("lost", c.lost)):
-            if some:
-                yield f"  {name}: {words.flips(some, pair, most)}"
+        yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
     if not found.answers:
         yield "answers: none changed its verdict"
-    for t in found.answers:
-        yield f"answers: {words.answers_flipped(t, found)}"
-        yield "  " + ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
+    for turned, requests in words.answers_flipped(found, most):
+        yield f"answers: {turned}"
+        yield f"  {requests}"
     yield from map(words.judged, verdicts)
-
-
-def _setting(value: str | None) -> str:
-    return "none" if value is None else printable(value, 60)
 
 
 def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
@@ -63,23 +55,16 @@ def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
     failed = sum(bool(verdict.failed) for verdict in verdicts)
     said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]
     said += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
-    said += [
-        f"- {name}: {code(f'{side.run.path}: {words.who(side)}')}"
-        for name, side in (("A", pair.a), ("B", pair.b))
-    ]
+    said += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
     said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(found)}", ""]
     for c in found.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
-        for name, some in (("gained", c.gained), ("lost", c.lost)):
-            if some:
-                said += [f"- {name}: {code(words.flips(some, pair, most))}"]
+        said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         said += [""]
     said += ["<details><summary>Answers and settings</summary>", ""]
-    for t in found.answers:
-        ids = ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
-        said += [f"- {code(words.answers_flipped(t, found))}: {code(ids)}"]
+    said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(found, most)]
     said += [] if found.answers else ["- no answer changed its verdict"]
-    said += [f"- {code(f'{name}: {_setting(a)} → {_setting(b)}')}" for name, a, b in found.settings]
+    said += [f"- {code(setting)}" for setting in words.settings(found)]
     return "\n".join([*said, "", "</details>"])
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from harness.core.errors import printable
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
-from harness.report.compare.difference import AnswersFlipped, Comparison, Difference, Flip, InCondition
+from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
 from harness.runs.metrics import unit
@@ -43,6 +43,11 @@ def who(side: Side) -> str:
     return f"{of_run['model']} · prompt {of_run['prompt']} · {of_run['answer']}"
 
 
+def sides(pair: Pair) -> list[tuple[str, str]]:
+    """`A` and `B`, each with its folder and who answered."""
+    return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+
+
 def paired(pair: Pair) -> str:
     """What is paired, and what only one of the runs has."""
     said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
@@ -76,24 +81,45 @@ def success(c: InCondition, pair: Pair) -> str:
     return f"{said}; {how} {ends} points, 95 %"
 
 
-def flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
+def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
+    """What a condition gained and what it lost, where it did: up to so many episodes of each."""
+    ways = (("gained", c.gained), ("lost", c.lost))
+    return [(way, _flips(some, pair, most)) for way, some in ways if some]
+
+
+def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
     said = []
     for t in some[:most]:
         how = t.a if t.b == "success" else t.b
         seeds = "" if len(t.seeds) == len(pair.seeds) else f" (seeds {', '.join(map(str, t.seeds))})"
         said.append(f"{t.episode} {how}{seeds}")
-    return ", ".join(said + more(len(some), most))
+    return _listed(said, len(some), most)
 
 
-def more(n: int, most: int) -> list[str]:
-    """`n more`, where a list is cut."""
-    return [f"{n - most} more"] if n > most else []
+def answers_flipped(found: Comparison, most: int) -> list[tuple[str, str]]:
+    """How many answers of a role changed their verdict, and up to so many of them."""
+    return [
+        (
+            f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}",
+            _listed(t.requests[:most], len(t.requests), most),
+        )
+        for t in found.answers
+    ]
 
 
-def answers_flipped(t: AnswersFlipped, found: Comparison) -> str:
-    """How many answers of a role changed their verdict."""
-    return f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}"
+def _listed(some: Sequence[str], n: int, most: int) -> str:
+    """Some of n, and how many more there are."""
+    return ", ".join([*some, f"{n - most} more"] if n > most else some)
+
+
+def settings(found: Comparison) -> list[str]:
+    """Each setting in which the runs differ, with both values."""
+
+    def shown(value: str | None) -> str:
+        return "none" if value is None else printable(value, 60)
+
+    return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in found.settings]
 
 
 def judged(verdict: Verdict) -> str:

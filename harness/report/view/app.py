@@ -93,7 +93,7 @@ class View:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._drawing = asyncio.Lock()  # Matplotlib draws for one at a time
+        self._drawing = asyncio.Lock()  # a page holds all rows of its runs
 
     def index(self, request: Request) -> Response:
         """The list of runs, filtered by `q` and sorted by `sort`."""
