@@ -15,7 +15,7 @@ from harness.core.errors import UserError, printable
 
 PANELS = {
     "Evaluate": ("eval", "drive", "sweep", "compare", "fidelity", "campaign"),
-    "Look": ("ls", "view", "report", "video", "parse"),
+    "Look": ("ls", "view", "report", "export", "video", "parse"),
     "Data": ("init", "prompt", "dataset", "scenario"),
     "Models": ("model", "distill", "parity", "doctor"),
 }

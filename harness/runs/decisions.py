@@ -28,6 +28,7 @@ COLUMNS = {
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
 }  # fmt: skip
+NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and what each action would lead to.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
 # A column a message's place, from 1: who was asked, and what became of the reply.
@@ -108,9 +109,7 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Whole numbers (n,). ValueError if one is unknown."""
-        if self.table[name].null_count:
-            raise ValueError(f"{name} is unknown")
+        """Whole numbers (n,)."""
         return self[name].astype(np.int64)
 
     def flags(self, name: str) -> Bools:
@@ -215,6 +214,9 @@ class Decisions:
         wanted = schema(actions, helpers)
         if missing := [name for name in wanted.names if name not in table.column_names]:
             raise ValueError(f"it lacks {', '.join(missing)}")
+        for name in NEVER_UNKNOWN:
+            if table[name].null_count:
+                raise ValueError(f"{name} is unknown in some rows")
         return cls(table.select(wanted.names).cast(wanted).unify_dictionaries(), tuple(actions), helpers)
 
     def frame(self) -> "pd.DataFrame":

@@ -20,6 +20,7 @@ from msgspec import Struct
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
 from harness.runs.formats import FORMAT, READ_BY
@@ -80,15 +81,19 @@ class Run:
         """`summary.csv`."""
         return self._read("summary.csv", lambda file: _records(file, Score))
 
-    @cached_property
+    @property
     def episodes(self) -> tuple[Episode, ...]:
         """`episodes.csv`, one of each condition, seed and episode."""
-        return self._read("episodes.csv", lambda file: tuple(self._grid_of(_records(file, Episode))[1]))
+        return self._placed[1]
 
-    @cached_property
+    @property
     def grid(self) -> Grid:
         """Conditions, seeds and episodes."""
-        return self._grid_of(self.episodes)[0]
+        return self._placed[0]
+
+    @cached_property
+    def _placed(self) -> tuple[Grid, tuple[Episode, ...]]:
+        return self._read("episodes.csv", self._place)
 
     @cached_property
     def decisions(self) -> Decisions:
@@ -115,19 +120,21 @@ class Run:
         ]
         return min(found, key=lambda s: s.interval != "episodes", default=None)
 
-    def _grid_of(self, episodes: Sequence[Episode]) -> tuple[Grid, list[Episode]]:
+    def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
+        episodes = _records(file, Episode)
         numbers = tuple(dict.fromkeys(episode.episode for episode in episodes))
         grid = Grid(self.conditions, self.manifest.seeds, numbers)
-        return grid, grid.ordered(episodes)
+        return grid, tuple(grid.ordered(episodes))
 
     def _decisions(self, file: Path) -> Decisions:
         decisions = Decisions.read(file, self.actions)
-        if (decisions.codes("action", self.actions) < 0).any():
-            raise ValueError("a decision has no action")
+        decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
-        places, step = self.grid.places(decisions), decisions.whole("step")
-        if len(np.unique(np.stack([places, step]), axis=1).T) != len(decisions):
+        places = self.grid.places(decisions)
+        steps, step = np.unique(decisions.whole("step"), return_inverse=True)
+        decided = np.sort(places * len(steps) + step, kind="stable")
+        if (decided[1:] == decided[:-1]).any():
             raise ValueError("a decision is there twice")
         begun = np.bincount(places, minlength=len(self.episodes))
         if (begun != [episode.decisions for episode in self.episodes]).any():
@@ -230,24 +237,23 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     return text.getvalue()
 
 
+@uncollected()
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     with file.open(encoding="utf-8", newline="") as lines:
-        reader = csv.DictReader(lines, strict=True)
-        if missing := [
-            name for name in kind.__struct_encode_fields__ if name not in (reader.fieldnames or ())
-        ]:
-            raise ValueError(f"it lacks {', '.join(missing)}")
-        rows = list(reader)
+        names, *rows = csv.reader(lines, strict=True)
+    if missing := [name for name in kind.__struct_encode_fields__ if name not in names]:
+        raise ValueError(f"it lacks {', '.join(missing)}")
     hints = zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True)
     optional = {name for name, hint in hints if type(None) in get_args(hint)}
-    return tuple(
-        msgspec.convert(
-            {k: None if v == "" and k in optional else v for k, v in row.items()}, kind, strict=False
-        )
-        for row in rows
-    )
+    columns = [
+        [text or None for text in column] if name in optional else column
+        for name, column in zip(names, zip(*rows, strict=True), strict=True)
+    ]
+    lines_by_name = [dict(zip(names, line, strict=True)) for line in zip(*columns, strict=True)]
+    return tuple(msgspec.convert(lines_by_name, list[kind], strict=False))  # type: ignore[valid-type]
 
 
+@uncollected()
 def _answers(file: Path, actions: int) -> list[Answer]:
     answers = _ANSWER.decode_lines(file.read_bytes())
     for answer in answers:
