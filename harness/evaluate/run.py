@@ -231,7 +231,7 @@ def _written(
 def finished(spec: Spec, out: Path) -> Evaluated:
     """The run that is there already. Raises UserError if it is another one, or damaged."""
     run = folder.read(out)
-    _same(spec.settings(), msgspec.to_builtins(run.manifest), out)
+    _same(spec.settings(), msgspec.json.decode(msgspec.json.encode(run.manifest)), out)
     tidy(out)
     return Evaluated(out, run.manifest, run.scores)
 
