@@ -17,6 +17,9 @@ from time import perf_counter, process_time
 from typing import Any
 from unittest.mock import patch
 
+from harness.evaluate.drive import run
+from harness.evaluate.live import drive
+from harness.evaluate.live_spec import Drive, spec_of
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -25,9 +28,6 @@ from harness.backends import cards
 from harness.backends.proxy import Proxy
 from harness.coordination.operating_point import POINTS
 from harness.dataset import freeze
-from harness.evaluate.drive import run
-from harness.evaluate.live import drive
-from harness.evaluate.live_spec import Drive, spec_of
 from harness.prompts import versions as prompts
 from harness.world import reference as live
 from harness.world import simulator

@@ -17,13 +17,13 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from harness.evaluate.evaluate import evaluate
 from playwright.sync_api import Browser, sync_playwright
 
 from harness.backends import cards
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import Scene, find, load
-from harness.evaluate.evaluate import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.report.page import render

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Request
+from harness.backends.base import Completion, Request
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.frozen_world import FrozenSource

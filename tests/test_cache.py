@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import Scripted, decisions, failed, rows_of, spec_of
+from harness.evaluate.evaluate import Evaluated, evaluate
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
@@ -23,7 +24,6 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset, load
-from harness.evaluate.evaluate import Evaluated, evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 

@@ -144,7 +144,7 @@ def test_a_manifest_that_is_none_is_one_line(harness: Harness, broken: Path) -> 
     (broken / "manifest.json").write_text("{")
     assert "manifest.json cannot be read" in one_line(harness("eval", "--dataset", broken))
     (broken / "manifest.json").write_text('{"\\u001b[31m": 1}')
-    assert "manifest.json at $: " in one_line(harness("eval", "--dataset", broken))
+    assert "manifest.json: unknown key in manifest " in one_line(harness("eval", "--dataset", broken))
 
 
 def test_a_tokenizer_that_is_none_is_one_line(harness: Harness, small_path: Path, tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import FILES, Scripted, ask, decisions, figure, rows_of, run, says, spec_of, sure
+from harness.evaluate.again import Asking
+from harness.evaluate.evaluate import Evaluated, evaluate
 
 from harness.coordination.channel import Draws
 from harness.coordination.operating_point import POINTS, named_point
@@ -14,8 +16,6 @@ from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import merging
-from harness.evaluate.again import Asking
-from harness.evaluate.evaluate import Evaluated, evaluate
 from harness.prompts.versions import load as prompt
 from harness.studies.setting import Setting
 from harness.studies.stored import Stored

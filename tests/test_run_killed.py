@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from evaluating import FILES, run, spec_of
+from harness.evaluate.evaluate import evaluate
 
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import ask_all, read_kept, requests
-from harness.evaluate.evaluate import evaluate
 
 RESULT = {*FILES, "run.json"}
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import Scripted, ask, failed, says, scored, spec_of, sure, with_outcomes
+from harness.evaluate.scoring import draw, score, statuses
+from harness.evaluate.timing import inference_s, measure
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -18,9 +20,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.cards import Latency
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
-from harness.evaluate.scoring import draw, score, statuses
 from harness.evaluate.success import table
-from harness.evaluate.timing import inference_s, measure
 from harness.runs import record
 from harness.runs.summary import COLUMNS, summary
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluating import decisions, figure, rows_of, run, spec_of
+from harness.evaluate.evaluate import Evaluated
 
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.evaluate import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 

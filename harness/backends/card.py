@@ -116,7 +116,9 @@ def read(path: Path) -> list[Card]:
         shared["latency"] = table["latency"]
     for engine, anew in others.items():
         at = f"{where} [engines.{printable(engine)}]"
-        if engine not in (allowed := [name for name in _takers("weights") if name != table["engine"]]):
+        other = None if engine == table["engine"] else find(engine)
+        if other is None or "weights" not in other.allowed_keys:
+            allowed = [name for name in _takers("weights") if name != table["engine"]]
             raise unknown(f"engine in {where}", engine, allowed)
         if not isinstance(anew, dict):
             raise UserError(f"{at} = {printable(anew)!r}; allowed: a table")
@@ -139,7 +141,7 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
         raise unknown(f"engine in {where}", card.engine, engines())
     for key in _OF_SOME:
         lacking = key in engine.required_keys and key not in table
-        if lacking or (key in table and key not in engine.keys):
+        if lacking or (key in table and key not in engine.allowed_keys):
             shown = f"[{key}]" if key in ("server", "failures") else key
             takers = " or ".join(_takers(key))
             raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
@@ -155,4 +157,4 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
 
 def _takers(key: str) -> list[str]:
     """Engines whose cards may have a key that not all may have."""
-    return [engine for engine, registered in registrations().items() if key in registered.keys]
+    return [engine for engine, registered in registrations().items() if key in registered.allowed_keys]

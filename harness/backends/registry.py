@@ -74,7 +74,7 @@ class Registration:
     finds: str = ""
 
     @property
-    def keys(self) -> tuple[str, ...]:
+    def allowed_keys(self) -> tuple[str, ...]:
         """Keys that its cards may have and not all others."""
         return (*self.required_keys, *self.card_keys)
 

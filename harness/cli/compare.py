@@ -37,9 +37,10 @@ def command(
     difference = compared(pair(a, b))
     verdicts = [judge(each, difference) for each in gates]
     if html:
-        from harness.report.compare.page import write
+        from harness.report.compare.page import render
+        from harness.report.page import save
 
-        write(difference, verdicts, show, html)
+        save(render(difference, verdicts, show), html, "--html")
     if as_json:
         echo_json(text.mapping(difference, verdicts, show))
     else:

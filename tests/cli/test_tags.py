@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from evaluating import FILES, run, spec_of
+from harness.evaluate.evaluate import evaluate
 
 from harness.dataset.load import Dataset
-from harness.evaluate.evaluate import evaluate
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.runs.listing import runs

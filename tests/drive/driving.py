@@ -4,15 +4,15 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from evaluating import says
+from harness.evaluate.live import drive
+from harness.evaluate.live_spec import Drive, spec_of
+from harness.runs.driven_record import Row
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
-from harness.evaluate.live import drive
-from harness.evaluate.live_spec import Drive, spec_of
 from harness.prompts import versions as prompts
-from harness.runs.driven_record import Row
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # layout seeds
 ALONE = POINTS["single-local"]

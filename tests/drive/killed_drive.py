@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 from driving import spec
-
 from harness.evaluate.drive import run
 
 if __name__ == "__main__":

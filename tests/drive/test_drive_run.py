@@ -10,9 +10,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from driving import spec
+from harness.evaluate.drive import run
 
 from harness.core.errors import UserError
-from harness.evaluate.drive import run
 
 FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
 HERE = Path(__file__).parent

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, decisions, driven, spec
+from harness.evaluate.live import P, _draws, frames
+from harness.evaluate.scoring import draw
 
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.noise import uniforms
 from harness.evaluate.branches import Decision, Episode, Trajectory
-from harness.evaluate.live import P, _draws, frames
-from harness.evaluate.scoring import draw
 from harness.evaluate.success import table
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS

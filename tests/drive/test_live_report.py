@@ -5,18 +5,18 @@ import shutil
 
 import pytest
 from driving import FROM_LEFT, spec
+from harness.evaluate.drive import run
+from harness.runs.driven_folder import read
 from reading import Page, details
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
-from harness.evaluate.drive import run
 from harness.evaluate.replay import scene_of
 from harness.prompts import versions as prompts
 from harness.report.choose import FAILURE, failures, pick
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs import folder
-from harness.runs.driven_folder import read
 
 V2 = prompts.load("v2")
 

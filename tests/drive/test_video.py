@@ -9,11 +9,11 @@ from typing import Any
 import pandas as pd
 import pytest
 from driving import FROM_LEFT, spec
+from harness.evaluate.drive import run
 from PIL import Image, ImageSequence
 
 from harness.cli import main
 from harness.core.errors import UserError
-from harness.evaluate.drive import run
 from harness.evaluate.replay import find, stills
 from harness.report.drawing.video import write_video
 

@@ -12,6 +12,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
+from harness.core.memory import uncollected
 from harness.report.compare.percentiles import Decided
 from harness.report.words import facts
 from harness.runs.folder import Run, read
@@ -92,6 +93,7 @@ class Pair:
         return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
 
 
+@uncollected()
 def pair(a: Path, b: Path) -> Pair:
     """Read two runs.
 
