@@ -240,7 +240,6 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     return text.getvalue()
 
 
-@uncollected()
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
@@ -265,7 +264,6 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
-@uncollected()
 def _answers(file: Path, actions: int) -> list[Answer]:
     answers = _ANSWER.decode_lines(file.read_bytes())
     for answer in answers:
@@ -277,7 +275,8 @@ def _answers(file: Path, actions: int) -> list[Answer]:
 def whole(file: Path, reader: Callable[[Path], T]) -> T:
     """What a reader makes of a file. Raises UserError if it is broken."""
     try:
-        return reader(file)
+        with uncollected():
+            return reader(file)
     except _BROKEN as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{printable(file)} is broken ({printable(reason)}); make the run again") from None
