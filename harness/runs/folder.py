@@ -254,7 +254,7 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         )  # fmt: skip
     columns = {}
     for field, name, column in zip(kind.__struct_fields__, hints, table.columns, strict=True):
-        values = column.to_pylist() if column.null_count else column.to_numpy().tolist()
+        values = column.to_pylist()
         if name in optional:
             values = [None if value == "" else value for value in values]
         elif column.null_count:
