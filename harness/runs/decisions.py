@@ -261,7 +261,7 @@ def _values(column: Any, unknown: float | int, kind: type) -> Any:
     """A column's values (n,), `unknown` in place of nulls."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     mask, data = array.buffers()
-    values = np.frombuffer(data, kind, len(array), array.offset * np.dtype(kind).itemsize)
+    values: Any = np.frombuffer(data, kind, len(array), array.offset * np.dtype(kind).itemsize)
     if not array.null_count:
         return values
     end = array.offset + len(array)
