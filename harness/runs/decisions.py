@@ -104,8 +104,7 @@ class Decisions:
     def __getitem__(self, name: str) -> Floats:
         """Numbers or flags (n,) as floats; NaN where unknown."""
         if name not in self._arrays:
-            column = self.table[name].cast(NUMBER).combine_chunks()
-            self._arrays[name] = column.to_numpy(zero_copy_only=False)
+            self._arrays[name] = _floats(self.table[name].combine_chunks())
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
@@ -136,7 +135,7 @@ class Decisions:
         if others := [label for label in own if label not in position]:
             raise ValueError(f"unknown {name} {others[0]!r}")
         lookup = np.array([*(position[label] for label in own), -1])
-        return cast(Ints, lookup[column.indices.fill_null(len(own)).to_numpy(zero_copy_only=False)])
+        return cast(Ints, lookup[np.nan_to_num(_floats(column.indices), nan=len(own)).astype(np.int64)])
 
     def labels(self, name: str) -> list[str | None]:
         """Labels (n,)."""
@@ -146,7 +145,7 @@ class Decisions:
     def scenes(self) -> dict[str, range]:
         """The rows of each decision point, in order. Raises ValueError unless they stand together."""
         codes = self.table["scene"].combine_chunks()
-        changes = np.flatnonzero(np.diff(codes.indices.to_numpy(zero_copy_only=False))) + 1
+        changes = np.flatnonzero(np.diff(_floats(codes.indices))) + 1
         starts = [0, *changes.tolist(), len(self)]
         names = codes.dictionary.to_pylist()
         found = {
@@ -224,6 +223,15 @@ class Decisions:
         import pandas as pd
 
         return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
+
+
+def _floats(array: pa.Array) -> Floats:
+    """Numbers or flags (n,), NaN where unknown. Arrow's own way to NumPy would load pandas."""
+    numbers = array.cast(NUMBER)
+    if numbers.null_count:
+        unknown = pa.py_buffer(np.full(len(numbers), np.nan))
+        numbers = pc.coalesce(numbers, pa.Array.from_buffers(NUMBER, len(numbers), [None, unknown]))
+    return np.from_dlpack(numbers)
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:

@@ -7,8 +7,8 @@ import math
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import typer
@@ -30,7 +30,7 @@ from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import headline, latency_source
-from harness.runs.folder import read
+from harness.runs.folder import csv_text, read
 from harness.runs.records import Latency, Score
 
 V2 = prompts.load("v2")
@@ -45,14 +45,16 @@ def written(*folders, prompts=prompts_of):
     return render(gather(list(folders)), prompts)
 
 
+def greeting(viewer):
+    return [{"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}]
+
+
 @pytest.fixture(scope="session")
-def text(run):
-    return written(
-        run,
-        prompts=told(lambda viewer: [
-            {"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}
-        ]),
-    )  # fmt: skip
+def text(run, tmp_path_factory):
+    """The page of a run that was asked with a greeting."""
+    greeted = shutil.copytree(run, tmp_path_factory.mktemp("greeted") / "sample")
+    change(greeted, answer=lambda a: a.update(prompt_sha256=digest(greeting(a["viewer"]))))
+    return written(greeted, prompts=told(greeting))
 
 
 @pytest.fixture(scope="session")
@@ -143,9 +145,10 @@ def prompts_in(opened):
 
 def test_prompts_are_those_given_and_none_where_none_are(run, opened):
     assert "I am v3." in prompts_in(opened)
-    bare = details(written(run))  # the sample's prompt is nobody's
-    assert prompts_in(bare) == []
-    assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
+    # The sample's prompt is nobody's, and it was asked with another than this greeting.
+    for bare in (details(written(run)), details(written(run, prompts=told(greeting)))):
+        assert prompts_in(bare) == []
+        assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
 
 
 def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, tmp_path):
@@ -249,25 +252,24 @@ def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
     assert (visible(None), visible(True), visible(0.5)) == ("–", "yes", 0.5)
 
 
-def test_a_lone_surrogate_in_a_prompt_does_not_break_the_page(run):
-    every = details(written(run, prompts=told(lambda viewer: [{"role": "user", "content": "\ud800"}])))
-    assert set(prompts_in(every)) == {"\ud800"}
-
-
 def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset):
     [request] = list(requests(spec_of(dataset), dataset.scenes[:1]))[:1]
     answer = answer_of(request, Completion(request.id, "I\ud800", None, None, "stop", None, 1))
     assert answer.raw == "I?"
 
 
-def scored(run, *scores):
-    named = (dict(zip(("condition", "metric", "value", "low", "high"), s, strict=True)) for s in scores)
-    return replace(run, scores=tuple(Score(**s, n=2, n_excluded=0, interval="episodes") for s in named))
+def scored(run, tmp_path, *scores):
+    """The run with another summary."""
+    found = [Score(*score, n=2, n_excluded=0, interval="episodes") for score in scores]
+    copy = copied(run, tmp_path)
+    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.of_run))
+    return read(copy)
 
 
-def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run):
+def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("6g", "success_rate", 0.94, 0.88, 0.97),
         ("6g", "latency_proxy_ms", 151.4, 151.0, 151.8),
@@ -280,9 +282,10 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
     )
 
 
-def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run):
+def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("v2x", "success_rate", 0.70, 0.60, 0.78),
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
@@ -290,9 +293,10 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run):
     assert headline(found).endswith("a gap of 2.0 points (-3.0 to 7.0 points), which may be chance.")
 
 
-def test_where_nothing_beats_driving_alone_the_headline_says_so(run):
+def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.7, None, None),
         ("6g", "success_rate", 0.7, None, None),
     )
@@ -350,7 +354,6 @@ def edited(run, tmp_path, name, edit):
         ("answers.jsonl", lambda t: t.replace('"strict"', '"stern"'), "answers.jsonl is broken .*'stern'"),
         ("answers.jsonl", lambda t: t.replace("would", r"\ud800"), "answers.jsonl is broken"),
         ("answers.jsonl", lambda t: t.replace('"intent":[', '"intent":[0.0,'), "has 4 probabilities"),
-        ("answers.jsonl", lambda t: t.replace('"00000-0"', '"x"'), "answers.jsonl .*'x'"),
         ("decisions.parquet", lambda t: t[:-40], "decisions.parquet is broken"),
         ("decisions.parquet", lambda t: "", "decisions.parquet is broken"),
         ("summary.csv", lambda t: t.replace("ci_low", "low"), "summary.csv is broken .it lacks ci_low"),
@@ -384,7 +387,7 @@ def set_in_first(name, value):
     ("change", "message"),
     [
         (
-            lambda d: d.take(range(0)),
+            lambda d: d.take(np.arange(0)),
             "decisions.parquet is broken .not every decision of episodes.csv is there",
         ),
         (lambda d: d.take(range(1, len(d))), "broken .not every decision of episodes.csv is there"),
@@ -444,7 +447,7 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     assert done.output == f"wrote {out}\n"
     assert out.is_file()
     for arguments, message in (
-        ([tmp_path], r"is no run: it has no run.json"),
+        ([tmp_path], r"is no finished run: it has no run.json"),
         ([run, "--out", tmp_path], "is a folder; name a file in it"),
         ([run, "--out", out / "page.html"], "cannot be written"),
         ([run, run.parent], "2 runs and no --out; name the file to write"),
