@@ -207,7 +207,7 @@ def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_p
     copy = copied(driven, tmp_path)
     change(copy, decision=lambda row: row.update(step=None))
     with pytest.raises(
-        UserError, match=r"decisions.parquet is broken .step is unknown in some rows"
+        UserError, match=r"decisions.parquet is broken .step is unknown"
     ) as error:
         written(copy)
     assert "\n" not in str(error.value)
