@@ -27,9 +27,11 @@ from harness.runs.summary import counted, scores
 FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
 
 
-def spec_of(dataset: Dataset, model: str = "proxy", prompt: str = "v2", **options: Any) -> Spec:
+def spec_of(
+    dataset: Dataset, model: str = "proxy", prompt: str = "v2", limit: int | None = None, **options: Any
+) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(cards.resolve(model), prompts.load(prompt), FrozenSource(dataset), **options)
+    return Spec(cards.resolve(model), prompts.load(prompt), FrozenSource(dataset, limit), **options)
 
 
 def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:
