@@ -267,7 +267,11 @@ def _begun(work: Path) -> dict[str, Any]:
 def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Refuse to go on with other settings, naming those that differ."""
     now = msgspec.json.decode(canonical_json(settings))
-    other = [key for key, value in now.items() if _unplaced(stored.get(key)) != _unplaced(value)]
+    other = _differing(now, stored)
+    if "world" in other:
+        # It may lie in another folder now.
+        inside = [key for key in _differing(now["world"], stored["world"]) if key != "path"]
+        other = [key for key in other if key != "world"] + [f"{key} of the world" for key in inside]
     if other:
         raise UserError(
             f"--resume: {printable(out)} was begun with another {', '.join(other)}; "
@@ -275,9 +279,8 @@ def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
         )
 
 
-def _unplaced(value: Any) -> Any:
-    """Without the folder that a dataset lies in."""
-    return {k: v for k, v in value.items() if k != "path"} if isinstance(value, dict) else value
+def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
+    return [key for key, value in now.items() if stored.get(key) != value]
 
 
 @contextmanager
