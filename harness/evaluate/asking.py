@@ -122,6 +122,7 @@ class Asker:
         answers: Mapping[str, Answer] | None = None,
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
+        whole_chunks: bool = True,
     ) -> None:
         """An asker.
 
@@ -133,8 +134,10 @@ class Asker:
             answers: further answers that are there already, by request id.
             progress: called with the number of answers just there, those kept from before included.
             more: called with the number of fusion calls, once it is known how many there are.
+            whole_chunks: ask a chunk of fusion calls again whole where one of its answers is missing, as a
+                resumed run must; else ask only what is missing.
         """
-        self.spec, self._backend, self._kept = spec, backend, kept
+        self.spec, self._backend, self._kept, self._whole_chunks = spec, backend, kept, whole_chunks
         self._progress, self._more = progress, more
         self.latency = latency
         self.answers = {**(answers or {}), **(read_kept(kept) if kept else {})}
@@ -172,8 +175,9 @@ class Asker:
             of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
             senders = [scene.viewers[1 + h] for h in heard]
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
-        self._more(len(asked))
-        self.ask(asked)
+        owed = asked if self._whole_chunks else [r for r in asked if r.id not in self.answers]
+        self._more(len(owed))
+        self.ask(owed)
         answers = [self.answers[request.id] for request in asked]
         if asked and self._lacks_fusion_time(answers):
             self.latency = with_fusion(self.latency, self._backend(), asked)

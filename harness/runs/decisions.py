@@ -210,9 +210,13 @@ class Decisions:
         return self.replace(**{column: self[column].round(kept) for column, kept in decimals.items()})
 
     def write(self, path: Path) -> None:
-        """Replace a Parquet file."""
+        """Replace a Parquet file. Equal rows give equal bytes: names are numbered as rows first have them."""
+        columns = [
+            column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
+            for column in self.table.combine_chunks().columns
+        ]
         with replacing(path) as part:
-            pq.write_table(self.table, part, compression="zstd")
+            pq.write_table(pa.table(columns, schema=self.table.schema), part, compression="zstd")
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
