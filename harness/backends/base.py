@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
+from harness.world.scenario import Scenario
+
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
 FinishReason = Literal["stop", "length", "error"]
@@ -31,6 +33,7 @@ class Request:
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
+        scenario: what the view is of; read by whoever reads the view.
     """
 
     id: str
@@ -44,6 +47,7 @@ class Request:
     sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
+    scenario: Scenario | None = None
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ NOT_IN_KEY = {
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
     "view": "no language model reads it",
     "truth": "no language model reads it",
+    "scenario": "no language model reads it; its actions are a field of their own",
 }
 # The program's own part in an answer: how it is asked for and put into text.
 _CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")

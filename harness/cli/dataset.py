@@ -30,11 +30,11 @@ def build(
     from harness.cli.progress import bar
     from harness.cli.scenario import ready_to_drive
 
-    ready_to_drive(name, episodes, seed, workers)
+    scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.dataset.build import build as build_dataset
 
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(out, episodes, seed, workers, progress)
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} episodes, {manifest['decisions']} decision points"
     )

@@ -30,7 +30,7 @@ def command(
 
     if finish_reason not in _FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, _FINISH_REASONS)
-    actions = scenarios.get(scenario).ACTIONS
+    actions = scenarios.get(scenario).actions
     text = _read(file)
     parsed = parse(text, role=role, actions=actions, thinking=thinking, finish_reason=finish_reason)
     typer.echo(_json(parsed, actions) if as_json else _table(parsed, actions))

@@ -53,7 +53,7 @@ def show(
     if viewer is not None and viewer not in found.viewers:
         raise unknown("viewer", viewer, found.viewers)
     sent = {
-        v: prompt.render(found.record["graphs"][v], data.actions)
+        v: prompt.render(found.record["graphs"][v], data.actions, words=data.scenario.words)
         for v in found.viewers
         if viewer in (None, v)
     }
@@ -85,7 +85,7 @@ def check(
     outside: list[dict[str, Any]] = []
     for scene in data.scenes:
         for v, graph in scene.record["graphs"].items():
-            messages = prompt.render(graph, data.actions)
+            messages = prompt.render(graph, data.actions, words=data.scenario.words)
             if count:
                 n = count(messages)
                 sizes[graph["role"]].append(n)

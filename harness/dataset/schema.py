@@ -5,9 +5,9 @@ from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
-from harness.world.road import APPROACHES, ROUTES, SECTORS
-from harness.world.scenarios.occluded_intersection import Parameters
-from harness.world.state import SIZES_M
+from harness.world.road import Road
+from harness.world.scenario import Scenario
+from harness.world.state import SIZES_M, indicator
 
 Schema = dict[str, Any]
 
@@ -39,46 +39,11 @@ def _enum(*values: Any) -> Schema:
     return {"enum": list(values)}
 
 
-_VEHICLE = _object(
-    id=VEHICLE_ID, kind=_enum(*SIZES_M), part=_enum("ego", "helper", "other"), x_m=NUMBER, y_m=NUMBER,
-    heading_rad=NUMBER, speed_mps=NUMBER, approach=_enum(*APPROACHES), route=_enum(*ROUTES),
-    crashed={"type": "boolean"},
-)  # fmt: skip
 _BUILDING = _object(
     id={"type": "string", "pattern": "^b[1-9]$"}, west_m=NUMBER, north_m=NUMBER, east_m=NUMBER, south_m=NUMBER
 )
 _POINT = _object(forward_m=NUMBER, left_m=NUMBER)
 _ARRIVAL = {"arc_m": NUMBER, "time_s": NUMBER_OR_NULL}
-_GRAPH = _object(
-    viewer=VEHICLE_ID,
-    role=_enum("ego", "helper"),
-    step=COUNT,
-    self=_object(speed_mps=NUMBER, lane={"type": "string"}, zone_m=NUMBER),
-    ego=_object(
-        id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER,
-        left_m=NUMBER,
-    ),
-    nodes=_list(
-        _object(
-            id=VEHICLE_ID, type=_enum("vehicle", *SIZES_M), forward_m=NUMBER, left_m=NUMBER,
-            heading_deg=NUMBER_OR_NULL, speed_mps=NUMBER, range_rate_mps=NUMBER_OR_NULL,
-            lane={"type": "string"}, indicator=_enum("left", "off", None),
-            sensors=_list(_enum("camera", "lidar", "radar")),
-        )
-    ),
-    conflicts=_list(
-        _object(**{
-            "with": VEHICLE_ID, "sector": _enum(*SECTORS), "route": _enum(*ROUTES), "point": _POINT,
-            "ego": _object(**_ARRIVAL), "other": _object(**_ARRIVAL, speed_mps=NUMBER),
-        })
-    ),
-    sectors=_list(
-        _object(
-            sector=_enum(*SECTORS), seen_share=NUMBER, occluded={"type": "boolean"},
-            by=_list({"type": "string"}),
-        )
-    ),
-)  # fmt: skip
 _OUTCOME = _object(
     result=_enum("cleared", "collision", "time_out", "off_road"),
     time_s=NUMBER,
@@ -90,8 +55,60 @@ _OUTCOME = _object(
 )
 
 
-def record_schema(actions: tuple[str, ...]) -> Schema:
+def _vehicle(road: Road) -> Schema:
+    return _object(
+        id=VEHICLE_ID, kind=_enum(*SIZES_M), part=_enum("ego", "helper", "other"), x_m=NUMBER, y_m=NUMBER,
+        heading_rad=NUMBER, speed_mps=NUMBER, approach=_enum(*_approaches(road)), route=_enum(*_routes(road)),
+        crashed={"type": "boolean"},
+    )  # fmt: skip
+
+
+def _graph(road: Road) -> Schema:
+    signals = [route for route in _routes(road) if indicator(route) == route]
+    return _object(
+        viewer=VEHICLE_ID,
+        role=_enum("ego", "helper"),
+        step=COUNT,
+        self=_object(speed_mps=NUMBER, lane={"type": "string"}, zone_m=NUMBER),
+        ego=_object(
+            id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER,
+            left_m=NUMBER,
+        ),
+        nodes=_list(
+            _object(
+                id=VEHICLE_ID, type=_enum("vehicle", *SIZES_M), forward_m=NUMBER, left_m=NUMBER,
+                heading_deg=NUMBER_OR_NULL, speed_mps=NUMBER, range_rate_mps=NUMBER_OR_NULL,
+                lane={"type": "string"}, indicator=_enum(*signals, "off", None),
+                sensors=_list(_enum("camera", "lidar", "radar")),
+            )
+        ),
+        conflicts=_list(
+            _object(**{
+                "with": VEHICLE_ID, "sector": _enum(*road.sectors), "route": _enum(*_routes(road)),
+                "point": _POINT, "ego": _object(**_ARRIVAL), "other": _object(**_ARRIVAL, speed_mps=NUMBER),
+            })
+        ),
+        sectors=_list(
+            _object(
+                sector=_enum(*road.sectors), seen_share=NUMBER, occluded={"type": "boolean"},
+                by=_list({"type": "string"}),
+            )
+        ),
+    )  # fmt: skip
+
+
+def _approaches(road: Road) -> list[str]:
+    return list(dict.fromkeys(approach for approach, _ in road.paths))
+
+
+def _routes(road: Road) -> list[str]:
+    return list(dict.fromkeys(route for _, route in road.paths))
+
+
+def record_schema(scenario: Scenario) -> Schema:
     """Schema of one line of `scenes.jsonl`."""
+    road, actions = scenario.road(), scenario.actions
+    most_sections = max(len(path.lanes) for path in road.paths.values())
     by_viewer = {"type": "object", "propertyNames": VEHICLE_ID}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -101,32 +118,36 @@ def record_schema(actions: tuple[str, ...]) -> Schema:
             episode=EPISODE,
             episode_seed=SEED,
             step=COUNT,
-            road=_object(
-                kind={"type": "string"}, lane_width_m=NUMBER, junction_m=NUMBER, ego={"type": "string"}
+            road=_object(**{k: _text_or_number(v) for k, v in road.facts.items()}),
+            danger=_object(
+                sector=_enum(*road.sectors, None), vehicle={"anyOf": [VEHICLE_ID, {"type": "null"}]}
             ),
-            danger=_object(sector=_enum(*SECTORS, None), vehicle={"anyOf": [VEHICLE_ID, {"type": "null"}]}),
             behaviour=_object(
                 action=_enum(*actions), reason=_enum("cruise", "local-view", "full-view", "random", "guard")
             ),
             state=_object(
                 scenario={"type": "string"}, episode_seed=SEED, step=COUNT, time_s=NUMBER,
                 target_speed_mps=NUMBER,
-                vehicles={**_list(_VEHICLE), "minItems": 1}, buildings=_list(_BUILDING),
+                vehicles={**_list(_vehicle(road)), "minItems": 1}, buildings=_list(_BUILDING),
             ),
-            graphs={**by_viewer, "additionalProperties": _GRAPH},
+            graphs={**by_viewer, "additionalProperties": _graph(road)},
             distance_m={**by_viewer, "additionalProperties": NUMBER},
             outcomes=_object(**dict.fromkeys(actions, _OUTCOME)),
             snapshot=_object(
                 frame=COUNT,
-                sections=_list({"type": "integer", "minimum": 0, "maximum": 2}),
-                speed_index={**COUNT, "maximum": len(Parameters().target_speeds_mps) - 1},
+                sections=_list({"type": "integer", "minimum": 0, "maximum": most_sections - 1}),
+                speed_index={**COUNT, "maximum": len(scenario.parameters.target_speeds_mps) - 1},
             ),
         ),
     }  # fmt: skip
 
 
-def manifest_schema() -> Schema:
-    """Schema of `manifest.json`."""
+def _text_or_number(value: str | float) -> Schema:
+    return {"type": "string"} if isinstance(value, str) else NUMBER
+
+
+def manifest_schema(scenario: Scenario) -> Schema:
+    """Schema of the `manifest.json` of a scenario's dataset."""
     text = {"type": "string", "maxLength": 200}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -139,7 +160,7 @@ def manifest_schema() -> Schema:
             parameters=_object(
                 **{
                     name: _list(NUMBER) if isinstance(value, tuple) else NUMBER
-                    for name, value in asdict(Parameters()).items()
+                    for name, value in asdict(scenario.parameters).items()
                 }
             ),
             behaviour={"type": "object", "additionalProperties": NUMBER},
@@ -157,34 +178,34 @@ def manifest_schema() -> Schema:
     }
 
 
-def manifest_validator() -> Any:
+def manifest_validator(scenario: Scenario) -> Any:
     """Validator of a manifest, which says what is wrong."""
     from jsonschema import Draft202012Validator
 
-    return Draft202012Validator(manifest_schema())
+    return Draft202012Validator(manifest_schema(scenario))
 
 
 @lru_cache(maxsize=8)
-def record_validator(actions: tuple[str, ...]) -> Any:
+def record_validator(scenario: Scenario) -> Any:
     """Compiled validator of one record; 1.0 is no integer to it."""
     from jsonschema import Draft202012Validator
     from jsonschema.validators import extend
 
     whole = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
     strict: Any = extend(Draft202012Validator, type_checker=whole)  # type: ignore[no-untyped-call]
-    return strict(record_schema(actions))
+    return strict(record_schema(scenario))
 
 
 @lru_cache(maxsize=8)
-def fits_record(actions: tuple[str, ...]) -> Callable[[Any], bool]:
+def fits_record(scenario: Scenario) -> Callable[[Any], bool]:
     """A quick yes to valid records; 1.0 is no integer to it either."""
-    valid = _quick_yes(record_schema(actions))
+    valid = _quick_yes(record_schema(scenario))
     return lambda record: valid(record) and all(type(n) is int for n in _integers(record))
 
 
-def fits_manifest(manifest: Any) -> bool:
+def fits_manifest(scenario: Scenario, manifest: Any) -> bool:
     """A quick yes to a valid manifest."""
-    return _quick_yes(manifest_schema())(manifest)
+    return _quick_yes(manifest_schema(scenario))(manifest)
 
 
 def _integers(record: dict[str, Any]) -> Iterator[Any]:

@@ -8,11 +8,12 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_bytes, sha256_file
 from harness.dataset.schema import fits_manifest, fits_record, manifest_validator, record_validator
-from harness.world.road import crossings
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
-    """The manifest, valid by its schema, and its digest."""
+    """The manifest, valid by the schema of its scenario, and its digest."""
     file = path / "manifest.json"
     try:
         data = file.read_bytes()
@@ -25,12 +26,23 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], str]:
         raise UserError(
             f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
         ) from None
-    for broken in () if fits_manifest(manifest) else manifest_validator().iter_errors(manifest):
+    scenario = _scenario(file, manifest)
+    valid = fits_manifest(scenario, manifest)
+    for broken in () if valid else manifest_validator(scenario).iter_errors(manifest):
         raise UserError(
             f"{printable(file)} at {printable(broken.json_path)}: {printable(broken.message)}; "
             "build the dataset again"
         )
     return manifest, sha256_bytes(data)
+
+
+def _scenario(file: Path, manifest: Any) -> Scenario:
+    """The scenario that a manifest names; some other where it names none, which its schema then refuses."""
+    name = manifest.get("scenario") if isinstance(manifest, dict) else None
+    try:
+        return scenarios.get(name if isinstance(name, str) else scenarios.DEFAULT)
+    except UserError as error:
+        raise UserError(f"{printable(file)}: {error}") from None
 
 
 def check(path: Path) -> list[str]:
@@ -61,8 +73,8 @@ def file_problems(path: Path, manifest: dict[str, Any]) -> Iterator[str]:
 
 def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[str]]]:
     """Each line's record, and what is wrong with it; a record is good for use only if nothing is."""
-    actions = tuple(manifest["actions"])
-    fits = fits_record(actions)
+    scenario = scenarios.get(manifest["scenario"])
+    fits = fits_record(scenario)
     before: tuple[int, int] | None = (-1, 0)  # episode and step; None after a line that cannot be read
     with file.open("rb") as lines:
         for number, text in enumerate(lines, 1):
@@ -76,11 +88,11 @@ def records(file: Path, manifest: dict[str, Any]) -> Iterator[tuple[dict[str, An
             except (ValueError, RecursionError) as error:
                 yield {}, [f"{where}: no JSON ({printable(error)})"]
                 continue
-            wrong = () if fits(record) else record_validator(actions).iter_errors(record)
+            wrong = () if fits(record) else record_validator(scenario).iter_errors(record)
             broken = sorted(wrong, key=lambda e: e.json_path)
             problems = [f"{where} at {printable(e.json_path)}: {printable(e.message)}" for e in broken[:3]]
             if not broken:
-                problems = [f"{where}: {what}" for what in _contradictions(record)]
+                problems = [f"{where}: {what}" for what in _contradictions(scenario, record)]
                 before = (record["episode"], record["step"])
                 if last and before not in ((last[0], last[1] + 1), (last[0] + 1, 0)):
                     problems.append(f"{where}: scene {record['scene']} does not follow the line before")
@@ -103,7 +115,7 @@ def _parsed(text: bytes) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
-def _contradictions(record: dict[str, Any]) -> list[str]:
+def _contradictions(scenario: Scenario, record: dict[str, Any]) -> list[str]:
     """Where one part of a record speaks against another, which no schema can state."""
     state, graphs = record["state"], record["graphs"]
     ids = [v["id"] for v in state["vehicles"]]
@@ -123,7 +135,7 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
         "a conflict is on a path that does not cross the ego's": {
             (c["sector"], c["route"]) for c in conflicts
         }
-        <= crossings().keys(),
+        <= scenario.road().crossings.keys(),
         "a graph names a vehicle that is not there": nodes | {c["with"] for c in conflicts} <= set(ids),
         "the dangerous vehicle is not there": record["danger"]["vehicle"] in (None, *ids),
         "sections are not one a vehicle": len(record["snapshot"]["sections"]) == len(ids),

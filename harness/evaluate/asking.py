@@ -33,8 +33,9 @@ def most_tokens(spec: Spec, role: Role) -> int:
 
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
+    scenario = spec.dataset.scenario
     for scene in scenes:
-        truth = truth_graph(scene.state) if spec.card.privileged else None
+        truth = truth_graph(scenario, scene.state) if spec.card.privileged else None
         for viewer in scene.viewers if spec.card.engine != "driver" else scene.viewers[:1]:
             graph = scene.record["graphs"][viewer]
             role: Role = graph["role"]
@@ -49,11 +50,12 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 thinking=spec.thinking,
                 view=graph,
                 truth=truth,
+                scenario=scenario,
             )
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.dataset.actions)
+    rendered = spec.prompt.render(graph, spec.dataset.actions, words=spec.dataset.scenario.words)
     return readout.asked(rendered, spec.dataset.actions) if spec.answer == "readout" else rendered
 
 

@@ -31,11 +31,12 @@ from harness.evaluate.merging import Merged
 from harness.evaluate.timing import inference_s, merge_s
 from harness.runs import driven_record as record
 from harness.world import reference as live
+from harness.world import scenarios
 from harness.world.drivers import PRIVILEGED
-from harness.world.scenarios.occluded_intersection import Parameters
 from harness.world.world import World
 
-P = Parameters()
+SCENARIO = scenarios.get(scenarios.DEFAULT)
+P = SCENARIO.parameters
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
@@ -70,7 +71,7 @@ def drive(
 def start(spec: Drive, number: int) -> Trajectory:
     """The first moment of an episode, which all of its conditions and seeds share."""
     episodes = [Episode(point, seed) for point in spec.points for seed in spec.seeds]
-    return Trajectory(number, World.start(spec.first_seed + number), episodes)
+    return Trajectory(number, World.start(spec.dataset.scenario, spec.first_seed + number), episodes)
 
 
 def frames(latency_s: float) -> int:
@@ -189,7 +190,7 @@ def _luck(seed: int, layout_seed: int, helpers: int) -> Any:
 def _ended(spec: Drive, arrived: Sequence[Trajectory]) -> list[record.Row]:
     """A row an episode, held against a full-view driver that thinks in no time."""
     references = {
-        number: live.drive(PRIVILEGED, spec.first_seed + number)
+        number: live.drive(spec.dataset.scenario, PRIVILEGED, spec.first_seed + number)
         for number in sorted({one.number for one in arrived if one.world.outcome.success})
     }
     rows = [

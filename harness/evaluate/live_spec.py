@@ -11,7 +11,7 @@ from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset
 from harness.evaluate.spec import Spec, model_argument
 from harness.prompts.versions import Prompt
-from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
+from harness.world import scenarios
 
 FORMAT = "swarmdrive-drive/1"
 
@@ -41,7 +41,10 @@ class Drive(Spec):
         of_frozen = super().settings()
         return {
             **{k: v for k, v in of_frozen.items() if k not in ("dataset", "limit")},
-            "scenario": {"name": NAME, "parameters": asdict(Parameters())},
+            "scenario": {
+                "name": self.dataset.scenario.name,
+                "parameters": asdict(self.dataset.scenario.parameters),
+            },
             "first_seed": self.first_seed,
             "episodes": self.episodes,
         }
@@ -64,5 +67,7 @@ def spec_of(
     card: Card, prompt: Prompt, points: tuple[OperatingPoint, ...], seeds: tuple[int, ...], **options: Any
 ) -> Drive:
     """A live run. It has the scenario's name and actions in the place of a dataset, and no frozen scenes."""
-    live = Dataset(Path(NAME), {"name": NAME, "actions": list(ACTIONS)}, "", ())
+    scenario = scenarios.get(scenarios.DEFAULT)
+    named = {"name": scenario.name, "scenario": scenario.name, "actions": list(scenario.actions)}
+    live = Dataset(Path(scenario.name), named, "", ())
     return Drive(card, prompt, live, points, seeds, **options)

@@ -93,7 +93,7 @@ def requests(spec: Spec, known: Intents, codes: Ints) -> Iterator[Request]:
         yield Request(
             id=request_id(scene, places),
             role="ego",
-            messages=spec.prompt.render(graph, spec.dataset.actions, sent),
+            messages=spec.prompt.render(graph, spec.dataset.actions, sent, spec.dataset.scenario.words),
             actions=spec.dataset.actions,
             max_tokens=most_tokens(spec, "ego"),
             form=spec.prompt.helper_answer,

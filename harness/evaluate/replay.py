@@ -8,7 +8,7 @@ from typing import Any
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Trajectory
-from harness.evaluate.live import P, look
+from harness.evaluate.live import SCENARIO, P, look
 from harness.runs.driven_folder import read
 from harness.runs.folder import Row, Run
 from harness.world.state import WorldState
@@ -101,7 +101,7 @@ def scene_of(run: Run, row: Row) -> Scene:
     mine, hz = row["decisions"][0], P.simulation_hz
     episode = played(run, row["episode"], mine["condition"], mine["seed"])
     begins = round(row["step"] * P.decision_period_s * hz)
-    world = World.start(run.config["first_seed"] + row["episode"])
+    world = World.start(SCENARIO, run.config["first_seed"] + row["episode"])
     for frame, action in _acts(episode).items():
         if frame <= begins:
             world.advance(frame)
@@ -118,7 +118,7 @@ def _acts(played: Played) -> dict[int, str]:
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """The episode, ten stills a second, and one a frame while a decision is open."""
     hz = P.simulation_hz
-    world = World.start(played.config["first_seed"] + played.episode)
+    world = World.start(SCENARIO, played.config["first_seed"] + played.episode)
     begins = [round(row["step"] * P.decision_period_s * hz) for row in played.moments]
     acts = _acts(played)
     place, seen = 0, world.state()

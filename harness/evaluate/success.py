@@ -110,10 +110,10 @@ def judge_choices(laid: Table, chosen: Ints) -> Verdict:
 
 def driver_choices(dataset: Dataset, driver: str) -> Ints:
     """Index of a reference driver's action in every scene, (n,)."""
-    actions = dataset.actions
+    actions, scenario = dataset.actions, dataset.scenario
     chosen = []
     for scene in dataset.scenes:
         graph = scene.record["graphs"][scene.state.ego.id]
-        truth = truth_graph(scene.state) if driver == PRIVILEGED else None
-        chosen.append(actions.index(choose(driver, graph, truth, actions)))
+        truth = truth_graph(scenario, scene.state) if driver == PRIVILEGED else None
+        chosen.append(actions.index(choose(scenario, driver, graph, truth)))
     return np.array(chosen)

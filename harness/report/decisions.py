@@ -14,6 +14,7 @@ from harness.report.choose import failures, pick
 from harness.report.runs import Runs
 from harness.runs.driven_folder import Driven
 from harness.runs.folder import Row, Run, answers_of
+from harness.world import scenarios
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
@@ -39,7 +40,8 @@ def prompts_of(run: Run) -> Sent | None:
         return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
+        words = scenarios.get(scene.state.scenario).words
+        messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
         return readout.asked(messages, actions) if run.answer == "readout" else messages
 
     return sent

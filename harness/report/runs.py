@@ -10,6 +10,8 @@ from harness.core.errors import UserError, printable
 from harness.dataset.load import Dataset
 from harness.runs.driven_folder import LIVE, Driven, driven
 from harness.runs.folder import FROZEN, Run, answers_of, dataset_of, read
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 
 # What a page reads of each decision, of each of its messages, and of each answer.
 DECISION = ("entropy_nats", "triggered", "own_weight", "own_failed", "latency_ms", "deadline_missed")
@@ -40,6 +42,13 @@ class Runs:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the order of every distribution."""
         return tuple(self.runs[0].config["actions"])
+
+    @property
+    def scenario(self) -> Scenario:
+        """What they decided in."""
+        if self.dataset is not None:
+            return self.dataset.scenario
+        return scenarios.get(self.runs[0].config["scenario"]["name"])
 
     @property
     def conditions(self) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ from harness.evaluate.live_spec import Drive
 from harness.evaluate.merging import Merged
 from harness.runs.record import by_scene, by_viewer, number
 from harness.world.outcome import Outcome
-from harness.world.scenarios.occluded_intersection import Parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +86,7 @@ def decisions(
 def ended(one: Trajectory, episode: Episode, reference: Outcome | None) -> Row:
     """What became of an episode; it is `late` if it cleared too long after the `reference`."""
     found = one.world.outcome
-    outcome = found.judged(reference, Parameters()) if reference else found
+    outcome = found.judged(reference, one.world.scenario.parameters) if reference else found
     delay_s = None
     if reference and reference.time_s is not None and reference.success and found.success:
         delay_s = round((found.time_s or 0.0) - reference.time_s, 3)
@@ -95,7 +94,7 @@ def ended(one: Trajectory, episode: Episode, reference: Outcome | None) -> Row:
     return {
         "episode": one.number,
         "layout_seed": one.world.seed,
-        "danger": one.world.env.layout.danger or "none",
+        "danger": one.world.layout.danger or "none",
         "condition": episode.point.name,
         "seed": episode.seed,
         "result": outcome.result,

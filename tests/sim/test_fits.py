@@ -26,7 +26,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def test_it_says_yes_to_every_frozen_record(small: Dataset):
-    assert all(map(fits_record(small.actions), (scene.record for scene in small.scenes)))
+    assert all(map(fits_record(small.scenario), (scene.record for scene in small.scenes)))
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -44,5 +44,5 @@ def test_where_it_says_yes_to_a_changed_record_so_does_json_schema(small: Datase
         holder["unknown"] = data.draw(ANY_JSON)
     else:
         holder[last] = data.draw(ANY_JSON)
-    if fits_record(small.actions)(record):
-        assert record_validator(small.actions).is_valid(record)
+    if fits_record(small.scenario)(record):
+        assert record_validator(small.scenario).is_valid(record)

@@ -20,10 +20,10 @@ from harness.dataset.load import Scene
 from harness.report.drawing.ground import ground, north_up
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import BLUE, GREY, INK, PURPLE, VERMILLION, Format, save, styled
-from harness.world.road import LANE_WIDTH_M
+from harness.world import scenarios
 from harness.world.state import VehicleState
 
-VIEW_M = 80.0  # from the centre of the junction to the edge of the picture
+VIEW_M = 80.0  # from the origin to the edge of the picture
 SIDE_IN = 5.8  # of the square that shows it
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 TEXT_PT = 6.5
@@ -61,9 +61,10 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     axes = figure.add_axes((0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height))
     axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[])
     labels = Labels(axes, PT_PER_M, TEXT_PT, VIEW_M)
-    for road in ([LANE_WIDTH_M, VIEW_M], [VIEW_M, LANE_WIDTH_M]):
-        labels.discourage(np.array([road, road]) * [[-1.0], [1.0]])
-    ground(axes, scene.state.buildings, VIEW_M, TEXT_PT)
+    scenario = scenarios.get(scene.state.scenario)
+    for box in scenario.road().ground(VIEW_M).boxes:
+        labels.discourage(box)
+    ground(axes, scenario, scene.state.buildings, VIEW_M, TEXT_PT)
     _sight_lines(axes, scene, viewer, seen)
     for vehicle in scene.state.vehicles:
         _vehicle(axes, labels, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)

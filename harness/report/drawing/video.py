@@ -17,6 +17,7 @@ from harness.core.files import replacing, write_whole
 from harness.evaluate.replay import Played, stills
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas, Pixels
+from harness.world import scenarios
 from harness.world.perception.graph import scene_graph
 from harness.world.state import WorldState
 
@@ -87,12 +88,13 @@ def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixel
     canvas: Canvas | None = None
     moment: WorldState | None = None
     seen: dict[str, list[str]] = {}
+    scenario = scenarios.get(played.config["scenario"]["name"])
     for still in stills(played, progress):
-        canvas = canvas or Canvas(played, still.state.buildings)
+        canvas = canvas or Canvas(played, scenario, still.state.buildings)
         if still.seen != moment:
             moment = still.seen
             seen = {
-                v.id: [node["id"] for node in scene_graph(moment, v.id)["nodes"]]
+                v.id: [node["id"] for node in scene_graph(scenario, moment, v.id)["nodes"]]
                 for v in (moment.ego, *moment.helpers)
             }
         yield canvas.picture(still, seen)
