@@ -5,9 +5,10 @@ A backend batches, threads or loops inside as suits its engine; nothing else in 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
-from harness.world.scenario import Scenario
+if TYPE_CHECKING:
+    from harness.world.scenario import Scenario
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -47,7 +48,7 @@ class Request:
     sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
-    scenario: Scenario | None = None
+    scenario: "Scenario | None" = None
 
 
 @dataclass(frozen=True)

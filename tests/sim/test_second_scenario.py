@@ -19,7 +19,6 @@ from harness.world.drivers import DRIVERS
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.planner import plan
 from harness.world.reference import drive_all
-from harness.world.state import WorldState
 from harness.world.world import World
 
 MEETING, FREE = 1, 2  # seeds
@@ -82,18 +81,6 @@ def test_both_vehicles_see_its_danger_in_its_sector():
         assert [n["lane"] for n in graph["nodes"] if n["id"] == "v3"] == ["street-west"]
     world.act("IDLE")
     assert plan(SCENARIO, truth_graph(SCENARIO, world.state())) == "SLOWER"
-
-
-@pytest.mark.parametrize("action", SCENARIO.actions)
-def test_a_thawed_world_of_it_goes_on_as_the_one_it_was_taken_from(action):
-    world = World.start(SCENARIO, MEETING)
-    world.act("SLOWER")
-    state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
-    thawed = World.thaw(SCENARIO, WorldState.from_dict(state), snapshot)
-    for then in (action, "IDLE"):
-        world.act(then)
-        thawed.act(then)
-        assert thawed.state() == world.state()
 
 
 def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
