@@ -31,6 +31,7 @@ from harness.dataset import freeze
 from harness.prompts import versions as prompts
 from harness.world import reference as live
 from harness.world import simulator
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 LATENCY = {"source": "card", "inference_s": {"ego": 0.145, "helper": 0.145}, "basis": "the proxy's card"}
@@ -85,12 +86,12 @@ def main() -> None:
 
 def frame_us(plain: bool = False) -> float:
     """CPU time of a frame, over ten seconds of four layouts with a braking ego."""
-    worlds = [World.start(seed) for seed in (0, 1, 6, 10)]
+    worlds = [World.start(SCENARIO, seed) for seed in (0, 1, 6, 10)]
     with highway_envs_own() if plain else ExitStack():
         start = process_time()
         for world in worlds:
             world.take("SLOWER")
-            world.advance(world.env.parameters.simulation_hz * 10)
+            world.advance(SCENARIO.parameters.simulation_hz * 10)
         return (process_time() - start) * 1e6 / sum(world.frame for world in worlds)
 
 
@@ -129,9 +130,7 @@ def shares(spec: Drive) -> tuple[dict[str, float], int, int]:
         start = perf_counter()
         _, episodes = drive(spec, Proxy(), LATENCY, range(spec.episodes))
         total = perf_counter() - start
-    lived = round(
-        sum(e["time_s"] for e in episodes) * simulator.OccludedIntersectionEnv.parameters.simulation_hz
-    )
+    lived = round(sum(e["time_s"] for e in episodes) * SCENARIO.parameters.simulation_hz)
     return {**spent, "own": total - sum(spent.values())}, calls["highway-env"], lived
 
 

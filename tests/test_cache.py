@@ -26,6 +26,7 @@ from harness.core.files import digest
 from harness.dataset.load import Dataset, load
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)
@@ -42,6 +43,7 @@ CHANGED: dict[str, Any] = {
     "sample": 1,
     "view": {"nodes": []},
     "truth": {"nodes": []},
+    "scenario": SCENARIO,
 }
 
 

@@ -9,8 +9,10 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
+from harness.evaluate.replay import scenario_of
 from harness.runs.folder import Run, dataset_of, read
 from harness.runs.records import FrozenScenes
+from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,13 @@ class Runs:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the order of every distribution."""
         return self.runs[0].actions
+
+    @property
+    def scenario(self) -> Scenario:
+        """What they decided in."""
+        if self.dataset is not None:
+            return self.dataset.scenario
+        return scenario_of(self.runs[0].manifest)
 
     @property
     def conditions(self) -> tuple[str, ...]:
