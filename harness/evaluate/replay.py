@@ -45,7 +45,8 @@ class Played:
     @cached_property
     def scenario(self) -> Scenario:
         """What was driven."""
-        return scenario_of(self.manifest)
+        assert isinstance(self.manifest.world, ClosedLoop)
+        return scenarios.get(self.manifest.world.scenario["name"])
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,6 @@ class Still:
     since_s: float
     open: bool
     outcome: str
-
-
-def scenario_of(manifest: Manifest) -> Scenario:
-    """The scenario that a live run drove, by its name."""
-    assert isinstance(manifest.world, ClosedLoop)
-    return scenarios.get(manifest.world.scenario["name"])
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:

@@ -9,9 +9,9 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
-from harness.evaluate.replay import scenario_of
 from harness.runs.folder import Run, dataset_of, read
-from harness.runs.records import FrozenScenes
+from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.world import scenarios
 from harness.world.scenario import Scenario
 
 
@@ -44,7 +44,9 @@ class Runs:
         """What they decided in."""
         if self.dataset is not None:
             return self.dataset.scenario
-        return scenario_of(self.runs[0].manifest)
+        world = self.runs[0].manifest.world
+        assert isinstance(world, ClosedLoop)
+        return scenarios.get(world.scenario["name"])
 
     @property
     def conditions(self) -> tuple[str, ...]:
