@@ -10,7 +10,6 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
-from harness.evaluate.replay import scene_of
 from harness.parsing.parse import spans
 from harness.parsing.status import Status
 from harness.prompts import readout, versions
@@ -98,6 +97,8 @@ class Decisions:
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
+        from harness.evaluate.replay import scene_of  # loads the simulator
+
         telling = [
             scene
             for run, of in zip(self._runs.runs, failed, strict=True)
