@@ -34,6 +34,7 @@ from harness.prompts import versions as prompts
 from harness.runs.records import Episode, Latency
 from harness.world import reference as live
 from harness.world import simulator
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145)
@@ -88,12 +89,12 @@ def main() -> None:
 
 def frame_us(plain: bool = False) -> float:
     """CPU time of a frame, over ten seconds of four layouts with a braking ego."""
-    worlds = [World.start(seed) for seed in (0, 1, 6, 10)]
+    worlds = [World.start(SCENARIO, seed) for seed in (0, 1, 6, 10)]
     with highway_envs_own() if plain else ExitStack():
         start = process_time()
         for world in worlds:
             world.take("SLOWER")
-            world.advance(world.env.parameters.simulation_hz * 10)
+            world.advance(SCENARIO.parameters.simulation_hz * 10)
         return (process_time() - start) * 1e6 / sum(world.frame for world in worlds)
 
 
@@ -142,7 +143,7 @@ def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
         episodes = drive(spec, numbers)
         total = perf_counter() - start
     lived_s = sum(episode.time_s or 0.0 for episode in episodes)
-    lived = round(lived_s * simulator.OccludedIntersectionEnv.parameters.simulation_hz)
+    lived = round(lived_s * SCENARIO.parameters.simulation_hz)
     return {**spent, "own": total - sum(spent.values())}, calls["highway-env"], lived
 
 

@@ -158,7 +158,7 @@ def _driven(
         asker = Asker(
             spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
         )
-        world = LiveWorld(first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+        world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
         folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
     return part

@@ -20,6 +20,7 @@ from harness.evaluate.walk import walk
 from harness.runs.decisions import Decisions
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.4, 0.3)
@@ -52,7 +53,7 @@ def test_an_episode_played_by_hand():
     assert mine[2].scene != its[2].scene
     assert len(script.asked) == len(set(script.asked)) == 4 * made.moments
 
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     for frame, action in ((56, "SLOWER"), (105, "FASTER"), (155, "FASTER")):
         world.advance(frame)
         world.take(action)
@@ -60,7 +61,7 @@ def test_an_episode_played_by_hand():
     assert (helped.success, helped.failure, helped.time_s) == (True, "", world.outcome.time_s)
     assert (helped.hard_brakings, alone.hard_brakings) == (1, 0)
     assert alone.success
-    assert alone.time_s == live.drive("cruise", NO_DANGER).time_s < helped.time_s
+    assert alone.time_s == live.drive(SCENARIO, "cruise", NO_DANGER).time_s < helped.time_s
 
 
 def test_braking_three_frames_later_is_42_centimetres_further():
@@ -69,15 +70,15 @@ def test_braking_three_frames_later_is_42_centimetres_further():
     south_m = []
     for latency_s in (0.145, 0.219):
         course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s)))
-        [one] = Trajectory(0, World.start(NO_DANGER), [course]).advance(250)
+        [one] = Trajectory(0, World.start(SCENARIO, NO_DANGER), [course]).advance(250)
         assert one.world.state().ego.speed_mps == pytest.approx(7.0, abs=0.02)
         south_m.append(one.world.state().ego.y_m)
     assert south_m[0] - south_m[1] == pytest.approx(0.42, abs=1e-3)
 
 
 def test_a_decision_acts_in_its_frame_and_not_before():
-    still, braking = World.start(NO_DANGER), Trajectory(
-        0, World.start(NO_DANGER), [Course(ALONE, 0, Decision("SLOWER", 8))]
+    still, braking = World.start(SCENARIO, NO_DANGER), Trajectory(
+        0, World.start(SCENARIO, NO_DANGER), [Course(ALONE, 0, Decision("SLOWER", 8))]
     )  # fmt: skip
     still.advance(8)
     braking.advance(8)
@@ -96,7 +97,7 @@ def test_a_decision_still_open_when_the_next_is_due_goes_on_and_the_next_is_skip
     assert acts_at_s == {0: 1.3, 2: 3.3, 4: 5.3}
     assert (episode.decisions, episode.skipped, episode.never_acted) == (3, 3, 0)
     assert episode.deadline_misses == 3  # 1.3 s outlast a window of 0.2 s
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     for frame in (65, 165, 265):
         world.advance(frame)
         world.take("SLOWER")
