@@ -66,10 +66,10 @@ def test_an_episode_played_by_hand():
 
 def test_braking_three_frames_later_is_42_centimetres_further():
     """145 ms are 8 frames and 219 ms are 11. From 14 to 7 m/s, 0.06 s later: 0.06 s x 7 m/s."""
-    assert (frames(0.145), frames(0.219), frames(0.14), frames(0.0)) == (8, 11, 7, 0)
+    assert (frames(0.145, 50), frames(0.219, 50), frames(0.14, 50), frames(0.0, 50)) == (8, 11, 7, 0)
     south_m = []
     for latency_s in (0.145, 0.219):
-        course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s)))
+        course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s, 50)))
         [one] = Trajectory(0, World.start(SCENARIO, NO_DANGER), [course]).advance(250)
         assert one.world.state().ego.speed_mps == pytest.approx(7.0, abs=0.02)
         south_m.append(one.world.state().ego.y_m)
