@@ -75,7 +75,7 @@ def driven(
     inference_s = of.card.latency.inference_s if infer_s is None else infer_s
     opened = backend or open_backend(of.card, batch_size=of.batch_size)
     asker = Asker(of, lambda: opened, Latency("card", "test", inference_s, inference_s, inference_s))
-    world = LiveWorld(of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
+    world = LiveWorld(of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
     decisions = table(
         list(chain.from_iterable(walk(world, of.points, asker))), world.columns(), of.actions
     ).rounded()
