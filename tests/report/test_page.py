@@ -260,7 +260,7 @@ def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset)
 
 def scored(run, tmp_path, *scores):
     """The run with another summary."""
-    found = [Score(*score, n=2, n_excluded=0, interval="episodes") for score in scores]
+    found = [Score(*score, 2, 0, "episodes") for score in scores]
     copy = copied(run, tmp_path)
     (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.of_run))
     return read(copy)
