@@ -41,7 +41,7 @@ def most_tokens(spec: Spec, role: Role) -> int:
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first."""
     for scene in scenes:
-        truth = truth_graph(scene.state) if spec.card.privileged else None
+        truth = truth_graph(spec.scenario, scene.state) if spec.card.privileged else None
         for viewer in spec.viewers(scene):
             graph = scene.record["graphs"][viewer]
             role: Role = graph["role"]
@@ -56,11 +56,12 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 thinking=spec.thinking,
                 view=graph,
                 truth=truth,
+                scenario=spec.scenario,
             )
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.actions)
+    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.words)
     return readout.asked(rendered, spec.actions) if spec.answer == "readout" else rendered
 
 
@@ -69,10 +70,11 @@ def fusion_request(
 ) -> Request:
     """What the ego's model is asked once these helpers' messages are there; `answers` by viewer."""
     ego = scene.viewers[0]
+    graph, heard = scene.record["graphs"][ego], messages_of(answers, senders)
     return Request(
         id=f"{scene.id}/{'+'.join((ego, *senders))}",
         role="ego",
-        messages=spec.prompt.render(scene.record["graphs"][ego], spec.actions, messages_of(answers, senders)),
+        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.words),
         actions=spec.actions,
         max_tokens=most_tokens(spec, "ego"),
         form=spec.prompt.helper_answer,
@@ -122,6 +124,7 @@ class Asker:
         answers: Mapping[str, Answer] | None = None,
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
+        whole_chunks: bool = True,
     ) -> None:
         """An asker.
 
@@ -133,8 +136,10 @@ class Asker:
             answers: further answers that are there already, by request id.
             progress: called with the number of answers just there, those kept from before included.
             more: called with the number of fusion calls, once it is known how many there are.
+            whole_chunks: ask a chunk of fusion calls again whole where one of its answers is missing, as a
+                resumed run must; else ask only what is missing.
         """
-        self.spec, self._backend, self._kept = spec, backend, kept
+        self.spec, self._backend, self._kept, self._whole_chunks = spec, backend, kept, whole_chunks
         self._progress, self._more = progress, more
         self.latency = latency
         self.answers = {**(answers or {}), **(read_kept(kept) if kept else {})}
@@ -172,8 +177,9 @@ class Asker:
             of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
             senders = [scene.viewers[1 + h] for h in heard]
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
-        self._more(len(asked))
-        self.ask(asked)
+        owed = asked if self._whole_chunks else [r for r in asked if r.id not in self.answers]
+        self._more(len(owed))
+        self.ask(owed)
         answers = [self.answers[request.id] for request in asked]
         if asked and self._lacks_fusion_time(answers):
             self.latency = with_fusion(self.latency, self._backend(), asked)

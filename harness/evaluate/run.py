@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
@@ -25,7 +25,6 @@ from harness.dataset.load import Scene
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, fusion_request, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
-from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec, versions
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
@@ -34,6 +33,9 @@ from harness.runs.formats import CONFIG, FORMAT, WORK
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Episode, Latency, Manifest, Score
 from harness.runs.summary import counted, scores
+
+if TYPE_CHECKING:  # the simulator is loaded by who drives
+    from harness.evaluate.live_world import LiveSource, LiveWorld
 
 EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
@@ -75,10 +77,10 @@ def evaluate(
     if resume and (out / "run.json").is_file():
         return finished(spec, out)
     refuse(spec, out, resume)
-    if isinstance(spec.source, LiveSource):
-        done = _closed_loop(spec, spec.source, out, progress, cache, workers)
+    if isinstance(spec.source, FrozenSource):
+        done = _frozen(spec, spec.source, out, progress, cache, more)
     else:
-        done = _frozen(spec, cast("FrozenSource", spec.source), out, progress, cache, more)
+        done = _closed_loop(spec, cast("LiveSource", spec.source), out, progress, cache, workers)
     tidy(out)
     return done
 
@@ -92,7 +94,7 @@ class Walked:
     answers: dict[str, Answer]
 
 
-def _walked(spec: Spec, world: FrozenWorld | LiveWorld, asker: Asker) -> Walked:
+def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
     return Walked(table(decided, world.columns(), spec.actions), world.episodes(), asker.answers)
 
@@ -121,7 +123,7 @@ def _frozen(
 
 
 def _closed_loop(
-    spec: Spec, source: LiveSource, out: Path, progress: Callable[[int], None], cache: Path | None,
+    spec: Spec, source: "LiveSource", out: Path, progress: Callable[[int], None], cache: Path | None,
     workers: int,
 ) -> Evaluated:  # fmt: skip
     # Compiled templates do not travel between processes.
@@ -149,12 +151,14 @@ def _driven(
     spec: Spec, first_seed: int, latency: Latency, work: Path, cache: Path | None, chunk: range
 ) -> Path:
     """Drive a chunk, unless that was done before."""
+    from harness.evaluate.live_world import LiveWorld
+
     part = work / f"episodes-{chunk.start:06d}"
     if not part.is_dir():
         asker = Asker(
             spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
         )
-        world = LiveWorld(first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+        world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
         folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
     return part
@@ -170,8 +174,7 @@ def _begin(spec: Spec) -> tuple[dict[str, Any], Latency]:
     latency = latencies.declared(spec, backend)
     if latency:
         return backend.identity(), latency
-    assert isinstance(spec.source, LiveSource)
-    scenes = spec.source.trial(latencies.SAMPLE, spec.ego_alone)
+    scenes = cast("LiveSource", spec.source).trial(latencies.SAMPLE, spec.ego_alone)
     trial = replace(spec, batch_size=2)
     latency = latencies.measured(trial, backend, list(requests(trial, scenes)))
     if latency.ego_s is None or latency.helper_s is None:
@@ -264,7 +267,11 @@ def _begun(work: Path) -> dict[str, Any]:
 def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Refuse to go on with other settings, naming those that differ."""
     now = msgspec.json.decode(canonical_json(settings))
-    other = [key for key, value in now.items() if _unplaced(stored.get(key)) != _unplaced(value)]
+    other = _differing(now, stored)
+    if "world" in other:
+        # It may lie in another folder now.
+        inside = [key for key in _differing(now["world"], stored["world"]) if key != "path"]
+        other = [key for key in other if key != "world"] + [f"{key} of the world" for key in inside]
     if other:
         raise UserError(
             f"--resume: {printable(out)} was begun with another {', '.join(other)}; "
@@ -272,9 +279,8 @@ def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
         )
 
 
-def _unplaced(value: Any) -> Any:
-    """Without the folder that a dataset lies in."""
-    return {k: v for k, v in value.items() if k != "path"} if isinstance(value, dict) else value
+def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
+    return [key for key, value in now.items() if stored.get(key) != value]
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from harness.report.choose import failures, pick
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.records import Answer, Decision
+from harness.world import scenarios
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
@@ -44,7 +45,8 @@ def prompts_of(run: Run) -> Sent | None:
         return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
+        words = scenarios.get(scene.state.scenario).words
+        messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
         return readout.asked(messages, actions) if run.manifest.answer == "readout" else messages
 
     return sent
@@ -95,7 +97,7 @@ class Decisions:
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
-        from harness.evaluate.replay import scene_of  # a second of simulator, which no frozen run waits for
+        from harness.evaluate.replay import scene_of  # loads the simulator
 
         telling = [
             scene

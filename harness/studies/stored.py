@@ -70,7 +70,7 @@ class Stored:
         own = latencies.kept(folder / TIMES) or manifest.latency
         self._asker = Asker(
             self._spec(), self._open, latencies.PAPER if latency == "paper" else own, folder / CALLS,
-            {answer.id: answer for answer in self.run.answers}, done, more,
+            {answer.id: answer for answer in self.run.answers}, done, more, whole_chunks=False,
         )  # fmt: skip
         self._intents: dict[str, Intents] = {}  # of each step, by the first of its scenes
 
@@ -82,7 +82,12 @@ class Stored:
         }  # fmt: skip
 
     def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
-        """All episodes, with the ego and so many of the nearest vehicles."""
+        """All episodes, with the ego and so many of the nearest vehicles.
+
+        Raises:
+            UserError: the point has the run's model fuse, and it cannot.
+        """
+        replace(self._asker.spec, points=(point,))
         world = FrozenWorld(self._dataset, seeds)
         columns, places = walk_through(world, point, _Nearest(self, vehicles - 1), seeds, world.numbers)
         verdicts = world.verdicts(point)

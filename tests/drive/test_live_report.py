@@ -206,9 +206,7 @@ def test_a_broken_live_run_is_one_line_that_names_the_file(driven, tmp_path, nam
 def test_decisions_without_a_step_are_one_line_that_names_the_file(driven, tmp_path):
     copy = copied(driven, tmp_path)
     change(copy, decision=lambda row: row.update(step=None))
-    with pytest.raises(
-        UserError, match=r"decisions.parquet is broken .step is unknown"
-    ) as error:
+    with pytest.raises(UserError, match=r"decisions.parquet is broken .step is unknown") as error:
         written(copy)
     assert "\n" not in str(error.value)
 
