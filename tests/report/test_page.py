@@ -260,7 +260,10 @@ def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset)
 
 def scored(run, tmp_path, *scores):
     """The run with another summary."""
-    found = [Score(*score, 2, 0, "episodes") for score in scores]
+    found = [
+        Score(condition, metric, value, low, high, 2, 0, "episodes")
+        for condition, metric, value, low, high in scores
+    ]
     copy = copied(run, tmp_path)
     (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.of_run))
     return read(copy)
