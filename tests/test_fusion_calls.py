@@ -244,10 +244,10 @@ def test_it_pays_a_second_inference_where_it_heard_somebody(done: Evaluated) -> 
         )
         assert fates == rule_fates
         assert not heard or {m.weight for m in again.messages} == {None}
-        assert again.latency_ms == pytest.approx((rule.latency_ms or 0) + 145 * heard)
+        assert again.latency_ms == pytest.approx(rule.latency_ms + 145 * heard)
         if not heard:
             assert again.fused == rule.fused
-    assert (figure(done, FUSION.name, "fusion_ms").value or 0) > 0
+    assert figure(done, FUSION.name, "fusion_ms").value > 0
     assert figure(done, "6g", "fusion_ms").value == 0
 
 
@@ -258,16 +258,13 @@ def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, s
         heard = [m.sender for m in d.messages if m.on_time]
         if heard:
             intent = answers[f"{d.scene}/{'+'.join(['v1', *heard])}"].intent
-            assert intent is not None
             assert d.fused == pytest.approx(intent, abs=1e-6)
             again += 1
     assert again > 10
     for said in answers.values():
         if said.heard:
             senders = [answers[f"{said.scene}/{viewer}"] for viewer in said.heard]
-            told = [
-                {"sender": a.viewer, "intent": list(a.intent or ()), **(a.message or {})} for a in senders
-            ]
+            told = [{"sender": a.viewer, "intent": list(a.intent), **a.message} for a in senders]
             graph = small.scene(said.scene).record["graphs"]["v1"]
             assert said.prompt_sha256 == digest(prompt("v2").render(graph, small.actions, told))
 
@@ -387,7 +384,7 @@ def test_fusion_calls_that_are_all_in_the_cache_are_timed_by_the_model_itself(
         assert fused
         rules = {(d.scene, d.seed): d.latency_ms for d in decisions(tmp_path / name, "6g")}
         for d in fused:
-            assert d.latency_ms == pytest.approx((rules[d.scene, d.seed] or 0) + 100, abs=2e-3)
+            assert d.latency_ms == pytest.approx(rules[d.scene, d.seed] + 100, abs=2e-3)
     said: list[Answer] = answers_of(tmp_path / "again")
     assert all(a.cached and a.seconds is None for a in said)
     assert (done.manifest.latency.ego_s, done.manifest.latency.fusion_s) == (0.1, 0.1)
