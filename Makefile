@@ -40,6 +40,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/answer_modes.py
 	$(BIN)/python benchmarks/drive.py
 	$(BIN)/python benchmarks/report.py
+	$(BIN)/python benchmarks/load.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

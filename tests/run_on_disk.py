@@ -12,7 +12,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.runs import folder
 from harness.runs.decisions import Decisions, schema
 from harness.runs.formats import FORMAT
-from harness.runs.metrics import Grid
+from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
 from harness.runs.summary import counted, scores
 
@@ -126,7 +126,7 @@ def _write(
     numbers = tuple(dict.fromkeys(end["episode"] for end in ends))
     grid = Grid(tuple(str(c["name"]) for c in manifest.conditions), manifest.seeds, numbers)
     episodes = counted(grid, decisions, _all(ends, Episode))
-    world = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
+    world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
     summary = scores(world, grid, decisions, episodes, answers)
     folder.write(out, manifest, decisions, episodes, answers, summary)
     return out
@@ -151,16 +151,17 @@ def _decision(
 ) -> Row:  # fmt: skip
     asks = point.profile is not None
     share = 1 / len(viewers) if asks else 1.0
-    row = {
+    latency_ms = 145.0 + 75.0 * asks
+    row: Row = {
         "scene": scene, "episode": episode, "step": step, "danger": None, "condition": point.name,
         "seed": seed, "action": "IDLE", "messages": len(viewers[1:]) * asks, "own_failed": False,
         "triggered": asks, "entropy_nats": 0.0, "normalised_entropy": 0.0, "own_weight": share,
-        "latency_ms": 145.0 + 75.0 * asks, "deadline_missed": False, "fusion_ms": 0.0 if asks else None,
+        "latency_ms": latency_ms, "deadline_missed": False, "fusion_ms": 0.0 if asks else None,
         "effective_loss": 0.0 if asks else None, "observed_loss": 0.0 if asks else None,
         **{f"fused_{action}": float(action == "IDLE") for action in ACTIONS},
     }  # fmt: skip
     if closed_loop:
-        row |= {"acts_at_s": step + row["latency_ms"] / 1000, "acted": True}
+        row |= {"acts_at_s": step + latency_ms / 1000, "acted": True}
     else:
         row |= {"safe": True, "delay_s": 0.0}
         row |= {f"safe_{action}": action == "IDLE" for action in ACTIONS}

@@ -124,9 +124,10 @@ def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, ru
     [
         (lambda text: "\n".join(text.splitlines()[:-1]), "not every episode is there once"),
         (lambda text: text + text.splitlines()[-1] + "\n", "not every episode is there once"),
-        (lambda text: text.replace("True", "perhaps"), "success"),
+        (lambda text: text.replace("True", "perhaps"), "'perhaps'"),
+        (lambda text: text.replace(",True,", ",,"), "success is unknown in some rows"),
         (lambda text: text.replace("6g", "7g"), "not every episode is there once"),
-        (lambda text: text.replace("failure", "fail"), "it lacks failure"),
+        (lambda text: text.replace("failure", "fail"), "Column 'failure'"),
     ],
 )
 def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str, run: Path) -> None:
@@ -174,6 +175,12 @@ def test_tables_raise_the_same(file: str, run: Path) -> None:
 def test_names_of_folders_are_no_columns(tmp_path: Path) -> None:
     run = made_up(tmp_path / "seed=7" / "condition=x")
     assert set(folder.read(run).decisions.whole("seed")) == {0, 1}
+
+
+def test_text_of_any_kind_is_read_as_it_was_written(run: Path) -> None:
+    said = 'a "b",\n\r\n=1 null NaN \u202e'
+    change(run, episode=lambda row: row.update(failure=said, partner=said))
+    assert {(e.failure, e.partner, e.fault) for e in folder.read(run).episodes} == {(said, said, None)}
 
 
 def test_a_change_by_hand_is_read_again(run: Path) -> None:

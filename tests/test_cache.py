@@ -28,6 +28,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)
@@ -44,6 +45,7 @@ CHANGED: dict[str, Any] = {
     "sample": 1,
     "view": {"nodes": []},
     "truth": {"nodes": []},
+    "scenario": SCENARIO,
 }
 
 

@@ -38,7 +38,16 @@ def made_up(n: int, start: int = 0) -> list[str]:
 
 def questions(dataset: Dataset, form: str) -> list[Request]:
     return [
-        Request(f"{scene.id}/{viewer}", graph["role"], (), dataset.actions, 64, form, view=graph)
+        Request(
+            f"{scene.id}/{viewer}",
+            graph["role"],
+            (),
+            dataset.actions,
+            64,
+            form,
+            view=graph,
+            scenario=dataset.scenario,
+        )
         for scene in dataset.scenes
         for viewer, graph in scene.record["graphs"].items()
     ]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 if TYPE_CHECKING:
     from harness.runs.records import Latency
+    from harness.world.scenario import Scenario
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -34,6 +35,7 @@ class Request:
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
+        scenario: what the view is of; read by whoever reads the view.
     """
 
     id: str
@@ -47,6 +49,7 @@ class Request:
     sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
+    scenario: "Scenario | None" = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ NOT_IN_KEY = {
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
     "view": "no language model reads it",
     "truth": "no language model reads it",
+    "scenario": "no language model reads it; its actions are a field of their own",
 }
 # What a completion has of its own asking, and not of its answer.
 _NOT_KEPT = ("request_id", "seconds", "error", "retries", "cached")

@@ -30,11 +30,11 @@ def build(
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
     """Freeze episodes into a dataset. The same command again continues a build that was stopped."""
-    ready_to_drive(name, episodes, seed, workers)
+    scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.dataset.build import build as build_dataset
 
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(out, episodes, seed, workers, progress)
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} episodes, {manifest['decisions']} decision points"
     )

@@ -29,6 +29,7 @@ def command(
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
     condition: options.Conditions = None,
+    scenario: str = typer.Option("occluded-intersection", help="Scenario to drive. `harness scenario list`."),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     seeds: options.Seeds = "0:5",
@@ -56,6 +57,7 @@ def command(
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
+    from harness.world import scenarios
 
     if condition and ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
@@ -70,7 +72,7 @@ def command(
     spec = Spec(
         card=cards.resolve(model, engine),
         prompt=versions.load(prompt),
-        source=LiveSource(first_seed, episodes),
+        source=LiveSource(first_seed, episodes, scenarios.get(scenario).name),
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),
         thinking=thinking,

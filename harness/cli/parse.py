@@ -26,7 +26,7 @@ def command(
 
     if finish_reason not in FINISH_REASONS:
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
-    actions = scenarios.get(scenario).ACTIONS
+    actions = scenarios.get(scenario).actions
     text = _read(file)
     parsed = parse(text, role=role, actions=actions, thinking=thinking, finish_reason=finish_reason)
     shares = None if parsed.intent is None else dict(zip(actions, parsed.intent, strict=True))

@@ -48,7 +48,8 @@ def show(
     if viewer is not None and viewer not in at.viewers:
         raise unknown("viewer", viewer, at.viewers)
     viewers = at.viewers if viewer is None else [viewer]
-    sent = {v: prompt.render(at.record["graphs"][v], data.actions) for v in viewers}
+    words = data.scenario.words
+    sent = {v: prompt.render(at.record["graphs"][v], data.actions, words=words) for v in viewers}
     if as_json:
         echo_json(sent)
         return
@@ -77,7 +78,7 @@ def check(
     outside: list[dict[str, Any]] = []
     for scene in data.scenes:
         for v, graph in scene.record["graphs"].items():
-            messages = prompt.render(graph, data.actions)
+            messages = prompt.render(graph, data.actions, words=data.scenario.words)
             if count:
                 n = count(messages)
                 sizes[graph["role"]].append(n)

@@ -7,10 +7,9 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import as_mapping, console, echo_json, shown, table
 from harness.cli.progress import bar
-from harness.core.errors import UserError
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    from harness.world.scenario import Scenario
 
 app = typer.Typer(help="List scenarios, show one, or drive the reference drivers.", no_args_is_help=True)
 
@@ -20,7 +19,7 @@ def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios."""
     from harness.world import scenarios
 
-    rows = [{"name": name, "summary": _summary(scenarios.get(name))} for name in scenarios.names()]
+    rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
     if as_json:
         echo_json(rows)
         return
@@ -36,15 +35,16 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     from harness.world import scenarios
 
     scenario = scenarios.get(name)
+    description, actions = scenario.description, scenario.actions
     parameters = _parameters(scenario)
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
-        described = {"name": name, "description": scenario.__doc__, "actions": scenario.ACTIONS}
-        schemas = {role: answer_schema(role, scenario.ACTIONS, name) for role in ROLES}
+        described = {"name": name, "description": description, "actions": actions}
+        schemas = {role: answer_schema(role, actions, name) for role in ROLES}
         echo_json({**described, "parameters": parameters, "answer_schema": schemas})
         return
-    typer.echo(f"{scenario.__doc__}\nactions: {', '.join(scenario.ACTIONS)}\n")
+    typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     for parameter, of in parameters.items():
         value = (
             ", ".join(f"{v:g}" for v in of["value"]) if isinstance(of["value"], tuple) else f"{of['value']:g}"
@@ -62,45 +62,42 @@ def check(
     as_json: options.Json = False,
 ) -> None:
     """Drive the reference drivers and show how episodes end. All drive the same episodes."""
-    ready_to_drive(name, episodes, seed, workers)
+    scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.world import reference as live
 
     with bar(f"driving {name}", episodes) as progress:
-        found = live.check(episodes, seed, workers, progress)
+        found = live.check(scenario, episodes, seed, workers, progress)
     if as_json:
         echo_json(_as_mapping(name, episodes, seed, found))
     else:
         _table(episodes, seed, found)
 
 
-def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> None:
-    """Raises UserError where the simulator cannot drive those episodes."""
+def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenario":
+    """The scenario. Raises UserError if there is none, or where those episodes cannot be driven."""
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
-    from harness.world.world import NAME
 
-    if scenarios.get(name).NAME != NAME:
-        raise UserError(f"scenario {name} has no simulator; give {NAME}")
+    scenario = scenarios.get(name)
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    return scenario
 
 
-def _summary(scenario: "ModuleType") -> str:
-    return str(scenario.__doc__).strip().splitlines()[0].rpartition(": ")[2]
-
-
-def _parameters(scenario: "ModuleType") -> dict[str, dict[str, Any]]:
-    """Value of each parameter, and its meaning out of the dataclass's docstring."""
+def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
+    """Value of each parameter, and its meaning out of the docstrings of its dataclasses."""
     import inspect
     import re
     from dataclasses import asdict
 
-    attributes = str(inspect.getdoc(scenario.Parameters)).partition("Attributes:\n")[2]
-    meanings = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
+    meanings: dict[str, str] = {}
+    for kind in reversed(type(scenario.parameters).__mro__[:-1]):
+        attributes = str(inspect.getdoc(kind)).partition("Attributes:\n")[2]
+        meanings |= re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE)
     return {
         name: {"value": value, "meaning": " ".join(meanings[name].split())}
-        for name, value in asdict(scenario.Parameters()).items()
+        for name, value in asdict(scenario.parameters).items()
     }
 
 

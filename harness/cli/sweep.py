@@ -27,8 +27,8 @@ def command(
     runs: options.Runs,
     over: list[str] | None = typer.Option(
         None,
-        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus; "
-        "repeatable. Default: the paper's panels.",
+        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus, or any "
+        "setting of an operating point by its name; repeatable. Default: the paper's panels.",
     ),
     grid: list[str] | None = typer.Option(
         None, help="Values of each --over in order: 0,10,20 or from:to:step. Default: the usual ones."

@@ -151,15 +151,16 @@ def named_point(text: str) -> OperatingPoint:
             raise unknown(f"setting of operating point {name}", key, SETTINGS, f"; as in {name}:window_s=0.3")
         if key in changed:
             raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
-        changed[key] = _value(getattr(POINTS[name], key), value)
+        changed[key] = setting_of(key, value)
     return replace(POINTS[name], name=text, **changed) if changed else POINTS[name]
 
 
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
 
 
-def _value(usual: object, text: str) -> object:
+def setting_of(key: str, text: str) -> object:
     """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
+    usual = getattr(POINTS["6g"], key)
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
     if isinstance(usual, str):

@@ -17,6 +17,8 @@ from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
 from harness.dataset.schema import Manifest
 from harness.dataset.verify import file_problems, read_manifest, records, released
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 
 
@@ -69,6 +71,11 @@ class Dataset:
     def name(self) -> str:
         """Name in the manifest."""
         return self.manifest.name
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What was frozen."""
+        return scenarios.get(self.manifest.scenario)
 
     @property
     def actions(self) -> tuple[str, ...]:

@@ -3,22 +3,20 @@
 What is typed here is enforced when a dataset is built and read, and published beside it as JSON Schema.
 """
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable
+from functools import lru_cache
+from types import GenericAlias
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, field
 
-from harness.world.road import APPROACHES, ROUTES, SECTORS
-from harness.world.state import Kind, Part
+from harness.world.scenario import Scenario
+from harness.world.state import Kind, Part, indicator
 
 FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # of a dataset and of its files: never a path
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
-
-
-def _choice(names: Sequence[str]) -> Meta:
-    return Meta(pattern=f"^({'|'.join(names)})$", extra_json_schema={"enum": list(names)})
-
 
 # No metre, second or share comes near these bounds; infinity and thousand-digit integers do not pass them.
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -29,9 +27,6 @@ Text = Annotated[str, Meta(max_length=200)]
 FileName = Annotated[str, Meta(pattern=FILE_NAME)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
-Approach = Annotated[str, _choice(APPROACHES)]
-Route = Annotated[str, _choice(ROUTES)]
-Sector = Annotated[str, _choice(SECTORS)]
 
 
 class Closed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,8 +43,8 @@ class Vehicle(Closed, frozen=True):
     y_m: Number
     heading_rad: Number
     speed_mps: Number
-    approach: Approach
-    route: Route
+    approach: str
+    route: str
     crashed: bool
 
 
@@ -105,7 +100,7 @@ class Node(Closed, frozen=True):
     speed_mps: Number
     range_rate_mps: Number | None
     lane: str
-    indicator: Literal["left", "off", None]
+    indicator: str | None
     sensors: list[Literal["camera", "lidar", "radar"]]
 
 
@@ -133,8 +128,8 @@ class Conflict(Closed, frozen=True):
     """A vehicle whose path crosses the ego's."""
 
     vehicle: VehicleId = field(name="with")
-    sector: Sector
-    route: Route
+    sector: str
+    route: str
     point: Point
     ego: EgoArrival
     other: Arrival
@@ -143,7 +138,7 @@ class Conflict(Closed, frozen=True):
 class SectorSeen(Closed, frozen=True):
     """How much of a sector is in sight, and what hides the rest."""
 
-    sector: Sector
+    sector: str
     seen_share: Number
     occluded: bool
     by: list[str]
@@ -175,18 +170,13 @@ class Outcome(Closed, frozen=True):
 
 
 class Road(Closed, frozen=True):
-    """The road, as far as a picture needs it."""
-
-    kind: str
-    lane_width_m: Number
-    junction_m: Number
-    ego: str
+    """What the scenario says of its road."""
 
 
 class Danger(Closed, frozen=True):
     """The vehicle that the layout sends against the ego, if any."""
 
-    sector: Sector | None
+    sector: str | None
     vehicle: VehicleId | None
 
 
@@ -201,12 +191,12 @@ class Snapshot(Closed, frozen=True):
     """What the simulator needs beyond the state to go on from here."""
 
     frame: Count
-    sections: list[Annotated[int, Meta(ge=0, le=2)]]
+    sections: list[Count]
     speed_index: Count
 
 
 class Record(Closed, frozen=True):
-    """A decision point: one line of `scenes.jsonl`."""
+    """A decision point: one line of `scenes.jsonl`. `record_type` has the names of a scenario's places."""
 
     scene: Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]$")]
     episode: Episode
@@ -245,9 +235,51 @@ class Manifest(Closed, frozen=True):
         return value
 
 
-def record_schema(actions: Sequence[str]) -> dict[str, Any]:
+@lru_cache(maxsize=8)
+def record_type(scenario: Scenario) -> type[Record]:
+    """`Record` with the approaches, routes, sectors and facts of the scenario's road."""
+    road = scenario.road()
+    approach = _choice(approach for approach, _ in road.paths)
+    route = _choice(route for _, route in road.paths)
+    sector = _choice(road.sectors)
+    signal = _choice([*(r for _, r in road.paths if indicator(r) == r), "off"])
+    section = Annotated[int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)]
+    vehicle = _narrowed(Vehicle, approach=approach, route=route)
+    graph = _narrowed(
+        Graph,
+        nodes=_list(_narrowed(Node, indicator=signal | None)),
+        conflicts=_list(_narrowed(Conflict, sector=sector, route=route)),
+        sectors=_list(_narrowed(SectorSeen, sector=sector)),
+    )
+    kind: type[Record] = _narrowed(
+        Record,
+        road=_narrowed(Road, **{k: str if isinstance(v, str) else Number for k, v in road.facts.items()}),
+        danger=_narrowed(Danger, sector=sector | None),
+        state=_narrowed(State, vehicles=Annotated[_list(vehicle), Meta(min_length=1)]),
+        graphs=GenericAlias(dict, (VehicleId, graph)),
+        snapshot=_narrowed(Snapshot, sections=_list(section)),
+    )
+    return kind
+
+
+def _choice(names: Iterable[str]) -> Any:
+    unique = list(dict.fromkeys(names))
+    pattern = f"^({'|'.join(map(re.escape, unique))})$"
+    return Annotated[str, Meta(pattern=pattern, extra_json_schema={"enum": unique})]
+
+
+def _list(kind: Any) -> Any:
+    return GenericAlias(list, (kind,))
+
+
+def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
+    """The kind, some of whose members are of a narrower type."""
+    return msgspec.defstruct(kind.__name__, fields.items(), bases=(kind,), frozen=True)
+
+
+def record_schema(scenario: Scenario) -> dict[str, Any]:
     """JSON Schema of one line of `scenes.jsonl`."""
-    schema = _published(Record, "decision point")
+    schema, actions = _published(record_type(scenario), "decision point"), scenario.actions
     schema["$defs"]["Lead"]["properties"]["action"] = {"enum": list(actions)}
     outcomes = schema["$defs"]["Record"]["properties"]["outcomes"]
     outcomes |= {"propertyNames": {"enum": list(actions)}, "required": sorted(actions)}

@@ -10,12 +10,11 @@ import msgspec
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_bytes, sha256_file
-from harness.dataset.schema import Manifest, Record
-from harness.world.road import crossings
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.dataset.schema import Manifest, Record, record_type
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 
 _MANIFEST = msgspec.json.Decoder(Manifest)
-_RECORD = msgspec.json.Decoder(Record)
 _JSON = msgspec.json.Decoder()
 _Lines = Iterator[tuple[dict[str, Any], list[str]]]
 
@@ -37,18 +36,22 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
         raise UserError(
             f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
         ) from None
-    for problem in _manifest_problems(manifest):
+    try:
+        scenario = scenarios.get(manifest.scenario)
+    except UserError as error:
+        raise UserError(f"{printable(file)}: {error}") from None
+    for problem in _manifest_problems(manifest, scenario):
         raise UserError(f"{printable(file)}: manifest {problem}; build the dataset again")
     return manifest, sha256_bytes(data)
 
 
-def _manifest_problems(manifest: Manifest) -> Iterator[str]:
+def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
     """What is wrong with a manifest that no type can state."""
     if len(set(manifest.actions)) < len(manifest.actions):
         yield "[actions]: an action stands there twice"
     if "scenes.jsonl" not in manifest.files:
         yield "[files] has no scenes.jsonl"
-    expected = asdict(Parameters())
+    expected = asdict(scenario.parameters)
     for name, value in manifest.parameters.items():
         if name not in expected:
             yield f"[parameters]: {unknown('parameter', name, expected)}"
@@ -87,6 +90,9 @@ def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
 
 def records(file: Path, manifest: Manifest) -> _Lines:
     """Each line's record, and what is wrong with it; a record is good for use only if nothing is."""
+    scenario = scenarios.get(manifest.scenario)
+    kind = record_type(scenario)
+    decoder = msgspec.json.Decoder(kind)
     before: tuple[int, int] | None = (-1, 0)  # episode and step; None after a line that cannot be read
     with file.open("rb") as lines:
         for number, text in enumerate(lines, 1):
@@ -96,14 +102,14 @@ def records(file: Path, manifest: Manifest) -> _Lines:
                 yield {}, [f"{where}: cut off"]
                 continue
             try:
-                record = _RECORD.decode(text)
+                record = decoder.decode(text)
             except msgspec.ValidationError as error:
-                yield {}, [f"{where}: {misfit(error, text, Record, 'record')}"]
+                yield {}, [f"{where}: {misfit(error, text, kind, 'record')}"]
                 continue
             except (ValueError, RecursionError) as error:
                 yield {}, [f"{where}: no JSON ({printable(error)})"]
                 continue
-            problems = [f"{where}: {what}" for what in contradictions(record, manifest)]
+            problems = [f"{where}: {what}" for what in contradictions(scenario, record, manifest)]
             before = (record.episode, record.step)
             if last and before not in ((last[0], last[1] + 1), (last[0] + 1, 0)):
                 problems.append(f"{where}: scene {record.scene} does not follow the line before")
@@ -129,7 +135,7 @@ def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -
     return printable(error)
 
 
-def contradictions(record: Record, manifest: Manifest) -> list[str]:
+def contradictions(scenario: Scenario, record: Record, manifest: Manifest) -> list[str]:
     """Where one part of a record speaks against another or the manifest, which no type can state."""
     state, graphs = record.state, record.graphs
     ids = [v.id for v in state.vehicles]
@@ -152,7 +158,7 @@ def contradictions(record: Record, manifest: Manifest) -> list[str]:
         "a graph is of another viewer": all(graph.viewer == viewer for viewer, graph in graphs.items()),
         "distances are not those of the ego and the helpers": record.distance_m.keys() == viewers,
         "a conflict is on a path that does not cross the ego's": {(c.sector, c.route) for c in conflicts}
-        <= crossings().keys(),
+        <= scenario.road().crossings.keys(),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
         "sections are not one a vehicle": len(record.snapshot.sections) == len(ids),

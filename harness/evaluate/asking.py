@@ -41,7 +41,7 @@ def most_tokens(spec: Spec, role: Role) -> int:
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """What is asked, scene by scene, the ego first."""
     for scene in scenes:
-        truth = truth_graph(scene.state) if spec.card.privileged else None
+        truth = truth_graph(spec.scenario, scene.state) if spec.card.privileged else None
         for viewer in spec.viewers(scene):
             graph = scene.record["graphs"][viewer]
             role: Role = graph["role"]
@@ -56,11 +56,12 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 thinking=spec.thinking,
                 view=graph,
                 truth=truth,
+                scenario=spec.scenario,
             )
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.actions)
+    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.words)
     return readout.asked(rendered, spec.actions) if spec.answer == "readout" else rendered
 
 
@@ -68,11 +69,11 @@ def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
     """What the ego's model is asked once these helpers' messages are there; `answers` by viewer."""
-    graph = scene.record["graphs"][scene.viewers[0]]
+    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
     return Request(
         id=_fusion_id(scene, senders),
         role="ego",
-        messages=spec.prompt.render(graph, spec.actions, messages_of(answers, senders)),
+        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.words),
         actions=spec.actions,
         max_tokens=most_tokens(spec, "ego"),
         form=spec.prompt.helper_answer,

@@ -14,6 +14,7 @@ from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
+from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,11 @@ class FrozenSource:
     def actions(self) -> tuple[str, ...]:
         """The dataset's."""
         return self.dataset.actions
+
+    @property
+    def scenario(self) -> Scenario:
+        """The dataset's."""
+        return self.dataset.scenario
 
     def record(self) -> FrozenScenes:
         """The dataset, pinned by its digest."""

@@ -8,6 +8,8 @@ action. A decision that is still open when the next is due goes on, and the next
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,44 +22,58 @@ from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
-from harness.world import reference
+from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
-from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters
+from harness.world.scenario import Scenario
 from harness.world.world import World
 
-P = Parameters()
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
 @dataclass(frozen=True)
 class LiveSource:
-    """Layouts that are driven: episode e has layout seed `first_seed` + e."""
+    """Layouts of a scenario that are driven: episode e has layout seed `first_seed` + e."""
 
     first_seed: int
     episodes: int
+    scenario_name: str = scenarios.DEFAULT
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
     command: ClassVar[str] = "drive"
-    actions: ClassVar[tuple[str, ...]] = tuple(ACTIONS)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What is driven."""
+        return scenarios.get(self.scenario_name)
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The scenario's."""
+        return self.scenario.actions
 
     def record(self) -> ClosedLoop:
         """The scenario, and which of its layouts."""
+        parameters = asdict(self.scenario.parameters)
         return ClosedLoop(
-            scenario={"name": NAME, "parameters": asdict(P)}, first_seed=self.first_seed,
+            scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
             episodes=self.episodes, late_against="full-view driver, whose decisions act at once",
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
-        """Which layouts."""
-        return [("--episodes", self.episodes), ("--first-seed", self.first_seed)]
+        """Which layouts of which scenario."""
+        return [
+            ("--scenario", self.scenario_name),
+            ("--episodes", self.episodes),
+            ("--first-seed", self.first_seed),
+        ]
 
     def trial(self, most: int, ego_alone: bool) -> list[Scene]:
         """The first moment of some episodes, each a while after its start."""
-        scenes = []
+        scenes, p = [], self.scenario.parameters
         for number in range(min(most, self.episodes)):
-            trajectory = Trajectory(number, World.start(self.first_seed + number), [])
-            trajectory.world.advance(round(number * P.decision_period_s * P.simulation_hz / 2))
+            trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
+            trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
             scenes.append(look(trajectory, 0, ego_alone))
         return scenes
 
@@ -66,21 +82,24 @@ class LiveWorld:
     """Some episodes of a scenario under all conditions and seeds, which share worlds until they part."""
 
     def __init__(
-        self, first_seed: int, numbers: Sequence[int], points: Sequence[OperatingPoint],
-        seeds: Sequence[int], ego_alone: bool,
+        self, scenario: Scenario, first_seed: int, numbers: Sequence[int],
+        points: Sequence[OperatingPoint], seeds: Sequence[int], ego_alone: bool,
     ) -> None:  # fmt: skip
         """The first moments.
 
         Args:
+            scenario: what is driven.
             first_seed: layout seed of episode 0.
             numbers: of the episodes.
             points: the conditions.
             seeds: of the channel's draws.
             ego_alone: whether helpers are not asked, so need not look.
         """
+        self._scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone
+        ways = list(product(points, seeds))
         self._going = [
-            Trajectory(n, World.start(first_seed + n), [Course(p, s) for p in points for s in seeds])
+            Trajectory(n, World.start(scenario, first_seed + n), [Course(*way) for way in ways])
             for n in numbers
         ]
         self._ended: list[Trajectory] = []
@@ -89,7 +108,7 @@ class LiveWorld:
 
     def observe(self) -> Sequence[Scene]:
         """Every moment in which some episode has no open decision, once."""
-        while self._going and self._step < P.decisions:
+        while self._going and self._step < self._p.decisions:
             for one in self._going:
                 for course in one.courses:
                     course.skipped += course.open is not None
@@ -108,18 +127,19 @@ class LiveWorld:
         episode = np.array([one.number for one in self._deciding])[at]
         helpers = max(len(scene.viewers) for scene in self._moments) - 1
         step = np.full(len(at), self._step)
-        draws = channel_draws(seed, self._first_seed + episode, step, P.decisions, helpers)
+        draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
         return Due(at, episode, seed, draws)
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Open every decision, and live until the next are due."""
-        begun = round(self._step * P.decision_period_s * P.simulation_hz)
+        actions, hz = self._scenario.actions, self._p.simulation_hz
+        begun = round(self._step * self._p.decision_period_s * hz)
         for part in decided:
-            latencies_s, actions = part.result.latency_s.tolist(), part.result.action.tolist()
+            latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
             for (_, course), latency_s, action in zip(
-                self._places(part.point), latencies_s, actions, strict=True
+                self._places(part.point), latencies_s, chosen, strict=True
             ):
-                course.open = Decision(ACTIONS[action], begun + frames(latency_s))
+                course.open = Decision(actions[action], begun + frames(latency_s, hz))
                 self._decisions.append(course.open)
         self._advance()
 
@@ -131,22 +151,23 @@ class LiveWorld:
 
     def _advance(self) -> None:
         self._step += 1
-        until_s = P.time_limit_s if self._step == P.decisions else self._step * P.decision_period_s
-        parts = [part for one in self._going for part in one.advance(round(until_s * P.simulation_hz))]
+        p = self._p
+        until_s = p.time_limit_s if self._step == p.decisions else self._step * p.decision_period_s
+        parts = [part for one in self._going for part in one.advance(round(until_s * p.simulation_hz))]
         self._ended += [one for one in parts if one.world.outcome.ended]
         self._going = [one for one in parts if not one.world.outcome.ended]
 
     def columns(self) -> dict[str, Any]:
         """When each decision acts, and whether it has, in the order of decisions."""
         return {
-            "acts_at_s": np.array([d.frame for d in self._decisions]) / P.simulation_hz,
+            "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
             "acted": np.array([d.acted for d in self._decisions]),
         }
 
     def episodes(self) -> list[Episode]:
         """How each episode ended, held against a full-view driver whose decisions act at once."""
         references = {
-            number: reference.drive(PRIVILEGED, self._first_seed + number)
+            number: reference.drive(self._scenario, PRIVILEGED, self._first_seed + number)
             for number in sorted({one.number for one in self._ended if one.world.outcome.success})
         }
         return [
@@ -154,9 +175,9 @@ class LiveWorld:
         ]
 
 
-def frames(latency_s: float) -> int:
+def frames(latency_s: float, simulation_hz: int) -> int:
     """Whole frames that a decision takes."""
-    return math.ceil(latency_s * P.simulation_hz - ROUNDING_FRAMES)
+    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
 def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
@@ -171,13 +192,13 @@ def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
 def _episode(one: Trajectory, course: Course, against: Outcome | None) -> Episode:
     """How an episode ended; it is `late` if it cleared too long after the reference."""
     ended = one.world.outcome
-    outcome = ended.judged(against, P) if against else ended
+    outcome = ended.judged(against, one.world.scenario.parameters) if against else ended
     delay_s = None
     if against and against.time_s is not None and against.success and ended.success:
         delay_s = round((ended.time_s or 0.0) - against.time_s, 3)
     return Episode(
         condition=course.point.name, seed=course.seed, episode=one.number, layout_seed=one.world.seed,
-        danger=one.world.env.layout.danger or "none", success=outcome.success,
+        danger=one.world.layout.danger or "none", success=outcome.success,
         failure="" if outcome.success else outcome.result, delay_s=delay_s, time_s=outcome.time_s,
         partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
         least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=one.world.hard_brakings,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Trajectory
-from harness.evaluate.live_world import P, look
+from harness.evaluate.live_world import look
 from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, Decision, Manifest
+from harness.world import scenarios
+from harness.world.scenario import Parameters, Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 
@@ -38,6 +41,12 @@ class Played:
     episode: int
     layout_seed: int
     decisions: list[Decision]
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What was driven."""
+        assert isinstance(self.manifest.world, ClosedLoop)
+        return scenarios.get(self.manifest.world.scenario["name"])
 
 
 @dataclass(frozen=True)
@@ -102,8 +111,8 @@ def scene_of(run: Run, name: str) -> Scene:
     rows = run.decisions.scenes[name]
     [mine] = run.decisions.records(rows.start, rows.start + 1)
     episode = played(run, mine.episode, mine.condition, mine.seed)
-    begins = _begins(mine)
-    world = World.start(episode.layout_seed)
+    begins = _begins(mine, episode.scenario.parameters)
+    world = World.start(episode.scenario, episode.layout_seed)
     for frame, action in _acts(episode).items():
         if frame <= begins:
             world.advance(frame)
@@ -113,24 +122,25 @@ def scene_of(run: Run, name: str) -> Scene:
     return look(Trajectory(mine.episode, world, []), mine.step, alone)
 
 
-def _begins(decision: Decision) -> int:
-    return round(decision.step * P.decision_period_s * P.simulation_hz)
+def _begins(decision: Decision, p: Parameters) -> int:
+    return round(decision.step * p.decision_period_s * p.simulation_hz)
 
 
 def _acts(played: Played) -> dict[int, str]:
     """Actions by the frame in which they were taken."""
-    return {_acts_in(d): d.action for d in played.decisions if d.acted}
+    p = played.scenario.parameters
+    return {_acts_in(d, p): d.action for d in played.decisions if d.acted}
 
 
-def _acts_in(decision: Decision) -> int:
-    return round((decision.acts_at_s or 0.0) * P.simulation_hz)
+def _acts_in(decision: Decision, p: Parameters) -> int:
+    return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """The episode, ten stills a second, and one a frame while a decision is open."""
-    hz = P.simulation_hz
-    world = World.start(played.layout_seed)
-    begins = [_begins(decision) for decision in played.decisions]
+    p = played.scenario.parameters
+    world = World.start(played.scenario, played.layout_seed)
+    begins = [_begins(decision, p) for decision in played.decisions]
     acts = _acts(played)
     place, seen = 0, world.state()
     while True:
@@ -138,11 +148,11 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
             place += 1
             seen = world.state()
         decision = played.decisions[place]
-        thinking = world.frame < _acts_in(decision)
+        thinking = world.frame < _acts_in(decision, p)
         outcome = world.outcome
         told = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
         told += f" with {outcome.partner}" if outcome.partner else ""
-        since_s = (world.frame - begins[place]) / hz
+        since_s = (world.frame - begins[place]) / p.simulation_hz
         progress(1)
         yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, told)
         if outcome.ended:

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
@@ -25,7 +25,6 @@ from harness.dataset.load import Scene
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, fusion_request, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
-from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec, versions
 from harness.evaluate.walk import heard_codes, table, walk
 from harness.runs import folder
@@ -34,6 +33,9 @@ from harness.runs.formats import CONFIG, FORMAT, WORK
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Episode, Latency, Manifest, Score
 from harness.runs.summary import counted, scores
+
+if TYPE_CHECKING:  # the simulator is loaded by who drives
+    from harness.evaluate.live_world import LiveSource, LiveWorld
 
 EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
@@ -75,10 +77,10 @@ def evaluate(
     if resume and (out / "run.json").is_file():
         return finished(spec, out)
     refuse(spec, out, resume)
-    if isinstance(spec.source, LiveSource):
-        done = _closed_loop(spec, spec.source, out, progress, cache, workers)
+    if isinstance(spec.source, FrozenSource):
+        done = _frozen(spec, spec.source, out, progress, cache, more)
     else:
-        done = _frozen(spec, cast("FrozenSource", spec.source), out, progress, cache, more)
+        done = _closed_loop(spec, cast("LiveSource", spec.source), out, progress, cache, workers)
     tidy(out)
     return done
 
@@ -92,7 +94,7 @@ class Walked:
     answers: dict[str, Answer]
 
 
-def _walked(spec: Spec, world: FrozenWorld | LiveWorld, asker: Asker) -> Walked:
+def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
     return Walked(table(decided, world.columns(), spec.actions), world.episodes(), asker.answers)
 
@@ -139,7 +141,7 @@ def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Reques
 
 
 def _closed_loop(
-    spec: Spec, source: LiveSource, out: Path, progress: Callable[[int], None], cache: Path | None,
+    spec: Spec, source: "LiveSource", out: Path, progress: Callable[[int], None], cache: Path | None,
     workers: int,
 ) -> Evaluated:  # fmt: skip
     # Compiled templates do not travel between processes.
@@ -167,12 +169,14 @@ def _driven(
     spec: Spec, first_seed: int, latency: Latency, work: Path, cache: Path | None, chunk: range
 ) -> Path:
     """Drive a chunk, unless that was done before."""
+    from harness.evaluate.live_world import LiveWorld
+
     part = work / f"episodes-{chunk.start:06d}"
     if not part.is_dir():
         asker = Asker(
             spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
         )
-        world = LiveWorld(first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+        world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
         folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
     return part
@@ -188,8 +192,7 @@ def _begin(spec: Spec) -> tuple[dict[str, Any], Latency]:
     latency = latencies.declared(spec, backend)
     if latency:
         return backend.identity(), latency
-    assert isinstance(spec.source, LiveSource)
-    scenes = spec.source.trial(latencies.SAMPLE, spec.ego_alone)
+    scenes = cast("LiveSource", spec.source).trial(latencies.SAMPLE, spec.ego_alone)
     trial = replace(spec, batch_size=2)
     latency = latencies.measured(trial, backend, list(requests(trial, scenes)))
     if latency.ego_s is None or latency.helper_s is None:

@@ -20,6 +20,7 @@ from harness.dataset.load import Scene
 from harness.prompts.versions import Prompt
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.world.scenario import Scenario
 
 Latency = Literal["card", "measured", "paper"]
 TAG_CHARACTERS = 40
@@ -46,6 +47,11 @@ class Source(Protocol):
     @property
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
+        ...
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is decided in."""
         ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
@@ -165,6 +171,11 @@ class Spec:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
         return self.source.actions
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is decided in."""
+        return self.source.scenario
 
     @property
     def ego_alone(self) -> bool:

@@ -21,6 +21,7 @@ from harness.core import kept
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Dataset
+from harness.world import scenarios
 from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import ROUNDING_S
 from harness.world.perception.graph import truth_graph
@@ -117,29 +118,31 @@ def judge_choices(laid: Table, chosen: Ints) -> Verdict:
 
 def driver_choices(dataset: Dataset, driver: str) -> Ints:
     """Index of a reference driver's action in every scene, (n,)."""
-    actions = dataset.actions
+    actions, scenario = dataset.actions, dataset.scenario
     chosen = []
     for scene in dataset.scenes:
         graph = scene.record["graphs"][scene.state.ego.id]
-        truth = truth_graph(scene.state) if driver == PRIVILEGED else None
-        chosen.append(actions.index(choose(driver, graph, truth, actions)))
+        truth = truth_graph(scenario, scene.state) if driver == PRIVILEGED else None
+        chosen.append(actions.index(choose(scenario, driver, graph, truth)))
     return np.array(chosen)
 
 
 def reference_success(dataset: Dataset) -> dict[str, float]:
     """Share of a dataset's episodes in which each reference driver succeeds; played once and then kept."""
     laid = table(dataset)
+    here = scenarios.is_here(dataset.scenario.name)  # of another's code no digest is known
     decided_by = [
         dataset.sha256, laid.episodes.tolist(), kept.code_sha256(*_CODE), version("numpy"), version("shapely")
     ]  # fmt: skip
     name = f"references-{digest(decided_by)}.json"
-    shares = _shares(kept.recall(name))
+    shares = _shares(kept.recall(name)) if here else None
     if shares is None:
         shares = {
             driver: float(judge_choices(laid, driver_choices(dataset, driver)).success.mean())
             for driver in DRIVERS
         }
-        kept.keep(name, canonical_json(shares).encode())
+        if here:
+            kept.keep(name, canonical_json(shares).encode())
     return shares
 
 

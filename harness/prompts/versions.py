@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from jinja2 import StrictUndefined, Template, TemplateSyntaxError
@@ -25,6 +26,7 @@ from harness.core.resources import entries, find
 Graph = Mapping[str, Any]
 ROLES = ("ego", "helper")
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
+NO_WORDS: Mapping[str, str] = MappingProxyType({})
 LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
 
 
@@ -99,7 +101,11 @@ class Prompt:
         return {role: template.new_context() for role, template in self._templates.items()}
 
     def render(
-        self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]] = ()
+        self,
+        graph: Graph,
+        actions: tuple[str, ...],
+        messages: Sequence[Mapping[str, Any]] = (),
+        words: Mapping[str, str] = NO_WORDS,
     ) -> tuple[dict[str, str], ...]:
         """Chat messages for one viewer's scene graph; exactly what a model is sent.
 
@@ -108,6 +114,7 @@ class Prompt:
             actions: meta-action names.
             messages: what helpers have sent, for the ego: `sender`, `evidence`, `risk`, `intent`,
                 `recommended_maneuver`, `confidence`.
+            words: what the scenario says of itself, by name.
         """
         objects = shown(graph, self.max_objects - bool(messages))
         variables = {
@@ -116,6 +123,7 @@ class Prompt:
             "objects": objects,
             "more": len(graph["nodes"]) - len(objects),
             "messages": messages,
+            "words": words,
         }
         template = self._templates[graph["role"]]
         try:
@@ -127,7 +135,8 @@ class Prompt:
         except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
-                "it needs the blocks system and user, and may use graph, actions, objects, more, messages"
+                "it needs the blocks system and user, and may use graph, actions, objects, more, messages, "
+                "words"
             ) from None
 
 

@@ -10,7 +10,6 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
-from harness.evaluate.replay import scene_of
 from harness.parsing.parse import spans
 from harness.parsing.status import Status
 from harness.prompts import readout, versions
@@ -19,6 +18,7 @@ from harness.report.choose import failures, pick
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.records import Answer, Decision
+from harness.world import scenarios
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
@@ -45,7 +45,8 @@ def prompts_of(run: Run) -> Sent | None:
         return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
+        words = scenarios.get(scene.state.scenario).words
+        messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
         return readout.asked(messages, actions) if run.manifest.answer == "readout" else messages
 
     return sent
@@ -96,6 +97,8 @@ class Decisions:
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling moments, played again; none where this simulator is not what the run's was."""
+        from harness.evaluate.replay import scene_of  # loads the simulator
+
         telling = [
             scene
             for run, of in zip(self._runs.runs, failed, strict=True)

@@ -20,7 +20,7 @@ from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
-from harness.report.drawing.geometry import VIEW_M, roads
+from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
 from harness.runs.records import Latency
@@ -100,7 +100,7 @@ def render(
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     """What the page's script has to know of the runs, besides the decisions."""
-    outline, marks, stops = roads()
+    surface = ground_of(runs.scenario)
     return {
         "names": runs.names,
         "runs": [
@@ -116,8 +116,8 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         ],
         "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
         "ground": {
-            "view_m": VIEW_M, "outline": outline.round(2).tolist(),
-            "marks": [m.tolist() for m in marks], "stops": [s.tolist() for s in stops],
+            "view_m": VIEW_M, "outline": surface.outline.round(2).tolist(),
+            "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},
         "policies": policies(),

@@ -10,7 +10,9 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.folder import Run, dataset_of, read
-from harness.runs.records import FrozenScenes
+from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,15 @@ class Runs:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the order of every distribution."""
         return self.runs[0].actions
+
+    @property
+    def scenario(self) -> Scenario:
+        """What they decided in."""
+        if self.dataset is not None:
+            return self.dataset.scenario
+        world = self.runs[0].manifest.world
+        assert isinstance(world, ClosedLoop)
+        return scenarios.get(world.scenario["name"])
 
     @property
     def conditions(self) -> tuple[str, ...]:

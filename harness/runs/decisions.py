@@ -38,6 +38,8 @@ DECIMALS = {  # that are kept: enough for every figure, and the same on every ma
     "arrival_ms": 3, "weight": 6,
 }  # fmt: skip
 
+ROWS = 2048  # that are made mappings at a time
+
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
     """Names and types of the columns, in the order of the file."""
@@ -80,6 +82,7 @@ class Decisions:
     actions: tuple[str, ...]
     helpers: int
     _arrays: dict[str, Floats] = field(default_factory=dict, repr=False, compare=False)
+    _rows: dict[int, list[dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
@@ -104,13 +107,12 @@ class Decisions:
     def __getitem__(self, name: str) -> Floats:
         """Numbers or flags (n,) as floats; NaN where unknown."""
         if name not in self._arrays:
-            column = self.table[name].cast(NUMBER).combine_chunks()
-            self._arrays[name] = column.to_numpy(zero_copy_only=False)
+            self._arrays[name] = _values(self.table[name].cast(NUMBER), np.nan, np.float64)
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
         """Whole numbers (n,)."""
-        return self[name].astype(np.int64)
+        return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
         """Whether it is known to be so, (n,)."""
@@ -136,7 +138,7 @@ class Decisions:
         if others := [label for label in own if label not in position]:
             raise ValueError(f"unknown {name} {others[0]!r}")
         lookup = np.array([*(position[label] for label in own), -1])
-        return cast(Ints, lookup[column.indices.fill_null(len(own)).to_numpy(zero_copy_only=False)])
+        return cast(Ints, lookup[_values(column.indices, len(own), np.int32)])
 
     def labels(self, name: str) -> list[str | None]:
         """Labels (n,)."""
@@ -146,7 +148,7 @@ class Decisions:
     def scenes(self) -> dict[str, range]:
         """The rows of each decision point, in order. Raises ValueError unless they stand together."""
         codes = self.table["scene"].combine_chunks()
-        changes = np.flatnonzero(np.diff(codes.indices.to_numpy(zero_copy_only=False))) + 1
+        changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]
         names = codes.dictionary.to_pylist()
         found = {
@@ -160,8 +162,14 @@ class Decisions:
 
     def records(self, start: int, stop: int) -> list[Decision]:
         """Some rows, one by one."""
-        rows = self.table.slice(start, stop - start).to_pylist()
-        return [self._record(row) for row in rows]
+        return [self._record(self._row(place)) for place in range(start, stop)]
+
+    def _row(self, place: int) -> Mapping[str, Any]:
+        chunk, n = divmod(place, ROWS)
+        if chunk not in self._rows:  # the last is kept, since rows are read in order
+            self._rows.clear()
+            self._rows[chunk] = self.table.slice(chunk * ROWS, ROWS).to_pylist()
+        return self._rows[chunk][n]
 
     def _record(self, row: Mapping[str, Any]) -> Decision:
         messages = tuple(
@@ -180,7 +188,8 @@ class Decisions:
 
     def take(self, which: Any) -> "Decisions":
         """Some of the decisions, by their positions."""
-        return Decisions(self.table.take(pa.array(which)), self.actions, self.helpers)
+        places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
+        return Decisions(self.table.take(places), self.actions, self.helpers)
 
     def replace(self, **columns: Any) -> "Decisions":
         """The same with other arrays (n,) in some columns."""
@@ -201,9 +210,13 @@ class Decisions:
         return self.replace(**{column: self[column].round(kept) for column, kept in decimals.items()})
 
     def write(self, path: Path) -> None:
-        """Replace a Parquet file."""
+        """Replace a Parquet file. Equal rows give equal bytes: names are numbered as rows first have them."""
+        columns = [
+            column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
+            for column in self.table.combine_chunks().columns
+        ]
         with replacing(path) as part:
-            pq.write_table(self.table, part, compression="zstd")
+            pq.write_table(pa.table(columns, schema=self.table.schema), part, compression="zstd")
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
@@ -226,10 +239,35 @@ class Decisions:
         return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
 
 
+# Where pyarrow turns what is not its own into an array, or the reverse, it loads pandas: buffers spare that.
+
+
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
+    """A column of an array or of `Labels`; null where it is NaN or no label."""
     if isinstance(values, Labels):
-        codes = pa.array(values.codes.astype(np.int32), mask=values.codes < 0)
-        return pa.DictionaryArray.from_arrays(codes, pa.array(list(values.names), pa.string()))
-    if kind == FLAG and values.dtype != bool:
-        return pa.array(values == 1.0, mask=np.isnan(values))
-    return pa.array(np.ascontiguousarray(values), kind, from_pandas=kind == NUMBER)
+        codes = _of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
+        texts = [name.encode() for name in values.names]
+        ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        names = pa.StringArray.from_buffers(len(texts), pa.py_buffer(ends), pa.py_buffer(b"".join(texts)))
+        return pa.DictionaryArray.from_arrays(codes, names)
+    if kind == WHOLE:
+        return _of_buffer(values.astype(np.int64), None, kind)
+    numbers = values.astype(np.float64)
+    return _of_buffer(numbers, ~np.isnan(numbers), NUMBER).cast(kind)
+
+
+def _of_buffer(values: Any, known: Any, kind: pa.DataType) -> pa.Array:
+    mask = None if known is None else pa.py_buffer(np.packbits(known, bitorder="little"))
+    return pa.Array.from_buffers(kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))])
+
+
+def _values(column: Any, unknown: float | int, kind: type) -> Any:
+    """A column's values (n,), `unknown` in place of nulls."""
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    mask, data = array.buffers()
+    values: Any = np.frombuffer(data, kind, len(array), array.offset * np.dtype(kind).itemsize)
+    if not array.null_count:
+        return values
+    end = array.offset + len(array)
+    known = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
+    return np.where(known, values, unknown)

@@ -16,6 +16,8 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 from msgspec import Struct
 
 from harness.core.errors import UserError, printable
@@ -39,6 +41,7 @@ _BROKEN = (
     OverflowError,
     csv.Error,
 )
+_KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 _ANSWER = msgspec.json.Decoder(Answer)
 _ENCODER = msgspec.json.Encoder()
 
@@ -237,23 +240,30 @@ def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str,
     return text.getvalue()
 
 
-@uncollected()
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
-    with file.open(encoding="utf-8", newline="") as lines:
-        names, *rows = csv.reader(lines, strict=True)
-    if missing := [name for name in kind.__struct_encode_fields__ if name not in names]:
-        raise ValueError(f"it lacks {', '.join(missing)}")
-    hints = zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True)
-    optional = {name for name, hint in hints if type(None) in get_args(hint)}
-    columns = [
-        [text or None for text in column] if name in optional else column
-        for name, column in zip(names, zip(*rows, strict=True), strict=True)
-    ]
-    lines_by_name = [dict(zip(names, line, strict=True)) for line in zip(*columns, strict=True)]
-    return tuple(msgspec.convert(lines_by_name, list[kind], strict=False))  # type: ignore[valid-type]
+    hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
+    optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
+    with file.open("rb") as lines:
+        table = pacsv.read_csv(
+            lines,
+            parse_options=pacsv.ParseOptions(newlines_in_values=True),
+            convert_options=pacsv.ConvertOptions(
+                column_types={name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()},
+                include_columns=list(hints), null_values=[""], true_values=["True"], false_values=["False"],
+            ),
+        )  # fmt: skip
+    columns = {}
+    for field, name, column in zip(kind.__struct_fields__, hints, table.columns, strict=True):
+        values = column.to_pylist()
+        if name in optional:
+            values = [None if value == "" else value for value in values]
+        elif column.null_count:
+            raise ValueError(f"{name} is unknown in some rows")
+        columns[field] = values
+    rows = zip(*columns.values(), strict=True)
+    return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
-@uncollected()
 def _answers(file: Path, actions: int) -> list[Answer]:
     answers = _ANSWER.decode_lines(file.read_bytes())
     for answer in answers:
@@ -265,7 +275,8 @@ def _answers(file: Path, actions: int) -> list[Answer]:
 def whole(file: Path, reader: Callable[[Path], T]) -> T:
     """What a reader makes of a file. Raises UserError if it is broken."""
     try:
-        return reader(file)
+        with uncollected():
+            return reader(file)
     except _BROKEN as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{printable(file)} is broken ({printable(reason)}); make the run again") from None

@@ -1,4 +1,4 @@
-"""What can be swept: one setting of the operating point, or the number of vehicles."""
+"""What can be swept: any setting of the operating point, or the number of vehicles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness.coordination.consensus import POOLS, names
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import POINTS, SETTINGS, OperatingPoint, setting_of
 from harness.core.errors import UserError, printable, unknown
 
 MOST_POINTS = 1000
@@ -23,7 +23,7 @@ class Axis:
         label: what an axis of a figure says, with its unit.
         field: the operating point's setting; None for the number of vehicles.
         scale: what a value is multiplied by to be that setting.
-        usual: the grid if none is given.
+        usual: the grid if none is given; empty if one must be.
     """
 
     name: str
@@ -36,7 +36,13 @@ class Axis:
         """The operating point with this setting. Raises UserError where it is not allowed."""
         if self.field is None:
             return point
-        setting = value if isinstance(value, str) else value * self.scale
+        setting: object
+        if isinstance(value, str):
+            setting = setting_of(self.field, value)
+        else:
+            setting = scaled = value * self.scale
+            if isinstance(getattr(point, self.field), int) and scaled == int(scaled):
+                setting = int(scaled)
         # A given loss stands in place of one that follows the number of vehicles.
         freed = replace(point, density_coupled=False) if self.field == "loss" else point
         return replace(freed, **{self.field: setting})  # type: ignore[arg-type]
@@ -56,10 +62,12 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """An axis by name. Raises UserError if there is none."""
-    if name not in AXES:
-        raise unknown("--over", name, AXES)
-    return AXES[name]
+    """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
+    if name in AXES:
+        return AXES[name]
+    if name not in SETTINGS:
+        raise unknown("--over", name, (*AXES, *SETTINGS))
+    return Axis(name, name.replace("_", " "), name, 1.0, "")
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
@@ -68,10 +76,12 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     Raises:
         UserError: it is none, or too long.
     """
+    if not text and not axis.usual:
+        raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
-    if axis.name == "consensus":
+    if axis.field and isinstance(getattr(POINTS["6g"], axis.field), str | bool):
         for part in parts:
-            if part not in names():
+            if axis.field == "consensus" and part not in names():
                 raise unknown("--grid", part, names())
         return tuple(dict.fromkeys(parts))
     found = [value for part in parts for value in _values(axis, part)]
@@ -91,6 +101,6 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
             raise ValueError
     except (ValueError, ZeroDivisionError):
         raise UserError(
-            f"--grid {printable(part)}: give numbers such as {axis.usual}, a list or from:to:step"
+            f"--grid {printable(part)}: give numbers such as {axis.usual or '0,1,2'}, a list or from:to:step"
         ) from None
     return [round(low + i * step, 10) for i in range(int(steps + 1e-9) + 1)]

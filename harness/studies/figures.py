@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE
 from harness.report.drawing.pictures import FORMATS, save, styled
-from harness.studies.axes import AXES
+from harness.studies.axes import axis_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,7 +124,7 @@ def _along(axes: Any, panel: "pd.DataFrame", best_band: bool) -> None:
         second.set_ylim(0, 112 if metric == "trigger_rate" else None)
     if variable == "tau" and best_band:
         axes.axvspan(*BEST_BAND, color="#ECECEC", zorder=0, label="best band of the paper")
-    axes.set(xlabel=AXES[variable].label, ylabel="success, %")
+    axes.set(xlabel=axis_of(variable).label, ylabel="success, %")
     _plain(axes)
 
 

@@ -82,7 +82,12 @@ class Stored:
         }  # fmt: skip
 
     def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
-        """All episodes, with the ego and so many of the nearest vehicles."""
+        """All episodes, with the ego and so many of the nearest vehicles.
+
+        Raises:
+            UserError: the point has the run's model fuse, and it cannot.
+        """
+        replace(self._asker.spec, points=(point,))
         world = FrozenWorld(self._dataset, seeds)
         columns, places = walk_through(world, point, _Nearest(self, vehicles - 1), seeds, world.numbers)
         verdicts = world.verdicts(point)

@@ -9,7 +9,7 @@ import numpy as np
 from harness.core import noise as luck
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, Scene
-from harness.prompts.versions import Prompt
+from harness.prompts.versions import NO_WORDS, Prompt
 from harness.training.answers import message
 from harness.training.teacher import labels
 
@@ -40,16 +40,18 @@ def alone(dataset: Dataset, prompts: Sequence[Prompt]) -> Iterator[Question]:
     for scene, label in zip(dataset.scenes, labels(dataset), strict=True):
         for viewer, graph in scene.record["graphs"].items():
             for prompt in prompts:
-                sent = prompt.render(graph, dataset.actions)
+                sent = prompt.render(graph, dataset.actions, words=dataset.scenario.words)
                 yield Question(_key(scene, viewer, prompt), prompt, graph, sent, label)
 
 
-def excerpts(questions: Sequence[Question], actions: tuple[str, ...]) -> Iterator[Question]:
+def excerpts(
+    questions: Sequence[Question], actions: tuple[str, ...], words: Mapping[str, str] = NO_WORDS
+) -> Iterator[Question]:
     """The same questions with nothing in them but the conflicts; those that have any."""
     for q in questions:
         if q.graph["conflicts"]:
             graph = {**q.graph, "nodes": [], "sectors": []}
-            yield replace(q, graph=graph, messages=q.prompt.render(graph, actions))
+            yield replace(q, graph=graph, messages=q.prompt.render(graph, actions, words=words))
 
 
 def with_messages(
@@ -67,7 +69,7 @@ def with_messages(
                 for h in heard
             ]
             if said:
-                sent = prompt.render(graphs[ego], dataset.actions, said)
+                sent = prompt.render(graphs[ego], dataset.actions, said, dataset.scenario.words)
                 yield Question(f"{_key(scene, ego, prompt)}+m", prompt, graphs[ego], sent, label)
 
 

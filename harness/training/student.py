@@ -100,7 +100,7 @@ class Student:
 
     def excerpts_stage(self) -> list[Sample]:
         """The read-out and the report of prompts that show nothing but conflicts."""
-        return self.reading(list(excerpts(self.questions, self.actions)))
+        return self.reading(list(excerpts(self.questions, self.actions, self.data.scenario.words)))
 
     def alone_stage(self) -> list[Sample]:
         """Every viewer's read-out and report: what to look at, and how near it comes."""

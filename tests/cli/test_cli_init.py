@@ -39,7 +39,7 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
     assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
     code, out, err = harness("eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json")
     assert (code, err) == (0, "")
-    assert json.loads(out)["manifest"]["dataset"]["path"] == str(project / "datasets/mine")
+    assert json.loads(out)["manifest"]["world"]["path"] == str(project / "datasets/mine")
 
 
 def test_its_own_are_found_beside_those_that_ship_and_only_there(

@@ -21,6 +21,7 @@ from harness.report.compare.difference import Comparison, Difference, Flip, comp
 from harness.report.compare.gate import NAMES
 from harness.report.compare.pair import pair
 from harness.runs.metrics import METRICS
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
@@ -265,7 +266,7 @@ def test_live_runs_are_compared_with_live_runs(
 def test_what_cannot_be_compared_is_refused(
     runs: tuple[Path, Path], small: Dataset, tmp_path: Path, harness: Callable[..., Said]
 ) -> None:
-    build(tmp_path / "data", 1, 7, 1, lambda done: None)
+    build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
     points = (POINTS["6g"],)
     other = evaluate(spec_of(load(tmp_path / "data"), points=points, seeds=SEEDS), tmp_path / "other").out
     luck = evaluate(spec_of(small, points=points, seeds=(0, 2)), tmp_path / "luck").out

@@ -1,6 +1,5 @@
 """A driven episode, played again and drawn."""
 
-import json
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -8,9 +7,10 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from driving import FROM_LEFT, spec
-from harness.evaluate.drive import run
+from driving import FROM_LEFT
+from evaluating import live_spec_of, run
 from PIL import Image, ImageSequence
+from run_on_disk import made_up
 
 from harness.cli import main
 from harness.core.errors import UserError
@@ -21,7 +21,7 @@ from harness.report.drawing.video import write_video
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("driven") / "run"
-    run(spec(episodes=3, first_seed=FROM_LEFT), folder, False, 1, lambda done: None)
+    run(live_spec_of(episodes=3, first_seed=FROM_LEFT), folder)
     return folder
 
 
@@ -118,12 +118,9 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
         ((out, 3, None, None), "give 0 to 2"),
         ((out, 0, "5g", None), "unknown condition '5g'"),
         ((out, 0, None, 9), "unknown seed '9'"),
-        ((tmp_path, 0, None, None), "is no run.* made by `harness drive`"),
+        ((tmp_path, 0, None, None), "is no finished run.* or `harness drive`"),
     ):
         with pytest.raises(UserError, match=says):
             find(*arguments)
-    frozen = tmp_path / "frozen"
-    frozen.mkdir()
-    (frozen / "run.json").write_text(json.dumps({"format": "swarmdrive-run/1"}))
-    with pytest.raises(UserError, match=r"has format 'swarmdrive-run/1'.* made by `harness drive`"):
-        find(frozen, 0, None, None)
+    with pytest.raises(UserError, match=r"was made by `harness eval`; give a folder made by `harness drive`"):
+        find(made_up(tmp_path / "frozen"), 0, None, None)

@@ -11,7 +11,7 @@ from jsonschema import Draft202012Validator
 from jsonschema.validators import extend
 
 from harness.dataset.load import Dataset, find
-from harness.dataset.schema import Manifest, Record, manifest_schema, record_schema
+from harness.dataset.schema import Manifest, manifest_schema, record_schema, record_type
 
 LEAF = (
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.sampled_from(["v1", "left"])
@@ -49,26 +49,26 @@ def fits(value: Any, kind: type) -> bool:
 def test_the_published_schemas_are_schemas_and_allow_what_is_released(small: Dataset):
     record = json.loads((RELEASED / "scenes.jsonl").read_text().partition("\n")[0])
     manifest = json.loads((RELEASED / "manifest.json").read_text())
-    for schema, value in ((record_schema(small.actions), record), (manifest_schema(), manifest)):
+    for schema, value in ((record_schema(small.scenario), record), (manifest_schema(), manifest)):
         Draft202012Validator.check_schema(schema)
         WholeNumbers(schema).validate(value)
 
 
 def test_every_frozen_record_fits(small: Dataset):
-    assert all(fits(scene.record, Record) for scene in small.scenes)
+    assert all(fits(scene.record, record_type(small.scenario)) for scene in small.scenes)
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
     record = changed(data.draw(st.sampled_from(small.scenes)).record, data)
-    now = WholeNumbers(record_schema(small.actions))
+    now = WholeNumbers(record_schema(small.scenario))
     if WholeNumbers(released_schema("scene")).is_valid(record):
         assert now.is_valid(record)
     if now.is_valid(record):
-        assert fits(record, Record)
+        assert fits(record, record_type(small.scenario))
     whose = (record.get("behaviour"), record.get("outcomes"))
-    if fits(record, Record):  # what the actions are stands in the manifest
+    if fits(record, record_type(small.scenario)):  # what the actions are stands in the manifest
         actions = {whose[0]["action"], *whose[1]}
         assert now.is_valid(record) == (actions == set(small.actions))
 

@@ -7,10 +7,10 @@ from typing import Any
 import pandas as pd
 import pytest
 from evaluating import figure, run, spec_of
-from harness.evaluate.evaluate import Evaluated
 
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
+from harness.evaluate.run import Evaluated
 from harness.studies.axes import AXES, grid
 from harness.studies.stored import Stored
 from harness.studies.sweep import run_sweep, settings

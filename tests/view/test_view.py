@@ -17,6 +17,7 @@ from viewing import configure, names, said
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
@@ -135,7 +136,7 @@ def test_what_cannot_be_shown_is_one_readable_line(
     (reports / "cut/decisions.parquet").unlink()
     (reports / "garbled/decisions.parquet").write_text("{")
     if "other" in address:
-        build(tmp_path / "data", 1, 7, 1, lambda done: None)
+        build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
         evaluate(spec_of(load(tmp_path / "data")), reports / "other")
     answer = browser.get(address)
     assert answer.status_code == 400

@@ -1,4 +1,4 @@
-"""What stands still in a picture of a scene: the junction's roads and the buildings around it."""
+"""What stands still in a picture of a scene: its roads and the buildings around them."""
 
 from collections.abc import Iterable
 
@@ -9,14 +9,20 @@ from matplotlib.patches import Polygon
 
 from harness.core.errors import printable
 from harness.report.drawing.colours import INK
-from harness.report.drawing.geometry import VIEW_M, north_up, roads
+from harness.report.drawing.geometry import VIEW_M, ground_of, north_up
+from harness.world.scenario import Scenario
 from harness.world.state import Building
 
 TEXT_PT = 6.5
 ROAD, WALL, PAPER = "#C9CCD1", "#EAE4D6", "#F7F7F4"
 
 
-def ground(figure: Figure, place: tuple[float, float, float, float], buildings: Iterable[Building]) -> Axes:
+def ground(
+    figure: Figure,
+    place: tuple[float, float, float, float],
+    scenario: Scenario,
+    buildings: Iterable[Building],
+) -> Axes:
     """Axes at a place of the figure, with roads, lane marks, buildings, a scale and where north is."""
     axes = figure.add_axes(place)
     axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[], facecolor=PAPER)
@@ -25,10 +31,11 @@ def ground(figure: Figure, place: tuple[float, float, float, float], buildings: 
         axes.add_patch(Polygon(corners, facecolor=WALL, edgecolor="#A79F8A", linewidth=0.8))
         x, y = np.sign(corners.mean(axis=0)) * (VIEW_M - 13.0)
         axes.text(x, y, printable(building.id), color="#877E68", size=TEXT_PT, ha="center", va="center")
-    outline, marks, stops = roads()
-    axes.add_patch(Polygon(outline, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
-    for mark, stop in zip(marks, stops, strict=True):
+    surface = ground_of(scenario)
+    axes.add_patch(Polygon(surface.outline, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
+    for mark in surface.marks:
         axes.plot(*mark.T, color="white", linewidth=1.0, dashes=(5, 4))
+    for stop in surface.stops:
         axes.plot(*stop.T, color="white", linewidth=2.0, solid_capstyle="butt")
     axes.plot([-76, -56], [-76, -76], color=INK, linewidth=1.5, solid_capstyle="butt")
     axes.text(-66, -74.8, "20 m", size=TEXT_PT, ha="center", va="bottom")

@@ -17,7 +17,7 @@ from harness.report.drawing.geometry import VIEW_M, conflict_points, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
-from harness.world.road import LANE_WIDTH_M
+from harness.world import scenarios
 from harness.world.state import VehicleState
 
 SIDE_IN = 5.8  # of the square that shows it
@@ -60,10 +60,11 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN + 1.12))
     height = figure.get_figheight()
     place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height
-    axes = ground(figure, place, scene.state.buildings)
+    scenario = scenarios.get(scene.state.scenario)
+    axes = ground(figure, place, scenario, scene.state.buildings)
     labels = Labels(axes, PT_PER_M, TEXT_PT, VIEW_M)
-    for road in ([LANE_WIDTH_M, VIEW_M], [VIEW_M, LANE_WIDTH_M]):
-        labels.discourage(np.array([road, road]) * [[-1.0], [1.0]])
+    for box in scenario.road().ground(VIEW_M).boxes:
+        labels.discourage(box)
     _sight_lines(axes, scene, viewer, seen)
     for vehicle in scene.state.vehicles:
         _vehicle(axes, labels, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)

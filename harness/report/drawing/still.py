@@ -1,7 +1,8 @@
 """One still of a driven episode, from above: what moves is drawn over a ground that was drawn once."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import cycle
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -20,7 +21,6 @@ from harness.report.drawing.colours import BLUE, GREEN, GREY, INK, ORANGE, PURPL
 from harness.report.drawing.geometry import VIEW_M, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.scene import style_of
-from harness.world.scenarios.occluded_intersection import ACTIONS
 from harness.world.state import Building, VehicleState, WorldState
 
 Pixels = NDArray[np.uint8]  # (height, width, 3)
@@ -34,13 +34,14 @@ class Canvas:
     """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
 
     def __init__(self, played: Played, buildings: Iterable[Building]) -> None:
-        self.played = played
+        self.played, self.actions = played, played.scenario.actions
         height = SIDE_IN + BARS_IN
         self.figure = Figure(figsize=(SIDE_IN, height), dpi=DPI)
-        self.axes = ground(self.figure, (0.0, BARS_IN / height, 1.0, SIDE_IN / height), buildings)
+        place = 0.0, BARS_IN / height, 1.0, SIDE_IN / height
+        self.axes = ground(self.figure, place, played.scenario, buildings)
         self.bars = self.figure.add_axes((0.62, 0.28 / height, 0.35, 0.8 / height))
-        self.bars.set(xlim=(0, 1), ylim=(len(ACTIONS) - 0.5, -0.5), xticks=[0, 0.5, 1])
-        self.bars.set_yticks(range(len(ACTIONS)), labels=ACTIONS, size=7)
+        self.bars.set(xlim=(0, 1), ylim=(len(self.actions) - 0.5, -0.5), xticks=[0, 0.5, 1])
+        self.bars.set_yticks(range(len(self.actions)), labels=self.actions, size=7)
         self.bars.tick_params(labelsize=6, length=2)
         self.lines = [self.figure.text(0.02, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
         self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
@@ -58,7 +59,7 @@ class Canvas:
             self._over(_vehicle(vehicle, vehicle.id in (*seen[ego.id], ego.id)))
         self._over(_names(still.state.vehicles))
         self._over(*_messages(self.played, still))
-        for bar in _bars(still):
+        for bar in _bars(still, self.actions):
             self.bars.add_artist(bar)
             self.bars.draw_artist(bar)
             bar.remove()
@@ -80,7 +81,7 @@ class Canvas:
 
 def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
-    for colour, (viewer, ids) in zip(EYES, seen.items(), strict=True):
+    for colour, (viewer, ids) in zip(cycle(EYES), seen.items(), strict=False):
         lines = [np.array([at[viewer], at[other]]) for other in ids]
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
@@ -125,9 +126,9 @@ def _messages(played: Played, still: Still) -> Iterator[Artist]:
             yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
 
 
-def _bars(still: Still) -> Iterator[Artist]:
+def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
     """The policy of the last decision, pale until it is ready."""
     decision = still.decision
-    for n, (action, p) in enumerate(zip(ACTIONS, decision.fused, strict=True)):
+    for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
         colour = VERMILLION if action == decision.action else "#BBBBBB"
         yield Rectangle((0.0, n - 0.4), p, 0.8, color=colour, alpha=0.35 if still.open else 1.0)
