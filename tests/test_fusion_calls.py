@@ -348,7 +348,7 @@ def test_a_resumed_runs_fusion_calls_take_as_long_as_an_uninterrupted_runs(
     spec = measured(small, batch_size=1)
     whole = run(spec, tmp_path / "whole")
     assert whole.manifest.latency == EACH_ITS_OWN
-    killed(spec, tmp_path / "run", "made", after=40)
+    killed(spec, tmp_path / "run", "made", after=20)
     resumed = run(spec, tmp_path / "run", resume=True)
     assert same_files(tmp_path / "run", tmp_path / "whole")
     assert resumed.manifest.latency == whole.manifest.latency
