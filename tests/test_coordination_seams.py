@@ -231,8 +231,10 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    assert OperatingPoint("x", "slow-radio").channel().latency_s == 0.5
-    assert OperatingPoint("x", "v2x").channel().latency_s == 0.025
+    slow, v2x = (OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x"))
+    assert isinstance(slow, Radio)
+    assert isinstance(v2x, Radio)
+    assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
         UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"

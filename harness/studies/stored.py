@@ -71,7 +71,7 @@ class Stored:
         own = latencies.kept(folder / TIMES) or manifest.latency
         self._asker = Asker(
             self._spec(), self._open, latencies.PAPER if latency == "paper" else own, folder / CALLS,
-            {answer.id: answer for answer in self.run.answers}, done, more, whole_chunks=False,
+            {answer.id: answer for answer in self.run.answers}, done, more,
         )  # fmt: skip
         self._world = lru_cache(maxsize=2)(partial(FrozenWorld, self._dataset))
         self._intents: dict[str, Intents] = {}  # of each step, by the first of its scenes
