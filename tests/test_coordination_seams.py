@@ -191,11 +191,11 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with a channel, and with three entries that do not work."""
+    """A package with a channel, and with four entries that do not work."""
     register(
         tmp_path,
         "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
-        "broken = radios:NONE\nodd = radios:ODD\n",
+        "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\n",
         radios="from harness.coordination.channel import Radio\n"
         "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
         "ODD = 7\n",
@@ -210,7 +210,7 @@ def test_a_package_adds_a_channel_and_replaces_none():
     assert OperatingPoint("x", "v2x").channel().latency_s == 0.025
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
-        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"
+        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, unmade, v2x"
     ):
         OperatingPoint("x", "slowradio")
 
@@ -226,6 +226,10 @@ def test_a_package_adds_a_channel_and_replaces_none():
         (
             "odd",
             r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair",
+        ),
+        (
+            "unmade",
+            r"plug-in 'unmade' \(swarmdrive.channels\): radios:Radio is of type type and no Channel; repair",
         ),
     ],
 )
