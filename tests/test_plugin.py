@@ -28,6 +28,8 @@ SMOOTHED, FOG_SMOOTHED, CLOSE = "6g:consensus=smoothing", "fog:consensus=smoothi
 FROZEN, DRIVEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE), (SMOOTHED, FOG_SMOOTHED)
 ACTIONS, PLACES = ("SLOWER", "IDLE", "FASTER"), (1, 2, 3)
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
