@@ -113,7 +113,7 @@ def highway_envs_own() -> Iterator[None]:
 
 def drive(spec: Spec, numbers: range) -> list[Episode]:
     """Walk some episodes and lay their decisions out as a table."""
-    world = LiveWorld(0, numbers, spec.points, spec.seeds, spec.ego_alone)
+    world = LiveWorld(SCENARIO, 0, numbers, spec.points, spec.seeds, spec.ego_alone)
     asker = Asker(spec, Proxy, LATENCY)
     decided = [part for step in walk(world, spec.points, asker) for part in step]
     table(decided, world.columns(), spec.actions)

@@ -81,7 +81,7 @@ def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None
         assert same == (name in NOT_IN_KEY), name
 
 
-@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "view", "truth"}))
+@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "view", "truth", "scenario"}))
 def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str, file: Path) -> None:
     talker = Talker()
     Cached(talker, file).complete([BASE])
@@ -293,7 +293,7 @@ def test_batches_are_timed_though_every_answer_is_kept(
     for name in ("first", "again"):
         done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=4)
         assert done.manifest.latency.n["ego"] > 0
-        assert (done.manifest.latency.ego_s or 0) > 0
+        assert done.manifest.latency.ego_s > 0
     assert done.manifest.cached_answers > 0
 
 
@@ -321,7 +321,6 @@ def test_one_by_one_with_every_answer_kept_a_sample_is_timed(
         done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=1)
     latency = done.manifest.latency
     assert latency.n["ego"] > 0
-    assert latency.ego_s is not None
     assert all(a.seconds is None for a in answers_of(tmp_path / "again"))
     for decision in decisions(tmp_path / "again", "single-local"):
         assert decision.latency_ms == pytest.approx(1000 * latency.ego_s, abs=1e-3)

@@ -1,6 +1,7 @@
 """Which replies cross, and when they have arrived."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 from harness.coordination.channel import CHANNELS, NO_CHANNEL, Draws, Links, density_coupled_loss, link_up
 from harness.core.noise import uniforms
 
-V2X, SIXG = CHANNELS["v2x"], CHANNELS["6g"]
+V2X: Any = CHANNELS["v2x"]
+SIXG: Any = CHANNELS["6g"]
 RANGE_M = np.array([10.0, 20.0, 30.0])
 ALL = np.array([True, True, True])
 NONE_S = np.zeros(3)

@@ -160,7 +160,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
     assert "prompt tokens: not counted" in said.out
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
-    assert (told["requests"], told["seeds"], told["limit"]) == (24, [0, 1, 2, 3, 4], None)
+    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (24, [0, 1, 2, 3, 4], None)
     assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
 
 

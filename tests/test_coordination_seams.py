@@ -206,8 +206,10 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    channels = [OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x")]
-    assert [channel.latency_s for channel in channels if isinstance(channel, Radio)] == [0.5, 0.025]
+    slow, v2x = (OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x"))
+    assert isinstance(slow, Radio)
+    assert isinstance(v2x, Radio)
+    assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
         UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, unmade, v2x"

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.backends import cards
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, Request, Role
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
 from harness.evaluate import latency as latencies
@@ -295,7 +295,7 @@ EACH_ITS_OWN = Latency("measured", "each answer alone, batch 1", None, None)
 def test_an_answer_without_a_time_takes_its_roles_median(small: Dataset) -> None:
     asked = {r.role: r for r in requests(spec_of(small), small.scenes[:1])}
 
-    def took(role: str, seconds: float | None, slow_s: float = 0.0) -> Answer:
+    def took(role: Role, seconds: float | None, slow_s: float = 0.0) -> Answer:
         completion = Completion(
             asked[role].id, sure("IDLE", role), None, None, "stop", seconds, 1, slow_s=slow_s
         )

@@ -108,20 +108,24 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
 
 
 class Cached:
-    """A backend whose answers are kept, but for errors. One that was kept has no seconds."""
+    """A backend whose answers are kept, but for errors. One that was kept has no seconds.
+
+    Attributes:
+        backend: who is asked for what is not kept.
+    """
 
     def __init__(self, backend: Rendering, file: Path) -> None:
-        self._backend = backend
+        self.backend = backend
         self._identity = backend.identity()
         self._file: CompletionFile | None = CompletionFile(file)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in the same order; the backend is asked for those that are not kept."""
-        prompts = self._backend.rendered(requests)
+        prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
         kept = self._try(lambda file: file.find(keys)) or {}
         owed = [r for k, r in zip(keys, requests, strict=True) if k not in kept]
-        asked = iter(self._backend.complete(owed) if owed else [])
+        asked = iter(self.backend.complete(owed) if owed else [])
         done = [
             replace(kept[k], request_id=r.id) if k in kept else next(asked)
             for k, r in zip(keys, requests, strict=True)

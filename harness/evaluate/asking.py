@@ -17,7 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
-from harness.evaluate.latency import fusion_s, inference_s, with_fusion
+from harness.evaluate.latency import fusion_s, inference_s, lacks_fusion, with_fusion
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
 from harness.prompts import readout
@@ -69,10 +69,9 @@ def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
     """What the ego's model is asked once these helpers' messages are there; `answers` by viewer."""
-    ego = scene.viewers[0]
-    graph, heard = scene.record["graphs"][ego], messages_of(answers, senders)
+    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
     return Request(
-        id=f"{scene.id}/{'+'.join((ego, *senders))}",
+        id=_fusion_id(scene, senders),
         role="ego",
         messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.words),
         actions=spec.actions,
@@ -81,6 +80,10 @@ def fusion_request(
         answer=spec.answer,
         thinking=spec.thinking,
     )
+
+
+def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
+    return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
@@ -124,7 +127,6 @@ class Asker:
         answers: Mapping[str, Answer] | None = None,
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
-        whole_chunks: bool = True,
     ) -> None:
         """An asker.
 
@@ -136,13 +138,11 @@ class Asker:
             answers: further answers that are there already, by request id.
             progress: called with the number of answers just there, those kept from before included.
             more: called with the number of fusion calls, once it is known how many there are.
-            whole_chunks: ask a chunk of fusion calls again whole where one of its answers is missing, as a
-                resumed run must; else ask only what is missing.
         """
-        self.spec, self._backend, self._kept, self._whole_chunks = spec, backend, kept, whole_chunks
+        self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency = latency
-        self.answers = {**(answers or {}), **(read_kept(kept) if kept else {})}
+        self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
         """Ask what is still owed, and keep each answer at once."""
@@ -169,27 +169,30 @@ class Asker:
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages."""
-        helpers = max(len(scene.viewers) for scene in moments) - 1
-        asked = []
-        for code in codes.tolist():
-            moment, heard = heard_in(code, helpers)
-            scene = moments[moment]
-            of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
-            senders = [scene.viewers[1 + h] for h in heard]
-            asked.append(fusion_request(self.spec, scene, of_viewers, senders))
-        owed = asked if self._whole_chunks else [r for r in asked if r.id not in self.answers]
-        self._more(len(owed))
-        self.ask(owed)
-        answers = [self.answers[request.id] for request in asked]
-        if asked and self._lacks_fusion_time(answers):
-            self.latency = with_fusion(self.latency, self._backend(), asked)
+        ids = [_fusion_id(*each) for each in _heard(moments, codes)]
+        if lacks_fusion(self.latency, self.answers) or not self.answers.keys() >= set(ids):
+            asked = self.fusion_requests(moments, codes)
+            self.ask_fusion([request for request in asked if request.id not in self.answers], asked)
+        answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
-        intents = np.array([a.intent or nothing for a in answers]).reshape(len(asked), len(nothing))
+        intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers, self.answers)).at
 
-    def _lacks_fusion_time(self, answers: Sequence[Answer]) -> bool:
-        own = self.latency.each_its_own and any(answer.seconds is not None for answer in answers)
-        return self.latency.fusion_s is None and not own
+    def fusion_requests(self, moments: Sequence[Scene], codes: Ints) -> list[Request]:
+        """What the ego's model is asked with these sets of messages."""
+        asked = []
+        for scene, senders in _heard(moments, codes):
+            of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
+            asked.append(fusion_request(self.spec, scene, of_viewers, senders))
+        return asked
+
+    def ask_fusion(self, owed: Sequence[Request], needed: Sequence[Request]) -> None:
+        """Make the fusion calls that are owed, and time some that are needed if nobody has."""
+        if owed:
+            self._more(len(owed))
+            self.ask(owed)
+        if needed and lacks_fusion(self.latency, self.answers):
+            self.latency = with_fusion(self.latency, self._backend(), needed)
 
     def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
         width, actions = max(map(len, answers)), len(self.spec.actions)
@@ -211,6 +214,14 @@ class Asker:
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)
         seconds = inference_s(self.latency, answers, self.answers)
         return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, seconds)
+
+
+def _heard(moments: Sequence[Scene], codes: Ints) -> Iterator[tuple[Scene, list[str]]]:
+    """The scene of each set of messages, and its senders."""
+    helpers = max(len(scene.viewers) for scene in moments) - 1
+    for code in codes.tolist():
+        moment, heard = heard_in(code, helpers)
+        yield moments[moment], [moments[moment].viewers[1 + h] for h in heard]
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:

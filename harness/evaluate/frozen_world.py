@@ -1,6 +1,7 @@
 """The frozen world: recorded courses of scenes, each asked once; what an action leads to is looked up."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -56,6 +57,15 @@ class FrozenSource:
         return [("--dataset", self.dataset.path), ("--limit", self.limit)]
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """The scenes of a step, their positions in the dataset, and the decisions that are due in them."""
+
+    places: Ints
+    scenes: Sequence[Scene]
+    due: Due
+
+
 class FrozenWorld:
     """Every episode of a dataset, under all conditions and seeds.
 
@@ -65,36 +75,45 @@ class FrozenWorld:
     def __init__(self, dataset: Dataset, seeds: Sequence[int]) -> None:
         self._dataset, self._seeds = dataset, seeds
         self._laid = table(dataset)
+        self._shown: list[_Shown] = []  # of each step, as far as it was observed
         self._step = -1
-        self._now: Ints = np.empty(0, dtype=int)  # the scenes of this step
         self._chosen: dict[str, Ints] = {}  # by condition, (S, n)
         self._columns: list[dict[str, Any]] = []
+
+    def undecided(self) -> "FrozenWorld":
+        """The same world before its first decision; both lay out a step's scenes and draws once."""
+        world = copy(self)
+        world._step, world._chosen, world._columns = -1, {}, []
+        return world
 
     def observe(self) -> Sequence[Scene]:
         """The scenes of the next step."""
         self._step += 1
-        steps = self._laid.index.shape[1]
-        if self._step == steps:
+        if self._step == self._laid.index.shape[1]:
             return ()
-        column = self._laid.index[:, self._step]
+        if self._step == len(self._shown):
+            self._shown.append(self._show())
+        return self._shown[self._step].scenes
+
+    def _show(self) -> "_Shown":
+        column, steps = self._laid.index[:, self._step], self._laid.index.shape[1]
         there = column >= 0
-        self._now = column[there]
-        scenes = [self._dataset.scenes[n] for n in self._now.tolist()]
+        places = column[there]
+        scenes = [self._dataset.scenes[n] for n in places.tolist()]
         n, helpers = len(scenes), max(len(scene.viewers) for scene in scenes) - 1
         at, seed = np.tile(np.arange(n), len(self._seeds)), np.repeat(self._seeds, n)
         draws = channel_draws(seed, self._laid.seeds[there][at], np.full(len(at), self._step), steps, helpers)
-        self._due = Due(at, self._laid.episodes[there][at], seed, draws)
-        return scenes
+        return _Shown(places, scenes, Due(at, self._laid.episodes[there][at], seed, draws))
 
     def due(self, point: OperatingPoint) -> Due:
         """Each scene of the step, with every seed."""
-        return self._due
+        return self._shown[self._step].due
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Look up what comes of each action."""
-        laid, n = self._laid, len(self._laid.safe)
-        place = self._now[self._due.at]
-        of_seed = np.repeat(np.arange(len(self._seeds)), len(self._now))
+        laid, n, shown = self._laid, len(self._laid.safe), self._shown[self._step]
+        place = shown.places[shown.due.at]
+        of_seed = np.repeat(np.arange(len(self._seeds)), len(shown.places))
         for part in decided:
             action = part.result.action
             chosen = self._chosen.setdefault(part.point.name, np.zeros((len(self._seeds), n), dtype=int))

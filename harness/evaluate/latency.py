@@ -11,6 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from harness.backends.base import Backend, Request, Timed
+from harness.backends.cache import Cached
 from harness.backends.registry import capabilities
 from harness.core.arrays import Floats
 from harness.core.files import write_whole
@@ -55,10 +56,12 @@ def keep(file: Path, latency: Latency) -> Latency:
 def lacks_times(answers: Mapping[str, Answer]) -> bool:
     """Whether some role has answers from the cache, which have no time, and no other that has one.
 
-    Where each answer's own time counts, a timed sample must then stand for every answer of the run.
+    Where each answer's own time counts, a timed sample must then stand for every answer of the run. Fusion
+    calls, which a resumed run may have already, are timed by themselves.
     """
-    timed_roles = {answer.role for answer in answers.values() if answer.seconds is not None}
-    return not {answer.role for answer in answers.values() if answer.cached} <= timed_roles
+    first = [answer for answer in answers.values() if not answer.heard]
+    timed_roles = {answer.role for answer in first if answer.seconds is not None}
+    return not {answer.role for answer in first if answer.cached} <= timed_roles
 
 
 def sample(items: Sequence[Any]) -> Sequence[Any]:
@@ -67,7 +70,8 @@ def sample(items: Sequence[Any]) -> Sequence[Any]:
 
 
 def timed(backend: Backend, asked: Sequence[Request]) -> Latency:
-    """The median time of a role's answers, each asked alone."""
+    """The median time of a role's answers, each asked alone, and of the backend itself."""
+    backend = backend.backend if isinstance(backend, Cached) else backend
     times: dict[str, list[float]] = {"ego": [], "helper": []}
     for request in asked:
         answer = backend.complete([request])[0]
@@ -80,6 +84,12 @@ def timed(backend: Backend, asked: Sequence[Request]) -> Latency:
         known.get("ego", fill), known.get("helper", fill), n={role: len(t) for role, t in times.items()},
         load_a_core=_load(),
     )  # fmt: skip
+
+
+def lacks_fusion(latency: Latency, answers: Mapping[str, Answer]) -> bool:
+    """Whether the time of fusion calls is still to be measured: nobody declared it, and no answer has one."""
+    own = latency.each_its_own and any(a.heard and a.seconds is not None for a in answers.values())
+    return latency.fusion_s is None and "merge" not in latency.n and not own
 
 
 def with_fusion(latency: Latency, backend: Backend, asked: Sequence[Request]) -> Latency:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend
+from harness.backends.base import Backend, Request
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
@@ -26,7 +26,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker, fusion_request, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.spec import Spec, versions
-from harness.evaluate.walk import table, walk
+from harness.evaluate.walk import heard_codes, table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.formats import CONFIG, FORMAT, WORK
@@ -117,9 +117,27 @@ def _frozen(
         if latency.each_its_own and latencies.lacks_times(asker.answers):
             asker.latency = latencies.timed(backend, list(trial()))
         latencies.keep(work / "latency.json", asker.latency)
+        if any(point.asks_again for point in spec.points):
+            calls = _fusion_calls(spec, source, asker)
+            asker.ask_fusion(calls, calls)
+            latencies.keep(work / "latency.json", asker.latency)
         with uncollected():
             walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
         return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), asker.latency)
+
+
+def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Request]:
+    """All fusion calls of a run, scene by scene: what frozen scenes show depends on no decision.
+
+    They are made before the walk, so that the time of one may count for another, whatever their steps.
+    """
+    world = FrozenWorld(source.dataset, spec.seeds)
+    asked: list[Request] = []
+    while scenes := world.observe():
+        codes = heard_codes({point: world.due(point) for point in spec.points}, asker(scenes))
+        asked += asker.fusion_requests(scenes, codes)
+    place = {scene.id: n for n, scene in enumerate(source.dataset.scenes)}
+    return sorted(asked, key=lambda request: place[request.id.partition("/")[0]])
 
 
 def _closed_loop(

@@ -132,12 +132,19 @@ def _fusion_calls(
     due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
 ) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
     """Who is heard depends on no fusion call: each set of messages that any condition hears is asked once."""
-    codes = []
+    if not any(point.asks_again for point in due):
+        return None
+    return ask.fusion_call(moments, heard_codes(due, intents))
+
+
+def heard_codes(due: Mapping[OperatingPoint, Due], intents: Intents) -> Ints:
+    """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
+    codes = [np.empty(0, dtype=int)]
     for point, each in due.items():
         if point.asks_again:
             on_time = exchange(point, intents.take(each.at), each.draws).on_time
             codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
-    return ask.fusion_call(moments, np.unique(np.concatenate(codes))) if codes else None
+    return np.unique(np.concatenate(codes))
 
 
 @lru_cache(maxsize=1 << 16)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -70,8 +71,9 @@ class Stored:
         own = latencies.kept(folder / TIMES) or manifest.latency
         self._asker = Asker(
             self._spec(), self._open, latencies.PAPER if latency == "paper" else own, folder / CALLS,
-            {answer.id: answer for answer in self.run.answers}, done, more, whole_chunks=False,
+            {answer.id: answer for answer in self.run.answers}, done, more,
         )  # fmt: skip
+        self._world = lru_cache(maxsize=2)(partial(FrozenWorld, self._dataset))
         self._intents: dict[str, Intents] = {}  # of each step, by the first of its scenes
 
     def manifest(self) -> dict[str, Any]:
@@ -88,7 +90,7 @@ class Stored:
             UserError: the point has the run's model fuse, and it cannot.
         """
         replace(self._asker.spec, points=(point,))
-        world = FrozenWorld(self._dataset, seeds)
+        world = self._world(tuple(seeds)).undecided()
         columns, places = walk_through(world, point, _Nearest(self, vehicles - 1), seeds, world.numbers)
         verdicts = world.verdicts(point)
         ends = {

@@ -98,11 +98,18 @@ def least_gap(road: Road, travelled: Floats, conflict: Mapping[str, Any]) -> Flo
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
     ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
     other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
-    # The ego's path is a line of constant x, so its discs differ in y alone.
-    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])[..., None] + DISCS_M
+    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])
     heading = its.headings_rad[np.searchsorted(its.arc_m, other_arc).clip(0, len(its.arc_m) - 1)]
-    other_x = np.interp(other_arc, its.arc_m, its.points[:, 0])[:, None] + np.cos(heading)[:, None] * DISCS_M
-    other_y = np.interp(other_arc, its.arc_m, its.points[:, 1])[:, None] + np.sin(heading)[:, None] * DISCS_M
-    squared = (crossing.x_m - other_x[:, None, :]) ** 2 + (ego_y[..., None] - other_y[:, None, :]) ** 2
-    nearest = np.sqrt(squared.min(axis=(1, 2, 3)))
+    other_x, other_y = (np.interp(other_arc, its.arc_m, along) for along in its.points.T)
+    # The ego's path is a line of constant x, so its discs differ in y alone. Of each of the other's discs the
+    # nearest is kept as it goes: arrays of all pairs would not fit into the processor's cache.
+    discs_y = [ego_y + disc for disc in DISCS_M]
+    squared = np.full(ego_y.shape, np.inf)
+    for disc in DISCS_M:
+        y = other_y + np.sin(heading) * disc
+        apart = np.abs(discs_y[0] - y)
+        for mine_y in discs_y[1:]:
+            np.minimum(apart, np.abs(mine_y - y), out=apart)
+        np.minimum(squared, apart**2 + (crossing.x_m - (other_x + np.cos(heading) * disc)) ** 2, out=squared)
+    nearest = np.sqrt(squared.min(axis=1))
     return np.asarray(nearest - 2 * DISC_RADIUS_M - MARGIN_M)

@@ -66,10 +66,10 @@ def test_an_episode_played_by_hand():
 
 def test_braking_three_frames_later_is_42_centimetres_further():
     """145 ms are 8 frames and 219 ms are 11. From 14 to 7 m/s, 0.06 s later: 0.06 s x 7 m/s."""
-    assert (frames(0.145), frames(0.219), frames(0.14), frames(0.0)) == (8, 11, 7, 0)
+    assert (frames(0.145, 50), frames(0.219, 50), frames(0.14, 50), frames(0.0, 50)) == (8, 11, 7, 0)
     south_m = []
     for latency_s in (0.145, 0.219):
-        course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s)))
+        course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s, 50)))
         [one] = Trajectory(0, World.start(SCENARIO, NO_DANGER), [course]).advance(250)
         assert one.world.state().ego.speed_mps == pytest.approx(7.0, abs=0.02)
         south_m.append(one.world.state().ego.y_m)
@@ -126,7 +126,7 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
 def test_a_driver_that_needs_no_time_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
-    outcome = live.drive_all(seed)[driver]
+    outcome = live.drive_all(SCENARIO, seed)[driver]
     assert len(episodes) == 6
     for episode in episodes:
         assert episode.success == outcome.success
@@ -192,7 +192,7 @@ def test_the_luck_is_the_frozen_runs(small):
     run = spec("cruise", points=(ALONE,), seeds=(3, 4), first_seed=first, episodes=4)
     frozen = dict(draws(spec_of(small, "proxy", points=(ALONE,)), FrozenWorld(small, (3, 4))))
     # A driver asks no helper, so the ego alone is looked at; `ego_alone` is given here to see all four.
-    closed = dict(draws(run, LiveWorld(first, range(4), run.points, run.seeds, ego_alone=False)))
+    closed = dict(draws(run, LiveWorld(SCENARIO, first, range(4), run.points, run.seeds, ego_alone=False)))
     assert closed.keys() <= frozen.keys()
     assert {step for *_, step in closed} == set(range(6))
     assert closed == {place: frozen[place] for place in closed}

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,7 +22,8 @@ from harness.world.state import WorldState
 from harness.world.world import World
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # seeds
-P, ACTIONS = SCENARIO.parameters, SCENARIO.actions
+P: Any = SCENARIO.parameters
+ACTIONS = SCENARIO.actions
 
 
 def trajectory(seed, actions=("IDLE", "SLOWER", "FASTER", "IDLE")):
