@@ -1,13 +1,18 @@
-"""Channels and rules that the harness does not have, one of each, and what holds for every plug-in."""
+"""Channels and rules that the harness does not have, one of each, and what holds for every plug-in.
 
-from dataclasses import dataclass, replace
+The two are of `tests/plugin`, here put where an entry point would put them.
+"""
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaged import register
+from swarm_extras import FOG, SMOOTHING, Fog
 
-from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Delivery, Draws, Links, Radio, link_up
-from harness.coordination.consensus import RULES, Fused, Messages, Rule, linear_pool
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Draws, Links, Radio
+from harness.coordination.consensus import RULES, Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -15,36 +20,10 @@ from harness.core.errors import UserError
 from harness.core.plugins import Plugins
 
 
-@dataclass(frozen=True)
-class Fog:
-    """A channel whose loss grows with range, so that each link has its own."""
-
-    latency_s: float = 0.01
-    loss_per_m: float = 0.01
-
-    def deliver(self, links: Links, draws: Draws) -> Delivery:
-        loss = links.range_m * self.loss_per_m
-        delay_s = np.where(links.asked, links.ready_s + self.latency_s, np.inf)
-        return Delivery(link_up(draws.link, loss), delay_s, loss)
-
-
-@dataclass(frozen=True)
-class Smooth:
-    """A rule with memory: the mean of what it would do now and of what it did at the last step."""
-
-    def start(self, batch, helpers, actions):
-        return np.full((*batch, actions), np.nan)
-
-    def fuse(self, messages, state):
-        now = linear_pool(messages.intents, messages.weights)
-        policy = np.where(np.isnan(state), now, (now + state) / 2)
-        return Fused(policy, messages.weights, policy)
-
-
 @pytest.fixture(autouse=True)
 def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CHANNELS._loaded, "fog", Fog())
-    monkeypatch.setitem(RULES._loaded, "smooth", Smooth())
+    monkeypatch.setitem(CHANNELS._loaded, "fog", FOG)
+    monkeypatch.setitem(RULES._loaded, "smoothing", SMOOTHING)
 
 
 def step(
@@ -72,7 +51,7 @@ def test_a_rule_with_memory_is_driven_step_by_step():
     The ego that hears nobody acts on its own intent, and the rule remembers that it did.
     A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
     """
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
     first = step(point, [(1.0, 0.0), (0.5, 0.5)], [True, True])
     assert first.fused.tolist() == [[0.75, 0.25], [0.5, 0.5]]
     second = step(point, [(1.0, 0.0), (0.5, 0.5)], [False, True], first.state)
@@ -85,7 +64,7 @@ def test_a_rule_with_memory_is_driven_step_by_step():
 
 
 def test_an_episode_takes_its_memory_along_wherever_its_row_is():
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
     state = step(point, [(1.0, 0.0), (0.0, 1.0)], [True, True]).state
     alone = step(point, [(0.0, 1.0)], [True], state[[1]])
     assert alone.fused.tolist() == [[0.25, 0.75]]
@@ -95,7 +74,7 @@ def test_an_episode_takes_its_memory_along_wherever_its_row_is():
 
 def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
     """Sure of the first action, it does not ask. The rule keeps half of (.9, .1) and half of (.25, .75)."""
-    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smooth")
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
     doubt = step(point, (0.0, 1.0), True)
     sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
     assert not sure.triggered
@@ -178,7 +157,7 @@ def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str)
         assert np.array_equal(batch[7], single, equal_nan=True)
 
 
-@pytest.mark.parametrize("name", [*RULES, "smooth"])
+@pytest.mark.parametrize("name", [*RULES, "smoothing"])
 def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
     rule, rng = RULES[name], np.random.default_rng(1)
     state = rule.start((20,), 3, 4)
@@ -212,18 +191,14 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with a channel, and with three entries that do not work."""
-    info = tmp_path / "radios-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: radios\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
+    """A package with a channel, and with four entries that do not work."""
+    register(
+        tmp_path,
         "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
-        "broken = radios:NONE\nodd = radios:ODD\n"
-    )
-    (tmp_path / "radios.py").write_text(
-        "from harness.coordination.channel import Radio\n"
+        "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\n",
+        radios="from harness.coordination.channel import Radio\n"
         "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
-        "ODD = 7\n"
+        "ODD = 7\n",
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(CHANNELS, "_loaded", dict(CHANNELS.built_in))
@@ -237,7 +212,7 @@ def test_a_package_adds_a_channel_and_replaces_none():
     assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
-        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, v2x"
+        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, unmade, v2x"
     ):
         OperatingPoint("x", "slowradio")
 
@@ -253,6 +228,10 @@ def test_a_package_adds_a_channel_and_replaces_none():
         (
             "odd",
             r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair",
+        ),
+        (
+            "unmade",
+            r"plug-in 'unmade' \(swarmdrive.channels\): radios:Radio is of type type and no Channel; repair",
         ),
     ],
 )

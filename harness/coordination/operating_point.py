@@ -139,11 +139,13 @@ POINTS = {
 def named_point(text: str) -> OperatingPoint:
     """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
 
-    The text is its name. Raises UserError if there is no such point or setting, or a value is not allowed.
+    Every channel profile of a package is a point of the profile's name, with the defaults. The text is the
+    point's name. Raises UserError if there is no such point or setting, or a value is not allowed.
     """
     name, colon, settings = text.partition(":")
-    if name not in POINTS:
-        raise unknown("operating point", name, POINTS)
+    if name not in POINTS and name not in CHANNELS:
+        raise unknown("operating point", name, {*POINTS, *CHANNELS})
+    point = POINTS.get(name) or OperatingPoint(name, name)
     changed: dict[str, Any] = {}
     for setting in settings.split(",") if colon else ():
         key, _, value = setting.partition("=")
@@ -152,7 +154,7 @@ def named_point(text: str) -> OperatingPoint:
         if key in changed:
             raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
         changed[key] = setting_of(key, value)
-    return replace(POINTS[name], name=text, **changed) if changed else POINTS[name]
+    return replace(point, name=text, **changed) if changed else point
 
 
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))

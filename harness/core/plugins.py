@@ -48,7 +48,8 @@ class Plugins(Mapping[str, T], Generic[T]):
             plugin: T = entry.load()
         except Exception as error:  # whatever a package's import raises
             raise UserError(f"{what} does not load ({printable(error)}); {repair}") from error
-        if not isinstance(plugin, self.kind):
+        # A class has its instances' methods, and so would pass for one of them.
+        if isinstance(plugin, type) or not isinstance(plugin, self.kind):
             raise UserError(
                 f"{what} is of type {type(plugin).__name__} and no {self.kind.__name__}; {repair}"
             )

@@ -5,38 +5,24 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from packaged import register
 
 from harness.backends import cards, registry
 from harness.core.errors import UserError
 
 MODULE = """
-import json
-from harness.backends.base import Completion
+from dataclasses import replace
 from harness.backends.registry import Capabilities, Registration
+from swarm_extras import CAUTIOUS, answer
 
-class Echo:
-    def complete(self, requests):
-        return [Completion(r.id, answer(r), None, None, "stop", None, 1) for r in requests]
-
-    def identity(self):
-        return {"engine": "echo"}
-
-def answer(request):
-    p = {"action_distribution": {a: 1 / len(request.actions) for a in request.actions}}
-    return json.dumps(p if request.role == "ego" else {"evidence": "", "risk": "low", **p})
-
-ECHO = Registration(
-    "echoing:opened",
-    Capabilities(answer_modes=("json",), thinks="never", renders=False),
-    card_keys=("revision",),
+ECHO = replace(
+    CAUTIOUS,
+    capabilities=replace(CAUTIOUS.capabilities, language_model=True),
     packages={"json": "json"},
 )
 BARE = Registration(
     "echoing:opened", Capabilities(), packages={"no_such_module": "a-package"}, install="pip install it"
 )
-
-def opened(card, **options):
-    return Echo()
 """
 ENTRIES = """[swarmdrive.backends]
 echo = echoing:ECHO
@@ -45,7 +31,7 @@ gone = no_such_module:ECHO
 odd = echoing:answer
 """
 CARD = """engine = "echo"
-description = "Says that all is as likely"
+description = "Slows down where it sees a conflict"
 revision = "2"
 [latency]
 source = "card"
@@ -58,12 +44,7 @@ basis = "declared: none"
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A project with a card, and on the path a package that registers its engine."""
     site = tmp_path / "site"
-    (site / "echoing-1.0.dist-info").mkdir(parents=True)
-    (site / "echoing-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: echoing\nVersion: 1.0\n"
-    )
-    (site / "echoing-1.0.dist-info" / "entry_points.txt").write_text(ENTRIES)
-    (site / "echoing.py").write_text(MODULE)
+    register(site, ENTRIES, echoing=MODULE)
     (tmp_path / "swarmdrive.toml").touch()
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "echo-1.toml").write_text(CARD)
@@ -86,7 +67,7 @@ def test_a_card_names_it_and_it_is_listed_and_run(
     )
     assert (code, err.count("harness: ")) == (0, 0), err
     manifest = json.loads((project / "run" / "run.json").read_text())
-    assert manifest["identity"] == {"engine": "echo"}
+    assert manifest["identity"] == {"engine": "cautious", "version": 1}
 
 
 def test_what_it_cannot_do_is_refused_by_its_capabilities(
