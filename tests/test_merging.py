@@ -17,7 +17,7 @@ from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import merging
 from harness.prompts.versions import load as prompt
-from harness.studies.setting import Setting
+from harness.studies.axes import Setting
 from harness.studies.stored import Stored
 
 MERGE = named_point("6g:consensus=ego-prompt")

@@ -24,10 +24,11 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.walk import Decided, Due
-from harness.studies.entropies import ACTIONS, peaked, spread
 from harness.studies.play import Walked, walk_through
 
 VERSION = "2"
+ACTIONS = 3
+CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 INTENTS = tuple(field.name for field in fields(Intents))
 CHUNK = 2000  # episodes that are played together
@@ -224,3 +225,25 @@ class Calibrated:
             np.full(n, seed), np.repeat(first + np.arange(e), STEPS), np.repeat(right, STEPS), intents,
             peaked(ego_nats, knew), witness, Draws(link, jitter),
         )  # fmt: skip
+
+
+def peaked(nats: Floats, top: Ints) -> Floats:
+    """Intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
+    entropies, shares = _by_entropy()
+    most = np.interp(nats, entropies, shares)[..., None]
+    return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
+
+
+@lru_cache(maxsize=1)
+def _by_entropy() -> tuple[Floats, Floats]:
+    share = np.linspace(1.0, 1 / ACTIONS, 4001)[1:-1]
+    rest = (1 - share) / (ACTIONS - 1)
+    return -share * np.log(share) - (1 - share) * np.log(rest), share
+
+
+def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
+    """Draws of a normal distribution, cut at `CUT` standard deviations either side, by its quantiles."""
+    from scipy.special import ndtr, ndtri
+
+    below = ndtr(-CUT)
+    return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.report.library import picture
-from harness.studies.html import render
+from harness.report.page import environment
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
+TEMPLATES = Path(__file__).parent / "templates"
 OFF = ("misses", "unclear")
 UNITS = {"count": "", "pct": ", %"}
 
@@ -18,13 +18,13 @@ UNITS = {"count": "", "pct": ", %"}
 def page(manifest: Mapping[str, Any], ledger: "pd.DataFrame", folder: Path) -> str:
     """The page, with the figures that lie in `folder` in it."""
     rows = [shown(row) for row in ledger.itertuples()]
-    totals = tally(ledger)
     pictures = {
         key: picture((folder / f"{key.replace('_', '-')}.svg").read_bytes())
         for key in ("figure_a", "figure_b")
     }
     off = {v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF}
-    return render("paper.html.j2", manifest=manifest, rows=rows, off=off, **pictures, **totals)
+    template = environment(TEMPLATES).get_template("paper.html.j2")
+    return template.render(manifest=manifest, rows=rows, off=off, **pictures, **tally(ledger))
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
