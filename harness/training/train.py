@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
+from harness.core.files import replacing
 from harness.training.muon import Muon
 
 STAGES = ("excerpts", "alone", "messages", "answers")
@@ -138,7 +140,7 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
     order = np.concatenate([rng.permutation(len(samples)) for _ in range(epochs)])[:count]
     kinds = np.array([samples[i].kind for i in order])
     lengths = np.array([len(samples[i].ids) for i in order])
-    found = []
+    parts = []
     for kind in sorted(set(kinds)):
         of_kind = order[kinds == kind]
         size = lengths[kinds == kind]
@@ -148,8 +150,8 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
             part = part[np.argsort(size[start : start + window], kind="stable")]
             short = -len(part) % plan.batch
             part = np.concatenate([part, part[rng.integers(0, len(part), short)]])
-            found.append(part.reshape(-1, plan.batch))
-    batches = np.concatenate(found)
+            parts.append(part.reshape(-1, plan.batch))
+    batches = np.concatenate(parts)
     return batches[rng.permutation(len(batches))][: max(1, count // plan.batch)]
 
 
@@ -209,20 +211,19 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
     model.eval()
     device = next(model.parameters()).device
     weight = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
-    found = np.zeros((len(samples), len(letters)))
+    p = np.zeros((len(samples), len(letters)))
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
-    start = 0
-    while start < len(order):
-        kind = samples[order[start]].kind
-        some = [i for i in order[start : start + batch] if samples[i].kind == kind]
-        start += len(some)
-        with torch.no_grad():
+    for _, group in groupby(order, key=lambda i: samples[i].kind):
+        of_kind = list(group)
+        for start in range(0, len(of_kind), batch):
+            some = of_kind[start : start + batch]
             asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
-            hidden = hidden_states(model, asked)
-        last = torch.tensor([samples[i].answer_at - samples[i].shared - 1 for i in some], device=device)
-        logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
-        found[some] = torch.softmax(logits.detach().float(), -1).cpu().numpy()
-    return found
+            last = torch.tensor([len(s.ids) - s.shared - 1 for s in asked], device=device)
+            with torch.no_grad():
+                hidden = hidden_states(model, asked)
+                logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
+            p[some] = torch.softmax(logits.float(), -1).cpu().numpy()
+    return p
 
 
 def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
@@ -234,6 +235,5 @@ def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
 
 def save(state: dict[str, Any], path: Path) -> None:
     """Write a checkpoint, whole or not at all."""
-    part = path.with_suffix(".part")
-    torch.save(state, part)
-    part.replace(path)
+    with replacing(path) as part:
+        torch.save(state, part)
