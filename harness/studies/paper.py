@@ -8,19 +8,22 @@ from typing import TYPE_CHECKING
 from harness.coordination.operating_point import POINTS
 from harness.core.files import write_whole
 from harness.evaluate.spec import versions
+from harness.report.library import picture
+from harness.report.page import environment
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, described, grid
 from harness.studies.calibrated import Calibrated
 from harness.studies.episode_tables import joined
 from harness.studies.folder import write, write_manifest
-from harness.studies.ledger import ledger
-from harness.studies.page import page
+from harness.studies.ledger import ledger, shown, tally
 from harness.studies.play import play
 
 if TYPE_CHECKING:
     import pandas as pd
 
+OFF = ("misses", "unclear")
 SEEDS = (0, 1, 2, 3, 4)
+TEMPLATES = Path(__file__).parent / "templates"
 VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 
@@ -80,11 +83,20 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
         "panels": described({p.name: p.settings for p in panels}),
         "versions": versions(),
     }
+    drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps, best_band=True)}
     write(
         out,
-        {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps, best_band=True)},
+        drawn,
         {"conditions": summary, "episodes": joined([p.episodes for p in played]), "ledger": numbers},
     )
     write_manifest(out, "study", manifest)
-    write_whole(out / "index.html", page(manifest, numbers, out))
+    rows = [shown(row) for row in numbers.itertuples()]
+    page = environment(TEMPLATES).get_template("paper.html.j2").render(
+        manifest=manifest,
+        rows=rows,
+        off={v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF},
+        pictures={stem: picture((out / f"{stem}.svg").read_bytes()) for stem in drawn},
+        **tally(numbers),
+    )  # fmt: skip
+    write_whole(out / "index.html", page)
     return numbers

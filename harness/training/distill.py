@@ -96,7 +96,7 @@ def _begin(out: Path, settings: dict[str, Any]) -> Path:
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
-    """README.md of a model's folder, from what `distill` returns: its data, how well it learnt, its limits."""
+    """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
     data, plan, apart = facts["dataset"], facts["plan"], facts["held_out"]
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"

@@ -74,16 +74,6 @@ class Plan:
     seed: int = 0
 
 
-def optimizers(model: Any, plan: Plan) -> list[Any]:
-    """Muon for the matrices of the blocks, AdamW for the rest."""
-    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
-    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
-    return [
-        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
-        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
-    ]
-
-
 def run_stage(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], count: int, plan: Plan,
     progress: Callable[[int, float], None], going: Path,
@@ -94,7 +84,12 @@ def run_stage(
         (sequences seen, mean loss since the last) along the way.
     """
     device = next(model.parameters()).device
-    opts = optimizers(model, plan)
+    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
+    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
+    opts = [
+        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
+        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
+    ]
     base = [[group["lr"] for group in opt.param_groups] for opt in opts]
     batches = _batches(samples, count, plan)
     start, curve = 0, []
