@@ -114,7 +114,12 @@ def copied(copies: int, out: Path) -> Path:
     files = {
         name: sha256_bytes((out / name).read_bytes()) for name in manifest["files"] if (out / name).exists()
     }
-    manifest |= {"name": out.name, "episodes": episodes * copies, "decisions": len(lines) * copies, "files": files}
+    manifest |= {
+        "name": out.name,
+        "episodes": episodes * copies,
+        "decisions": len(lines) * copies,
+        "files": files,
+    }
     (out / "manifest.json").write_text(canonical_json(manifest))
     return out
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from harness.coordination.operating_point import POINTS
 from harness.runs.folder import read
+from harness.studies.axes import Setting
 from harness.studies.calibrated import STEPS, Calibrated
 from harness.studies.paper import SEEDS, panels
 from harness.studies.play import play
-from harness.studies.setting import Setting
 
 HARNESS = [sys.executable, "-m", "harness"]
 

@@ -24,9 +24,8 @@ def paper(
     quiet: options.Quiet = False,
 ) -> None:
     """Hold the calibrated proxy against the paper's numbers. Writes both, and Figures A and B."""
-    from harness.studies.campaign import run_paper
-    from harness.studies.page import shown, tally
-    from harness.studies.paper import panels
+    from harness.studies.ledger import shown, tally
+    from harness.studies.paper import panels, run_paper
 
     options.in_range("--episodes", episodes, 10, MOST_EPISODES)
     options.in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)

@@ -16,11 +16,10 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Compare frozen with closed-loop success, by episode. Takes runs of `eval` and of `drive`."""
-    from harness.studies import fidelity_page
-    from harness.studies.fidelity import fidelity as compared
+    from harness.studies import fidelity
 
-    result = compared(runs)
-    page = fidelity_page.write(result, out)
+    result = fidelity.fidelity(runs)
+    page = fidelity.write(result, out)
     if as_json:
         typer.echo(result.table.to_json(orient="records"))
         return
@@ -28,7 +27,7 @@ def command(
         f"{'condition':<{LABEL}}{'frozen %':>12}{'closed %':>12}{'difference, points':>28}{'same %':>12}"
     )
     who = ""
-    for row in map(fidelity_page.shown, result.table.to_dict("records")):
+    for row in map(fidelity.shown, result.table.to_dict("records")):
         if row["who"] != who:
             who = row["who"]
             typer.echo(printable(who))
@@ -36,6 +35,6 @@ def command(
         label = printable(row["condition"])
         label = f"{label:<{LABEL}}" if len(label) < LABEL else f"{label}\n{'':<{LABEL}}"
         typer.echo(f"{label}{frozen:>12}{closed:>12}{row['difference']:>28}{same:>12}")
-    for sentence in fidelity_page.headline(result):
+    for sentence in fidelity.headline(result):
         typer.echo(sentence)
     typer.echo(f"wrote {printable(page)}")

@@ -79,7 +79,7 @@ def command(
 
 def tables(summary: "pd.DataFrame") -> None:
     """Print a study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
-    from harness.studies.setting import CORE
+    from harness.studies.axes import CORE
 
     heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
     above = ""

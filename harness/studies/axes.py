@@ -1,7 +1,8 @@
-"""What can be swept: any setting of the operating point, or the number of vehicles."""
+"""What can be swept, any setting of the operating point or the number of vehicles, and the grid points."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from harness.coordination.operating_point import POINTS, SETTINGS, OperatingPoin
 from harness.core.errors import UserError, printable, unknown
 
 MOST_POINTS = 1000
+CORE = "core"  # the panel that compares operating points
 
 Value = float | str
 
@@ -84,12 +86,12 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
             if axis.field == "consensus" and part not in names():
                 raise unknown("--grid", part, names())
         return tuple(dict.fromkeys(parts))
-    found = [value for part in parts for value in _values(axis, part)]
-    if len(found) > MOST_POINTS:
-        raise UserError(f"--grid {printable(text)}: {len(found)} points; give {MOST_POINTS} or fewer")
-    if axis.field is None and any(value != int(value) or value < 1 for value in found):
+    values = [value for part in parts for value in _values(axis, part)]
+    if len(values) > MOST_POINTS:
+        raise UserError(f"--grid {printable(text)}: {len(values)} points; give {MOST_POINTS} or fewer")
+    if axis.field is None and any(value != int(value) or value < 1 for value in values):
         raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(values))
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:
@@ -104,3 +106,30 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
             f"--grid {printable(part)}: give numbers such as {axis.usual or '0,1,2'}, a list or from:to:step"
         ) from None
     return [round(low + i * step, 10) for i in range(int(steps + 1e-9) + 1)]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One grid point of a panel.
+
+    Attributes:
+        condition: name of the operating point that it is a change of.
+        point: the operating point.
+        vehicles: how many, the ego included.
+        variable: what varies in the panel; empty where conditions are compared.
+        value: its value there.
+    """
+
+    condition: str
+    point: OperatingPoint
+    vehicles: int
+    variable: str = ""
+    value: Value | None = None
+
+
+def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
+    """The grid points, complete, for a manifest."""
+    return {
+        name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
+        for name, settings in panels.items()
+    }

@@ -24,10 +24,11 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.walk import Decided, Due
-from harness.studies.entropies import ACTIONS, peaked, spread
 from harness.studies.play import Walked, walk_through
 
 VERSION = "2"
+ACTIONS = 3
+CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 INTENTS = tuple(field.name for field in fields(Intents))
 CHUNK = 2000  # episodes that are played together
@@ -89,8 +90,6 @@ class _Drawn:
     """E episodes of S decisions as n = E x S rows; H helpers.
 
     Attributes:
-        seed: of each row, (n,).
-        episode: number of each row's, (n,).
         right: the action that is right in each row's episode, (n,).
         intents: what every vehicle intends, the ego as long as it guesses.
         knowing: the ego's intent once it has heard the witness, (n, A).
@@ -98,8 +97,6 @@ class _Drawn:
         draws: of the channel; a link is up or down for a whole episode.
     """
 
-    seed: Ints
-    episode: Ints
     right: Ints
     intents: Intents
     knowing: Floats
@@ -113,10 +110,11 @@ class CalibratedWorld:
     An ego that has fused the witness's message knows from its next decision on. The last decision decides.
     """
 
-    def __init__(self, drawn: Sequence[_Drawn]) -> None:
-        self._drawn = drawn
+    def __init__(self, drawn: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
+        self._drawn = drawn  # of each seed, with as many episodes as `numbers`
+        self._seed, self._episode = np.repeat(seeds, len(numbers)), np.tile(numbers, len(seeds))
         self._step = -1
-        self._knows = np.zeros(sum(len(d.right) for d in drawn) // STEPS, dtype=bool)
+        self._knows = np.zeros(len(self._seed), dtype=bool)
         self.success: Bools = self._knows
 
     def _now(self, of: Callable[[_Drawn], Any]) -> Any:
@@ -140,8 +138,7 @@ class CalibratedWorld:
     def due(self, point: OperatingPoint) -> Due:
         """Every episode."""
         draws = Draws(self._now(lambda d: d.draws.link), self._now(lambda d: d.draws.jitter))
-        every = np.arange(len(self._knows))
-        return Due(every, self._now(lambda d: d.episode), self._now(lambda d: d.seed), draws)
+        return Due(np.arange(len(self._knows)), self._episode, self._seed, draws)
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""
@@ -181,7 +178,8 @@ class Calibrated:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
         for first in range(0, self.episodes, CHUNK):
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
-            world = CalibratedWorld([self._draw(seed, vehicles - 1, first) for seed in seeds])
+            drawn = [self._draw(seed, vehicles - 1, first) for seed in seeds]
+            world = CalibratedWorld(drawn, seeds, numbers)
             columns, places = walk_through(world, point, world, seeds, numbers)
             success = world.success.reshape(len(seeds), len(numbers)).astype(float)
             ends = {
@@ -220,7 +218,26 @@ class Calibrated:
             payload_bits=np.full((n, helpers), PAYLOAD_BITS),
             inference_s=np.full((n, 1 + helpers), p.inference_s),
         )  # fmt: skip
-        return _Drawn(
-            np.full(n, seed), np.repeat(first + np.arange(e), STEPS), np.repeat(right, STEPS), intents,
-            peaked(ego_nats, knew), witness, Draws(link, jitter),
-        )  # fmt: skip
+        return _Drawn(np.repeat(right, STEPS), intents, peaked(ego_nats, knew), witness, Draws(link, jitter))
+
+
+def peaked(nats: Floats, top: Ints) -> Floats:
+    """Intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
+    entropies, shares = _by_entropy()
+    most = np.interp(nats, entropies, shares)[..., None]
+    return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
+
+
+@lru_cache(maxsize=1)
+def _by_entropy() -> tuple[Floats, Floats]:
+    share = np.linspace(1.0, 1 / ACTIONS, 4001)[1:-1]
+    rest = (1 - share) / (ACTIONS - 1)
+    return -share * np.log(share) - (1 - share) * np.log(rest), share
+
+
+def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
+    """Draws of a normal distribution, cut at `CUT` standard deviations either side, by its quantiles."""
+    from scipy.special import ndtr, ndtri
+
+    below = ndtr(-CUT)
+    return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))

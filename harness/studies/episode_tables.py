@@ -1,14 +1,12 @@
 """Tables of studies: a row a grid point, seed and episode, of which there may be millions."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.core.files import replacing
-from harness.studies.setting import Setting
+from harness.studies.axes import Setting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +16,6 @@ PLACE = (*NAMES, "value")
 EPISODE_METRICS = (
     "success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode", "effective_loss",
 )  # fmt: skip
-ROWS = 100_000  # that are text in memory at a time
 
 
 def of_episodes(
@@ -33,10 +30,8 @@ def of_episodes(
     column = {name: np.concatenate([of[name] for of in found]) for name in found[0]}
     point = np.repeat(np.arange(len(settings)), [len(of["seed"]) for of in found])
 
-    def named(names: Sequence[str]) -> "pd.Categorical[str]":
-        known = list(dict.fromkeys(names))
-        codes = np.array([known.index(name) for name in names])[point]
-        return pd.Categorical.from_codes(codes, categories=pd.Index(known))
+    def named(names: list[Any]) -> "pd.Categorical[Any]":
+        return pd.Categorical(names).take(point)
 
     values = [np.nan if s.value is None else s.value for s in settings]
     kind = object if any(isinstance(v, str) for v in values) else float
@@ -64,12 +59,3 @@ def joined(tables: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
     found = {name: union_categoricals([t[name] for t in tables]) for name in NAMES}
     rest = pd.concat([t.drop(columns=list(NAMES)) for t in tables], ignore_index=True)
     return pd.concat([pd.DataFrame(found), rest], axis=1)
-
-
-def write_table(table: "pd.DataFrame", stem: Path) -> None:
-    """Write a table as CSV and as JSON Lines, some rows at a time."""
-    with replacing(stem.with_suffix(".csv")) as part:
-        table.to_csv(part, index=False)
-    with replacing(stem.with_suffix(".jsonl")) as part, part.open("w", encoding="utf-8") as file:
-        for first in range(0, len(table), ROWS):
-            file.write(table[first : first + ROWS].to_json(orient="records", lines=True))

@@ -12,8 +12,8 @@ from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, seed_interval
 from harness.evaluate.walk import Ask, World, columns, walk
 from harness.runs.metrics import METRICS, PERCENTILES, of_decisions, over_episodes, over_seeds, percentiles
+from harness.studies.axes import Setting
 from harness.studies.episode_tables import EPISODE_METRICS, PLACE, of_episodes
-from harness.studies.setting import Setting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,12 +50,8 @@ class Source(Protocol):
         same_episodes: whether every seed plays the same episodes.
     """
 
+    name: str
     same_episodes: bool
-
-    @property
-    def name(self) -> str:
-        """What figures call it."""
-        ...
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""

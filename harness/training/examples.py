@@ -1,4 +1,9 @@
-"""What each viewer of each scene is asked, and what it should have intended."""
+"""What each viewer of each scene is asked, and what the outcome table says it should have intended.
+
+Each safe action has the weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one
+has none. Where IDLE and FASTER come to the same (at the highest speed level) most goes to IDLE. A viewer that
+cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, Scene
 from harness.prompts.versions import NO_WORDS, Prompt
 from harness.training.answers import message
-from harness.training.teacher import labels
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
+SOFTNESS_S = 0.25
+CALM = {"FASTER": 0.3}  # prior weight of an action, 1 if not named
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,15 @@ class Question:
     graph: Mapping[str, Any]
     messages: tuple[Mapping[str, str], ...]
     label: Floats
+
+
+def labels(dataset: Dataset) -> Floats:
+    """Soft labels of every scene, (n, A); uniform where no action is safe."""
+    safe, delay_s = dataset.outcome_arrays()
+    prior = np.array([CALM.get(a, 1.0) for a in dataset.actions])
+    weight = np.where(safe, prior * np.exp(-np.nan_to_num(delay_s) / SOFTNESS_S), 0.0)
+    weight = np.where(safe.any(axis=1, keepdims=True), weight, 1.0)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def alone(dataset: Dataset, prompts: Sequence[Prompt]) -> Iterator[Question]:
@@ -62,14 +77,14 @@ def with_messages(
         graphs = scene.record["graphs"]
         ego, *helpers = scene.viewers
         for prompt in prompts:
-            lucky = luck.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
-            heard = [h for h, u in zip(helpers, lucky, strict=True) if u < ARRIVES]
-            said = [
+            draws = noise.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
+            heard = [
                 {"sender": h, **message(graphs[h], intents[_key(scene, h, prompt)], dataset.actions)}
-                for h in heard
+                for h, u in zip(helpers, draws, strict=True)
+                if u < ARRIVES
             ]
-            if said:
-                sent = prompt.render(graphs[ego], dataset.actions, said, dataset.scenario.words)
+            if heard:
+                sent = prompt.render(graphs[ego], dataset.actions, heard, dataset.scenario.words)
                 yield Question(f"{_key(scene, ego, prompt)}+m", prompt, graphs[ego], sent, label)
 
 
@@ -80,7 +95,7 @@ def split(dataset: Dataset, held_out: int) -> tuple[Dataset, Dataset]:
     parts: tuple[list[Scene], list[Scene]] = ([], [])
     for scene in dataset.scenes:
         parts[scene.record["episode"] in last].append(scene)
-    kept, apart = (Dataset(dataset.path, dataset.manifest, dataset.sha256, tuple(scenes)) for scenes in parts)
+    kept, apart = (replace(dataset, scenes=tuple(scenes)) for scenes in parts)
     return kept, apart
 
 

@@ -9,8 +9,7 @@ import pytest
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
-from harness.studies.calibrated import STEPS, Calibrated, Parameters
-from harness.studies.entropies import ACTIONS, peaked, spread
+from harness.studies.calibrated import ACTIONS, STEPS, Calibrated, Parameters, peaked, spread
 from harness.studies.fit import fit
 from harness.studies.play import Walked
 
