@@ -85,11 +85,15 @@ def run(checkout: Path, command: list[str], runs: Path) -> tuple[float, float]:
     if "OUT" in command:
         shutil.rmtree(runs / "run", ignore_errors=True)
     typed = [{"OUT": str(runs / "run"), "RUNS": str(runs)}.get(part, part) for part in command]
-    told = subprocess.run(
+    said = subprocess.run(
         [sys.executable, "-c", CHILD, sys.executable, "-m", "harness", *typed],
-        env={**os.environ, "PYTHONPATH": str(checkout)}, cwd=checkout, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    cpu_s, peak_mb = map(float, told.stdout.split()[-2:])
+        env={**os.environ, "PYTHONPATH": str(checkout)},
+        cwd=checkout,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout
+    cpu_s, peak_mb = map(float, said.split()[-2:])
     return cpu_s, peak_mb
 
 
