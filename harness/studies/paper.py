@@ -13,10 +13,9 @@ from harness.report.page import environment
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, described, grid
 from harness.studies.calibrated import Calibrated
-from harness.studies.episode_tables import joined
 from harness.studies.folder import write, write_manifest
 from harness.studies.ledger import ledger, shown, tally
-from harness.studies.play import play
+from harness.studies.play import joined, play
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,13 +67,10 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
     Returns:
         The ledger.
     """
-    import pandas as pd
-
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     played = [play(sources[p.episodes], p.name, p.settings, SEEDS, progress) for p in panels]
-    core, *sweeps = summaries = [p.summary for p in played]
-    summary = pd.concat(summaries, ignore_index=True)
-    numbers = ledger(summary)
+    whole, (core, *sweeps) = joined(played), (p.summary for p in played)
+    numbers = ledger(whole.summary)
     manifest = {
         "study": "paper",
         "seeds": list(SEEDS),
@@ -84,11 +80,7 @@ def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None
         "versions": versions(),
     }
     drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps, best_band=True)}
-    write(
-        out,
-        drawn,
-        {"conditions": summary, "episodes": joined([p.episodes for p in played]), "ledger": numbers},
-    )
+    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes, "ledger": numbers})
     write_manifest(out, "study", manifest)
     rows = [shown(row) for row in numbers.itertuples()]
     page = environment(TEMPLATES).get_template("paper.html.j2").render(

@@ -13,11 +13,15 @@ from harness.core.statistics import Estimate, seed_interval
 from harness.evaluate.walk import Ask, World, columns, walk
 from harness.runs.metrics import METRICS, PERCENTILES, of_decisions, over_episodes, over_seeds, percentiles
 from harness.studies.axes import Setting
-from harness.studies.episode_tables import EPISODE_METRICS, PLACE, of_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
 
+NAMES = ("source", "panel", "condition", "variable")
+PLACE = (*NAMES, "value")
+EPISODE_METRICS = (
+    "success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode", "effective_loss",
+)  # fmt: skip
 ENDS = ("success_rate", "unsafe_rate", "late_rate")
 PER_DECISION = (
     "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
@@ -74,8 +78,8 @@ def walk_through(
     of_seed = {seed: place for place, seed in enumerate(seeds)}
     row = np.array([of_seed[seed] for part in decided for seed in part.due.seed.tolist()])
     column = np.searchsorted(episodes, np.concatenate([part.due.episode for part in decided]))
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return found, row * len(episodes) + column
+    joint = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return joint, row * len(episodes) + column
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def play(
             "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
         })  # fmt: skip
         progress(1)
-    return Played(pd.DataFrame(rows), of_episodes(source.name, panel, settings, episodes))
+    return Played(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
 
 
 def _metric(name: str, walked: Walked, seeds: int) -> Floats:
@@ -150,3 +154,50 @@ def _estimates(
             yield name, over_episodes(name, values), "episodes"
     for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
         yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
+
+
+def _episode_table(
+    source: str, panel: str, settings: Sequence[Setting], values: Sequence[Mapping[str, Floats]]
+) -> "pd.DataFrame":
+    """The table of a panel's episodes, from `EPISODE_METRICS`, `seed` and `episode` of each grid point, (n,).
+
+    Names are kept once.
+    """
+    import pandas as pd
+
+    column = {name: np.concatenate([of[name] for of in values]) for name in values[0]}
+    point = np.repeat(np.arange(len(settings)), [len(of["seed"]) for of in values])
+
+    def named(names: list[Any]) -> "pd.Categorical[Any]":
+        return pd.Categorical(names).take(point)
+
+    swept = [np.nan if s.value is None else s.value for s in settings]
+    kind = object if any(isinstance(v, str) for v in swept) else float
+    return pd.DataFrame({
+        "source": named([source] * len(settings)),
+        "panel": named([panel] * len(settings)),
+        "condition": named([s.condition for s in settings]),
+        "variable": named([s.variable for s in settings]),
+        "value": np.array(swept, dtype=kind)[point],
+        "seed": column["seed"],
+        "episode": column["episode"].astype(int),
+        "success": column["success_rate"].astype(bool),
+        "trigger_rate": column["trigger_rate"],
+        "latency_ms": column["latency_proxy_ms"].round(3),
+        "messages": column["messages_per_episode"].astype(int),
+        "effective_loss": column["effective_loss"].round(6),
+    })  # fmt: skip
+
+
+def joined(parts: Sequence[Played]) -> Played:
+    """What came of several panels or sources, one below the other; the names in episodes are kept once."""
+    import pandas as pd
+    from pandas.api.types import union_categoricals
+
+    tables = [part.episodes for part in parts]
+    names = {name: union_categoricals([table[name] for table in tables]) for name in NAMES}
+    rest = pd.concat([table.drop(columns=list(NAMES)) for table in tables], ignore_index=True)
+    return Played(
+        pd.concat([part.summary for part in parts], ignore_index=True),
+        pd.concat([pd.DataFrame(names), rest], axis=1),
+    )

@@ -10,9 +10,8 @@ from harness.core.errors import UserError, printable
 from harness.evaluate.spec import versions
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
-from harness.studies.episode_tables import joined
 from harness.studies.folder import write, write_manifest
-from harness.studies.play import Source, play
+from harness.studies.play import Source, joined, play
 from harness.studies.stored import Stored
 
 if TYPE_CHECKING:
@@ -75,8 +74,6 @@ def run_sweep(
     Returns:
         The summary: a row a source, grid point and metric.
     """
-    import pandas as pd
-
     played = {
         panel: [
             play(source, panel, able, seeds, progress)
@@ -86,14 +83,12 @@ def run_sweep(
         ]
         for panel, points in panels.items()
     }
-    by_panel = {panel: [p.summary for p in parts] for panel, parts in played.items()}
-    core = by_panel.get(CORE, [])
-    along = [pd.concat(parts, ignore_index=True) for panel, parts in by_panel.items() if panel != CORE]
-    summary = pd.concat([part for parts in by_panel.values() for part in parts], ignore_index=True)
-    episodes = joined([p.episodes for parts in played.values() for p in parts])
+    whole = joined([part for parts in played.values() for part in parts])
+    along = [whole.summary[whole.summary.panel == panel] for panel in panels if panel != CORE]
     drawn = {"sweep": figures.along(along)}
-    drawn |= {f"operating-points-{n}": figures.composite_a(part) for n, part in enumerate(core, 1)}
-    write(out, drawn, {"conditions": summary, "episodes": episodes})
+    for n, part in enumerate(played.get(CORE, ()), 1):
+        drawn[f"operating-points-{n}"] = figures.composite_a(part.summary)
+    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes})
     manifest = {
         "sources": [source.manifest() for source in sources],
         "seeds": list(seeds),
@@ -101,4 +96,4 @@ def run_sweep(
         "versions": versions(),
     }
     write_manifest(out, "sweep", manifest)
-    return summary
+    return whole.summary

@@ -78,7 +78,7 @@ def run_stage(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], count: int, plan: Plan,
     progress: Callable[[int, float], None], going: Path,
 ) -> list[tuple[int, float]]:  # fmt: skip
-    """Train on `count` sequences drawn from `samples`, going on from the checkpoint `going` if there is one.
+    """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
 
     Returns:
         (sequences seen, mean loss since the last) along the way.
@@ -90,7 +90,6 @@ def run_stage(
         Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
         torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
     ]
-    base = [[group["lr"] for group in opt.param_groups] for opt in opts]
     batches = _batches(samples, count, plan)
     start, curve = 0, []
     if going.is_file():
@@ -105,9 +104,8 @@ def run_stage(
     kept_s = time.monotonic()
     for step in range(start, len(batches)):
         scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
-        for opt, rates in zip(opts, base, strict=True):
-            for group, rate in zip(opt.param_groups, rates, strict=True):
-                group["lr"] = rate * scale
+        for opt, rate in zip(opts, (plan.muon_lr, plan.adam_lr), strict=True):
+            opt.param_groups[0]["lr"] = rate * scale
         loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
