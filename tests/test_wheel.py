@@ -55,9 +55,9 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     assert (lacks["proxy"], lacks["qwen3-4b"]) == (None, "torch")
 
     told = json.loads(harness("eval", "--model", "proxy", "--limit", "2", "--json"))
-    assert str(site) in told["manifest"]["dataset"]["path"]
+    assert str(site) in told["manifest"]["world"]["path"]
     run = tmp_path / told["run"]
-    files = {"run.json", "rows.jsonl", "episodes.csv", "summary.csv", "report.html"}
+    files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
     assert {p.name for p in run.iterdir()} == files
     [metadata] = site.glob("lib/*/site-packages/swarmdrive_harness-*.dist-info")
     assert (metadata / "licenses/LICENSE").read_text() == (ROOT / "LICENSE").read_text()
