@@ -286,7 +286,7 @@ def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
     """Refuse to go on with other settings, naming those that differ."""
     now = msgspec.json.decode(canonical_json(settings))
     other = _differing(now, stored)
-    if "world" in other:
+    if "world" in other and "world" in stored:
         # It may lie in another folder now.
         inside = [key for key in _differing(now["world"], stored["world"]) if key != "path"]
         other = [key for key in other if key != "world"] + [f"{key} of the world" for key in inside]
