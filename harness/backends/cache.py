@@ -1,7 +1,7 @@
-"""Completions kept between runs: a question that was answered is not asked again.
+"""Completions kept between runs: a model answers the same question once.
 
-The cache is a help and nothing else. A run's rows hold its answers, and where the file gives trouble the run
-goes on without it.
+The cache only saves time. A run's rows hold its answers, and if the file does not work the run continues
+without it.
 """
 
 import json
@@ -108,10 +108,10 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
 
 
 class Cached:
-    """A backend whose answers are kept, but for errors. One that was kept has no seconds.
+    """A backend whose answers are kept, except errors. A kept answer has no seconds.
 
     Attributes:
-        backend: who is asked for what is not kept.
+        backend: answers what is not kept.
     """
 
     def __init__(self, backend: Rendering, file: Path) -> None:
@@ -120,7 +120,7 @@ class Cached:
         self._file: CompletionFile | None = CompletionFile(file)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order; the backend is asked for those that are not kept."""
+        """One completion per request, in the same order; the backend answers those that are not kept."""
         prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
         kept = self._try(lambda file: file.find(keys)) or {}
@@ -139,7 +139,7 @@ class Cached:
         return self._identity
 
     def _try(self, work: Callable[[CompletionFile], T]) -> T | None:
-        """What some work on the file gives; None where the file gives trouble, now or before."""
+        """The result of some work on the file; None once the file has failed."""
         if self._file is None:
             return None
         try:

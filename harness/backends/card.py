@@ -51,7 +51,7 @@ class Card:
             `replay`; the name a server knows the model by for `openai`; None if model-free.
         file: name of the GGUF file in `weights`; None where `weights` is the file, or needs none.
         revision: branch, tag or commit on the hub; None is its default branch.
-        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, held against it on loading.
+        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, compared with it on loading.
         gated: the hub gives the weights only to who has accepted their licence there.
         dtype: number format of a checkpoint's weights; `auto` is its own.
         quantisation: number format of a GGUF file's weights, for people; the file has the say.

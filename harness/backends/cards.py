@@ -1,4 +1,4 @@
-"""The cards at hand, and the card that a user means by what is typed.
+"""The model cards that are found here, and the card that a user names.
 
 A card is one file, `models/<name>.toml`; `<name>:<engine>` is the same model on another engine that the file
 names. A directory, a GGUF file, a hub id and `replay:RUN_DIR` get a card on the spot.
@@ -23,7 +23,7 @@ _GGUF_HEAD = 1 << 25  # bytes of a GGUF file that hold its vocabulary and its te
 
 
 def names() -> list[str]:
-    """Names of the card files at hand, sorted."""
+    """Names of all card files, sorted."""
     return sorted({path.stem for path in entries("models", "*.toml")})
 
 
@@ -43,7 +43,7 @@ def load(name: str) -> Card:
 
 
 def load_all() -> list[Card]:
-    """Every card at hand, on each of its engines."""
+    """Every card, on each of its engines."""
     return [card for name in names() for card in each_engine(name)]
 
 
@@ -53,7 +53,7 @@ def each_engine(stem: str) -> list[Card]:
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """The card that a user means by a name, `replay:RUN_DIR`, a path or a hub id, tried so.
+    """The card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
     Args:
         text: what the user wrote.

@@ -1,4 +1,4 @@
-"""How a stand-in for a language model fails on purpose, so that what is counted can be known."""
+"""How a stand-in for a language model fails on purpose, so that a run's counts can be checked."""
 
 import re
 from collections.abc import Sequence

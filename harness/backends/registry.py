@@ -34,7 +34,7 @@ class Capabilities:
             what its model reads.
         has_weights: it loads weights here, so they can be pulled, and a device and a number format chosen.
         asks_helpers: helpers are asked as well as the ego.
-        closed_loop: it answers for scenes that nobody has seen before.
+        closed_loop: it answers for scenes that are new, not only for recorded ones.
         own_latency: it is a `harness.backends.base.Timed`: its answers were timed before.
         reference: a driver that a report holds models against.
     """

@@ -23,7 +23,7 @@ def paper(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Hold the calibrated proxy against the paper's numbers. Writes both, and Figures A and B."""
+    """Compare the calibrated proxy with the paper's numbers. Writes both, and Figures A and B."""
     from harness.studies.ledger import shown, tally
     from harness.studies.paper import panels, run_paper
 
@@ -68,7 +68,7 @@ def closed_loop(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Drive the paper's panels closed-loop, with Figures A and B."""
+    """Run the paper's panels in closed loop, with Figures A and B."""
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED

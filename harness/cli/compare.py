@@ -11,7 +11,7 @@ from harness.core.errors import UserError, printable
 
 def command(
     a: Path = typer.Argument(help="Folder of the base run.", metavar="A"),
-    b: Path = typer.Argument(help="Folder of the run that is held against it.", metavar="B"),
+    b: Path = typer.Argument(help="Folder of the run that is compared with it.", metavar="B"),
     fail_if: list[str] | None = typer.Option(
         None,
         help="Gate on B - A: '[CONDITION:]METRIC[.low|.high] OP NUMBER', in any condition unless one is "

@@ -1,4 +1,4 @@
-"""`harness dataset`: build frozen scenes, verify them, look at one, hold them against live driving."""
+"""`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -94,7 +94,7 @@ def show(
 
 @app.command("rank")
 def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: options.Json = False) -> None:
-    """Compare the reference drivers' frozen and live success. Both are on the same episodes."""
+    """Compare the reference drivers' frozen and closed-loop success. Both are on the same episodes."""
     from harness.dataset import load
 
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
@@ -102,7 +102,7 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: option
     from harness.studies.rank import rank, ranks_agree
 
     episodes = data.manifest.episodes
-    with bar(f"driving {printable(data.name, 30)} live", episodes) as progress:
+    with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
         standings = rank(data, workers, progress)
     agree = ranks_agree(standings)
     if as_json:
@@ -120,7 +120,7 @@ def _as_mapping(name: str, episodes: int, agree: bool, standings: dict[str, "Sta
 
 
 def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None:
-    heads = ("driver", "frozen % [95 % CI]", "live % [95 % CI]", "difference, pts", "same %")
+    heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
     rows = []
     for driver, s in standings.items():
         agreement = f"{100 * s.agreement.value:.0f}"

@@ -103,7 +103,7 @@ def command(
         f"{len(spec.seeds)} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
         "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means",
     )
-    show(done, "driven live", COLUMNS, notes, tight=True)
+    show(done, "closed loop", COLUMNS, notes, tight=True)
     if videos:
         typer.echo(f"wrote {where / 'videos'}: {', '.join(video.name for video in videos)}")
     elif save_video:

@@ -1,4 +1,4 @@
-"""`harness model`: the models at hand, fetching one, and a look at one before a run."""
+"""`harness model`: the model cards, fetching weights, and a look at a model before a run."""
 
 import json
 from dataclasses import asdict, replace

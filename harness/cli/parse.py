@@ -1,4 +1,4 @@
-"""`harness parse`: what the harness makes of one answer. A failed verdict is data, so the exit code is 0."""
+"""`harness parse`: how one answer is parsed. A failed verdict is data, so the exit code is 0."""
 
 import sys
 from pathlib import Path
@@ -20,7 +20,7 @@ def command(
     finish_reason: str = typer.Option("stop", help="Why the engine stopped: stop, length or error."),
     as_json: options.Json = False,
 ) -> None:
-    """Parse one completion: what it says, or why it fails. Names what was repaired in it."""
+    """Parse one completion: its intent, or why it fails. Names every repair."""
     from harness.parsing.parse import parse
     from harness.world import scenarios
 

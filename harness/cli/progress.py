@@ -26,7 +26,7 @@ class Bar:
 
 @contextmanager
 def bar(label: str, total: int, quiet: bool = False) -> Iterator[Bar]:
-    """A bar to tell how many are done, how fast and until when. Nothing is drawn where nobody watches."""
+    """A bar: how many are done, how fast, time left. None is drawn unless stderr is a terminal."""
     if quiet or not sys.stderr.isatty():
         yield Bar()
         return

@@ -1,4 +1,4 @@
-"""`harness prompt`: the versions at hand, what a model is sent, and whether it keeps its budget."""
+"""`harness prompt`: the versions, the text a model is sent, and its token budget."""
 
 from pathlib import Path
 from typing import Annotated, Any

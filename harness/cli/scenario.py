@@ -1,4 +1,4 @@
-"""`harness scenario`: what is driven, and how hard it is for drivers that need no model."""
+"""`harness scenario`: the scenarios, and how hard each is for the reference drivers."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""What typer does otherwise here: commands stand in groups, and plain values are read without pydantic."""
+"""Changes to typer: commands are listed in groups, and plain values are read without pydantic."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""`harness sweep`: finished runs, coordinated otherwise."""
+"""`harness sweep`: finished runs at other operating points."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Score stored answers at other operating points. No model is asked, except for ego-prompt."""
+    """Score stored answers at other operating points. Needs no model, except for ego-prompt."""
     from harness.studies.axes import axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated

@@ -1,4 +1,4 @@
-"""`harness video`: a driven episode as a moving picture."""
+"""`harness video`: an episode of a closed-loop run as a video."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def command(
     seed: int | None = typer.Option(None, help="Channel seed. Default: the run's first."),
     out: Path = typer.Option(Path("episode.gif"), help="File: .gif, or .mp4 with the extra `video`."),
 ) -> None:
-    """Draw a driven episode from above, as a video. Shows sight, messages and the ego's policy."""
+    """Draw an episode of a closed-loop run as a video. Shows sight, messages and the ego's policy."""
     from harness.evaluate.replay import find, stills
     from harness.report.drawing.video import check, write_video
 

@@ -1,9 +1,9 @@
 """One cooperative decision, from seeing to acting, for any number of scenes at once.
 
 First the exchange of messages (its timeline is in `exchange.py`), then fusion: a consensus rule is
-arithmetic and takes no time; `ego-prompt` makes a fusion call, which asks the ego's model once more after
-the exchange, and the decision takes that much longer. An ego that has heard nobody acts on its own intent
-at once.
+arithmetic and takes no time; `ego-prompt` makes a fusion call: after the exchange the ego's model answers
+with the messages, and the decision takes that much longer. An ego that has heard nobody acts on its own
+intent at once.
 """
 
 from collections.abc import Callable

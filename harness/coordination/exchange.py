@@ -41,8 +41,8 @@ class Exchange:
         entropy_nats: entropy of `own`, `(...)`.
         triggered: the entropy is above tau and the point has a channel, `(...)`.
         asked: helpers asked, each a scheduled reply, `(..., H)`.
-        loss: probability that one crossing was lost, `(...)`: the mean over who was asked, where links
-            differ; NaN without a channel.
+        loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
+            asked, where links differ; NaN without a channel.
         delivered: asked, and request and reply crossed, `(..., H)`.
         arrival_s: end of the reply, `(..., H)`; inf where lost or not asked.
         on_time: arrived within the window, so fused, `(..., H)`.

@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 class Plugins(Mapping[str, T], Generic[T]):
-    """Things by name. A package adds one by an entry point; it is loaded when somebody asks for it by name.
+    """Things by name. A package adds one by an entry point; it loads when it is looked up by name.
 
     What is built in cannot be replaced.
 

@@ -1,8 +1,8 @@
 """Freezing an episode: one record a decision point, with an outcome table for look-up later.
 
 The behaviour that leads the ego through is declared and varied (`Behaviour`): it drives as `cruise` or
-`local-view`, now and then takes a random action, and is only stopped at the last moment. Where its action
-would end badly, the best safe action is taken instead and `full-view` drives on. So every episode comes as
+`local-view`, now and then takes a random action, and a guard stops it at the last instant: where its action
+would end badly, it takes the best safe action instead and `full-view` drives on. So every episode comes as
 close to failure as that behaviour gets, and still has all its decision points.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph
@@ -40,7 +40,7 @@ class Behaviour:
 def freeze(scenario: Scenario, seed: int, episode: int, behaviour: Behaviour) -> list[Record]:
     """Every decision point of one episode."""
     world = World.start(scenario, seed)
-    chance = luck.generator("behaviour", seed)
+    chance = noise.generator("behaviour", seed)
     driver = "cruise" if chance.random() < behaviour.cruise_share else "local-view"
     records = []
     while not world.outcome.ended and world.step < scenario.parameters.decisions:

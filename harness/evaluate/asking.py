@@ -1,4 +1,4 @@
-"""Asking: every viewer of every moment once, kept as the answers come, so that a killed run continues."""
+"""Answers: one for each viewer at each decision point, kept as they come, so that a killed run resumes."""
 
 import math
 import os
@@ -28,18 +28,18 @@ CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
 def request_count(spec: Spec, scenes: Sequence[Scene]) -> int:
-    """How many requests these scenes make."""
+    """Number of requests for these scenes."""
     return sum(len(spec.viewers(scene)) for scene in scenes)
 
 
 def most_tokens(spec: Spec, role: Role) -> int:
-    """Most tokens that an answer may have, its thought included where the model is asked to think."""
+    """Most tokens that an answer may have, its thought included if the model thinks first."""
     answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
     return answer + (spec.card.thinking_tokens if spec.thinking else 0)
 
 
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
-    """What is asked, scene by scene, the ego first."""
+    """The requests, scene by scene, the ego first."""
     for scene in scenes:
         truth = truth_graph(spec.scenario, scene.state) if spec.card.privileged else None
         for viewer in spec.viewers(scene):
@@ -68,7 +68,7 @@ def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], 
 def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
-    """What the ego's model is asked once these helpers' messages are there; `answers` by viewer."""
+    """The fusion call with these helpers' messages; `answers` by viewer."""
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
     return Request(
         id=_fusion_id(scene, senders),
@@ -87,13 +87,13 @@ def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """A completion, read."""
+    """The answer that a completion holds."""
     # A lone surrogate cannot be written to a file; nothing else of the text is touched.
     raw = completion.text.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
     viewer, *heard = viewers.split("+")
     said = parse(
-        # A read-out is a bare distribution, whoever gives it.
+        # A read-out is a bare distribution, a helper's too.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
         thinking=request.thinking, finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
@@ -110,11 +110,11 @@ def answer_of(request: Request, completion: Completion) -> Answer:
 
 
 class Asker:
-    """Asks what has no answer yet, and lays answers out as intents.
+    """Gets the answers that are missing, and turns answers into arrays of intents.
 
     Attributes:
         spec: the evaluation.
-        answers: by request id, in the order in which they were asked.
+        answers: by request id, in the order of the requests.
         latency: how long inference takes.
     """
 
@@ -132,12 +132,12 @@ class Asker:
 
         Args:
             spec: the evaluation.
-            backend: gives who answers, when somebody is asked.
+            backend: opens the backend, at the first request.
             latency: how long inference takes.
             kept: JSON Lines file of answers so far; may be torn at its end by a kill.
             answers: further answers that are there already, by request id.
-            progress: called with the number of answers just there, those kept from before included.
-            more: called with the number of fusion calls, once it is known how many there are.
+            progress: called with the number of new answers, those kept from before included.
+            more: called with the number of fusion calls, once it is known.
         """
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
@@ -145,9 +145,9 @@ class Asker:
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Ask what is still owed, and keep each answer at once."""
-        # Chunks begin at the same places in a resumed run, and a torn one is asked again whole: an engine may
-        # answer with an eye on a request's company.
+        """Get the answers that are missing, and keep each at once."""
+        # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
+        # depend on the other requests in its batch.
         size = self.spec.batch_size * math.ceil(CHUNK / self.spec.batch_size)
         for start in range(0, len(asked), size):
             chunk = asked[start : start + size]
@@ -160,7 +160,7 @@ class Asker:
             self._progress(len(chunk))
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        """What every viewer intends; NaN where nobody was asked or the answer failed."""
+        """What every viewer intends; NaN for one without a request, or whose answer failed."""
         viewers = [(scene.id, self.spec.viewers(scene)) for scene in moments]
         if any(f"{scene}/{viewer}" not in self.answers for scene, some in viewers for viewer in some):
             self.ask(list(requests(self.spec, moments)))
@@ -179,7 +179,7 @@ class Asker:
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers, self.answers)).at
 
     def fusion_requests(self, moments: Sequence[Scene], codes: Ints) -> list[Request]:
-        """What the ego's model is asked with these sets of messages."""
+        """The requests of the fusion calls with these sets of messages."""
         asked = []
         for scene, senders in _heard(moments, codes):
             of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
@@ -187,7 +187,7 @@ class Asker:
         return asked
 
     def ask_fusion(self, owed: Sequence[Request], needed: Sequence[Request]) -> None:
-        """Make the fusion calls that are owed, and time some that are needed if nobody has."""
+        """Make the fusion calls that are owed, and time a sample of those needed if no time is known."""
         if owed:
             self._more(len(owed))
             self.ask(owed)
@@ -236,7 +236,7 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Answers kept so far, by request id. A torn last line is dropped and asked again."""
+    """Answers kept so far, by request id. A torn last line is dropped."""
     if not kept.is_file():
         return {}
     data = kept.read_bytes()

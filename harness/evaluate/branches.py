@@ -1,8 +1,8 @@
-"""An episode of the closed loop, and the world it shares with those that have gone the same way so far.
+"""An episode of the closed loop, and the world it shares with those that have acted alike so far.
 
 Episodes of one layout differ in condition and seed alone. Until one takes another action than the rest, or
-takes it in another frame, they are in one and the same world: it is simulated, seen and asked once. There the
-world branches. A branch goes on to the last bit as the whole would have.
+takes it in another frame, they are in one world, which is simulated and observed once. Then the world
+branches. A branch continues exactly as the whole would, to the last bit.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from harness.world.world import World
 
 @dataclass
 class Decision:
-    """A decision that is made, whether or not it acts yet.
+    """A decision of the ego, and when it acts.
 
     Attributes:
         action: the meta-action.
@@ -33,8 +33,8 @@ class Course:
     Attributes:
         point: the condition.
         seed: seed of the channel's draws.
-        open: the decision that is still being made; the ego keeps to the action before.
-        skipped: decisions that were not begun, since one was still open when they were due.
+        open: the decision that does not act yet; the ego keeps to the action before.
+        skipped: decisions that did not begin, since one was still open when they were due.
     """
 
     point: OperatingPoint
@@ -58,20 +58,20 @@ class Trajectory:
     courses: list[Course]
 
     def advance(self, until_frame: int) -> list["Trajectory"]:
-        """Live on until so many frames are simulated or the episode is decided; decisions act meanwhile.
+        """Simulate up to a frame or the end of the episode; decisions act meanwhile.
 
         Returns:
-            What has become of it: one trajectory for each way that its episodes have gone.
+            One trajectory for each way in which its episodes continue.
         """
         going, arrived = [self], []
         while going:
-            one = going.pop()
-            frame = min((c.open.frame for c in one.courses if c.open), default=until_frame + 1)
-            one.world.advance(min(frame, until_frame))
-            if one.world.outcome.ended or frame > until_frame:
-                arrived.append(one)
+            trajectory = going.pop()
+            frame = min((c.open.frame for c in trajectory.courses if c.open), default=until_frame + 1)
+            trajectory.world.advance(min(frame, until_frame))
+            if trajectory.world.outcome.ended or frame > until_frame:
+                arrived.append(trajectory)
             else:
-                going += one._act()
+                going += trajectory._act()
         return arrived
 
     def _act(self) -> list["Trajectory"]:

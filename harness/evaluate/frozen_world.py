@@ -1,4 +1,4 @@
-"""The frozen world: recorded courses of scenes, each asked once; what an action leads to is looked up."""
+"""The frozen world: recorded courses of scenes; a table says where each action would lead."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -75,7 +75,7 @@ class FrozenWorld:
     def __init__(self, dataset: Dataset, seeds: Sequence[int]) -> None:
         self._dataset, self._seeds = dataset, seeds
         self._laid = table(dataset)
-        self._shown: list[_Shown] = []  # of each step, as far as it was observed
+        self._shown: list[_Shown] = []  # of each step observed so far
         self._step = -1
         self._chosen: dict[str, Ints] = {}  # by condition, (S, n)
         self._columns: list[dict[str, Any]] = []
@@ -110,7 +110,7 @@ class FrozenWorld:
         return self._shown[self._step].due
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Look up what comes of each action."""
+        """Look up where each action leads."""
         laid, n, shown = self._laid, len(self._laid.safe), self._shown[self._step]
         place = shown.places[shown.due.at]
         of_seed = np.repeat(np.arange(len(self._seeds)), len(shown.places))
@@ -125,7 +125,7 @@ class FrozenWorld:
             })  # fmt: skip
 
     def columns(self) -> dict[str, Any]:
-        """What came of each decision, and what each action would have led to, in the order of decisions."""
+        """Outcome of each decision, and of every other action, in the order of decisions."""
         return {name: np.concatenate([each[name] for each in self._columns]) for name in self._columns[0]}
 
     @property

@@ -1,7 +1,7 @@
-"""Fusion calls: the ego's model gets the messages that arrived beside its own view, and answers once more.
+"""Fusion calls: the ego's model answers with the messages that arrived beside its own view.
 
 Who is heard depends on the channel and not on fusion, so the sets of messages that any condition and seed
-hears are known before the first of them is asked. Each is asked once.
+hears are known before the first call. There is one call for each set.
 """
 
 from collections.abc import Mapping, Sequence

@@ -19,7 +19,7 @@ from harness.evaluate.spec import Spec
 from harness.runs.records import Answer, Latency
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
-SAMPLE = 5  # moments timed one request at a time where answers come in batches
+SAMPLE = 5  # scenes timed one request at a time where answers come in batches
 
 
 def declared(spec: Spec, backend: Backend) -> Latency | None:
@@ -35,7 +35,7 @@ def declared(spec: Spec, backend: Backend) -> Latency | None:
 
 
 def measured(spec: Spec, backend: Backend, asked: Sequence[Request]) -> Latency:
-    """The latency of a backend that is asked these requests; each answer's own where batches are of one."""
+    """The latency of a backend at these requests; each answer's own time where batches are of one."""
     backend.complete(asked[:1])  # the first answer of a process pays for warming up
     if spec.batch_size == 1:
         return Latency("measured", "each answer alone, batch 1", None, None)
@@ -43,7 +43,7 @@ def measured(spec: Spec, backend: Backend, asked: Sequence[Request]) -> Latency:
 
 
 def kept(file: Path) -> Latency | None:
-    """The latency that a run was begun with; None if none was decided."""
+    """The latency that a run began with; None if there is none yet."""
     return msgspec.json.decode(file.read_bytes(), type=Latency) if file.is_file() else None
 
 
@@ -77,23 +77,23 @@ def timed(backend: Backend, asked: Sequence[Request]) -> Latency:
         answer = backend.complete([request])[0]
         if answer.seconds is not None and answer.error is None:
             times[request.role].append(answer.seconds)
-    known = {role: statistics.median(t) for role, t in times.items() if t}
-    fill = max(known.values(), default=None)
+    medians = {role: statistics.median(t) for role, t in times.items() if t}
+    fill = max(medians.values(), default=None)
     return Latency(
         "measured", "median of single requests (batch 1) on this machine, before the run",
-        known.get("ego", fill), known.get("helper", fill), n={role: len(t) for role, t in times.items()},
+        medians.get("ego", fill), medians.get("helper", fill), n={role: len(t) for role, t in times.items()},
         load_a_core=_load(),
     )  # fmt: skip
 
 
 def lacks_fusion(latency: Latency, answers: Mapping[str, Answer]) -> bool:
-    """Whether the time of fusion calls is still to be measured: nobody declared it, and no answer has one."""
+    """Whether the time of fusion calls is still to be measured: none is declared, and no answer has one."""
     own = latency.each_its_own and any(a.heard and a.seconds is not None for a in answers.values())
     return latency.fusion_s is None and "merge" not in latency.n and not own
 
 
 def with_fusion(latency: Latency, backend: Backend, asked: Sequence[Request]) -> Latency:
-    """With the time of a fusion call, measured on a sample of these if nobody declared it."""
+    """With the time of a fusion call, measured on a sample of these if none is declared."""
     found = timed(backend, sample(asked))
     return replace(latency, fusion_s=found.ego_s, n={**latency.n, "merge": found.n["ego"]})
 

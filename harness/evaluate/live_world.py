@@ -1,8 +1,8 @@
-"""The closed loop: every decision is asked from what is seen at its moment, and acts when it is ready.
+"""The closed loop: each decision is made from what vehicles see when it is due, and acts when it is ready.
 
-Decision k is due at k decision periods. Whoever is asked answers from what it sees in that frame; the action
-is taken in the first frame that begins after the decision's latency, and until then the ego keeps to its last
-action. A decision that is still open when the next is due goes on, and the next one is skipped.
+Decision k is due at k decision periods. The model answers from what each vehicle sees then; the action is
+taken in the first frame that begins after the decision's latency, and until then the ego keeps to its last
+action. A decision that is still open when the next is due continues, and the next one is skipped.
 """
 
 import math
@@ -69,7 +69,7 @@ class LiveSource:
         ]
 
     def trial(self, most: int, ego_alone: bool) -> list[Scene]:
-        """The first moment of some episodes, each a while after its start."""
+        """One decision point of each of some episodes, a while after its start."""
         scenes, p = [], self.scenario.parameters
         for number in range(min(most, self.episodes)):
             trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
@@ -109,12 +109,12 @@ class LiveWorld:
     def observe(self) -> Sequence[Scene]:
         """Every moment in which some episode has no open decision, once."""
         while self._going and self._step < self._p.decisions:
-            for one in self._going:
-                for course in one.courses:
+            for trajectory in self._going:
+                for course in trajectory.courses:
                     course.skipped += course.open is not None
-            self._deciding = [one for one in self._going if any(c.open is None for c in one.courses)]
+            self._deciding = [t for t in self._going if any(c.open is None for c in t.courses)]
             if self._deciding:
-                self._moments = [look(one, self._step, self._ego_alone) for one in self._deciding]
+                self._moments = [look(t, self._step, self._ego_alone) for t in self._deciding]
                 return self._moments
             self._advance()
         return ()
@@ -124,14 +124,14 @@ class LiveWorld:
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
-        episode = np.array([one.number for one in self._deciding])[at]
+        episode = np.array([trajectory.number for trajectory in self._deciding])[at]
         helpers = max(len(scene.viewers) for scene in self._moments) - 1
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
         return Due(at, episode, seed, draws)
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Open every decision, and live until the next are due."""
+        """Open every decision, and simulate until the next are due."""
         actions, hz = self._scenario.actions, self._p.simulation_hz
         begun = round(self._step * self._p.decision_period_s * hz)
         for part in decided:
@@ -145,7 +145,7 @@ class LiveWorld:
 
     def _places(self, point: OperatingPoint) -> list[tuple[int, Course]]:
         return [
-            (n, course) for n, one in enumerate(self._deciding) for course in one.courses
+            (n, course) for n, trajectory in enumerate(self._deciding) for course in trajectory.courses
             if course.open is None and course.point is point
         ]  # fmt: skip
 
@@ -153,9 +153,9 @@ class LiveWorld:
         self._step += 1
         p = self._p
         until_s = p.time_limit_s if self._step == p.decisions else self._step * p.decision_period_s
-        parts = [part for one in self._going for part in one.advance(round(until_s * p.simulation_hz))]
-        self._ended += [one for one in parts if one.world.outcome.ended]
-        self._going = [one for one in parts if not one.world.outcome.ended]
+        parts = [part for t in self._going for part in t.advance(round(until_s * p.simulation_hz))]
+        self._ended += [part for part in parts if part.world.outcome.ended]
+        self._going = [part for part in parts if not part.world.outcome.ended]
 
     def columns(self) -> dict[str, Any]:
         """When each decision acts, and whether it has, in the order of decisions."""
@@ -165,14 +165,12 @@ class LiveWorld:
         }
 
     def episodes(self) -> list[Episode]:
-        """How each episode ended, held against a full-view driver whose decisions act at once."""
+        """How each episode ended; late against a full-view driver whose decisions act at once."""
         references = {
             number: reference.drive(self._scenario, PRIVILEGED, self._first_seed + number)
-            for number in sorted({one.number for one in self._ended if one.world.outcome.success})
+            for number in sorted({t.number for t in self._ended if t.world.outcome.success})
         }
-        return [
-            _episode(one, course, references.get(one.number)) for one in self._ended for course in one.courses
-        ]
+        return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
 
 
 def frames(latency_s: float, simulation_hz: int) -> int:
@@ -181,7 +179,7 @@ def frames(latency_s: float, simulation_hz: int) -> int:
 
 
 def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
-    """What there is to be seen and asked in a trajectory now. The same moment has the same id anywhere."""
+    """The decision point of a trajectory now. Equal states have equal ids anywhere."""
     world = trajectory.world
     state = replace(world.state(), step=step)
     viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
@@ -189,18 +187,19 @@ def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
     return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
 
 
-def _episode(one: Trajectory, course: Course, against: Outcome | None) -> Episode:
+def _episode(trajectory: Trajectory, course: Course, against: Outcome | None) -> Episode:
     """How an episode ended; it is `late` if it cleared too long after the reference."""
-    ended = one.world.outcome
-    outcome = ended.judged(against, one.world.scenario.parameters) if against else ended
+    world = trajectory.world
+    ended = world.outcome
+    outcome = ended.judged(against, world.scenario.parameters) if against else ended
     delay_s = None
     if against and against.time_s is not None and against.success and ended.success:
         delay_s = round((ended.time_s or 0.0) - against.time_s, 3)
     return Episode(
-        condition=course.point.name, seed=course.seed, episode=one.number, layout_seed=one.world.seed,
-        danger=one.world.layout.danger or "none", success=outcome.success,
+        condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
+        danger=world.layout.danger or "none", success=outcome.success,
         failure="" if outcome.success else outcome.result, delay_s=delay_s, time_s=outcome.time_s,
         partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
-        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=one.world.hard_brakings,
+        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.hard_brakings,
         other_crashes=outcome.other_crashes, skipped=course.skipped,
     )  # fmt: skip

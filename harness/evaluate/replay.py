@@ -1,4 +1,4 @@
-"""A driven episode, played again from its record: the same actions in the same frames give the same world."""
+"""A closed-loop episode, replayed from its record: equal actions in equal frames give an equal world."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ EVERY_FRAMES = 5  # between two stills, where no decision is open
 
 @dataclass(frozen=True)
 class Played:
-    """One episode of a finished live run.
+    """One episode of a finished closed-loop run.
 
     Attributes:
         manifest: the run's.
@@ -51,15 +51,15 @@ class Played:
 
 @dataclass(frozen=True)
 class Still:
-    """One moment to be drawn.
+    """One picture of an episode.
 
     Attributes:
         state: what is where.
         seen: what was there when the last decision began.
         decision: that decision, open or taken.
         since_s: how long ago it began.
-        open: whether it is still being made.
-        outcome: what has become of the episode; empty while it goes on.
+        open: whether it does not act yet.
+        outcome: how the episode ended; empty until then.
     """
 
     state: WorldState
@@ -74,7 +74,7 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
     """An episode of a run folder; the last condition and the first seed unless others are given.
 
     Raises:
-        UserError: the folder is no live run, or has no such episode, condition or seed.
+        UserError: the folder is no closed-loop run, or has no such episode, condition or seed.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):
@@ -104,9 +104,9 @@ def played(run: Run, episode: int, condition: str, seed: int) -> Played:
 
 
 def scene_of(run: Run, name: str) -> Scene:
-    """What there was to be seen in a moment, by playing one of the episodes in it again.
+    """A decision point's scene, by replaying one of the episodes that reach it.
 
-    Its id is the moment's only where this simulator does what the run's did.
+    Its id is the decision point's only if this simulator does what the run's did.
     """
     rows = run.decisions.scenes[name]
     [mine] = run.decisions.records(rows.start, rows.start + 1)

@@ -1,4 +1,4 @@
-"""`harness eval` and `harness drive`: walk, score, write. A run killed at any moment goes on where it was."""
+"""`harness eval` and `harness drive`: walk, score, write. A killed run resumes where it was."""
 
 import math
 import shutil
@@ -64,15 +64,15 @@ def evaluate(
     Args:
         spec: what is evaluated.
         out: the run's folder.
-        resume: go on with the run that a kill left there.
-        progress: called with the number of answers just there, or of episodes just driven, those kept from
-            before included.
-        cache: file of completions kept between runs, for language models; None to ask for every answer.
-        more: called with the number of fusion calls on frozen scenes, once it is known how many there are.
+        resume: continue the run that a kill left there.
+        progress: called with the number of new answers, or of episodes just driven, those kept from before
+            included.
+        cache: file of completions kept between runs, for language models; None for no cache.
+        more: called with the number of fusion calls on frozen scenes, once it is known.
         workers: processes that drive, each with a backend of its own.
 
     Raises:
-        UserError: the folder holds something else, or the model cannot be had. Nothing is written then.
+        UserError: the folder holds something else, or the model is not available. Nothing is written then.
     """
     if resume and (out / "run.json").is_file():
         return finished(spec, out)
@@ -106,7 +106,7 @@ def _frozen(
     scenes = source.dataset.scenes
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     with working(spec, out, backend.identity()) as work:
-        # Times are those of the backend itself: the cache answers in no time, which is nobody's.
+        # Times are those of the backend itself: the cache answers in no time.
         latency = latencies.declared(spec, backend) or latencies.kept(work / "latency.json")
         trial = partial(requests, spec, latencies.sample(scenes))
         if latency is None:
@@ -146,7 +146,7 @@ def _closed_loop(
 ) -> Evaluated:  # fmt: skip
     # Compiled templates do not travel between processes.
     spec = replace(spec, prompt=replace(spec.prompt))
-    # Engines are opened where they are asked: a process that is forked has none of their threads.
+    # Engines are opened where they answer: a forked process has none of their threads.
     [(identity, latency)] = spread(_begin, [spec], workers, lambda done: None)
     with working(spec, out, identity) as work:
         latency = latencies.keep(work / "latency.json", latencies.kept(work / "latency.json") or latency)
@@ -168,7 +168,7 @@ def _closed_loop(
 def _driven(
     spec: Spec, first_seed: int, latency: Latency, work: Path, cache: Path | None, chunk: range
 ) -> Path:
-    """Drive a chunk, unless that was done before."""
+    """Drive a chunk, unless a killed run did."""
     from harness.evaluate.live_world import LiveWorld
 
     part = work / f"episodes-{chunk.start:06d}"
@@ -231,13 +231,13 @@ def _written(
     spec: Spec, out: Path, work: Path, numbers: tuple[int, ...], walked: Walked, identity: dict[str, Any],
     latency: Latency,
 ) -> Evaluated:  # fmt: skip
-    """Score a walk and write the run's files; what it was made of last."""
+    """Score a walk and write the run's files, the manifest last."""
     begun = _begun(work)
     spec = spec.tagged(begun)
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, numbers)
     episodes = counted(grid, walked.decisions, walked.episodes)
     answers = folder.ordered(walked.answers.values(), walked.decisions)
-    found = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
+    summary = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
     manifest = msgspec.convert({
         "format": FORMAT, "name": out.name, "created": begun["created"], "command": spec.command(out),
         "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency), "identity": identity,
@@ -245,12 +245,12 @@ def _written(
         "engine_errors": sum(answer.error is not None for answer in answers),
         "versions": versions(),
     }, Manifest)  # fmt: skip
-    folder.write(out, manifest, walked.decisions.rounded(), episodes, answers, found)
-    return Evaluated(out, manifest, found)
+    folder.write(out, manifest, walked.decisions.rounded(), episodes, answers, summary)
+    return Evaluated(out, manifest, summary)
 
 
 def finished(spec: Spec, out: Path) -> Evaluated:
-    """The run that is there already. Raises UserError if it is another one, or damaged."""
+    """The run that is there already. Raises UserError if it is another run, or damaged."""
     run = folder.read(out)
     _same(spec.settings(), msgspec.json.decode(msgspec.json.encode(run.manifest)), out)
     tidy(out)

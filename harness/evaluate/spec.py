@@ -1,4 +1,4 @@
-"""What is evaluated, resolved and complete: enough to run it again."""
+"""An evaluation's settings, complete: enough to run it again."""
 
 import platform
 import shlex
@@ -31,7 +31,7 @@ class Source(Protocol):
 
     @property
     def kind(self) -> World:
-        """What a run's manifest calls it."""
+        """Its kind in a run's manifest."""
         ...
 
     @property
@@ -41,7 +41,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called in the name of a run's folder."""
+        """Its part of the name of a run's folder."""
         ...
 
     @property
@@ -51,15 +51,15 @@ class Source(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """What is decided in."""
+        """The scenario of its episodes."""
         ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
-        """What a run's manifest says of it."""
+        """Its record in a run's manifest."""
         ...
 
     def options(self) -> list[tuple[str, object]]:
-        """Options of `command` that name it, None for one that is not given."""
+        """Options of `command` that name it; None for an option that is not given."""
         ...
 
 
@@ -72,9 +72,9 @@ class Spec:
         prompt: the prompt version.
         source: which world is walked.
         points: conditions, each an operating point.
-        seeds: seeds of the channel's luck.
-        thinking: whether the model is asked to think first.
-        answer: how answers are had: free `json`, `constrained` to the schema, or the `readout` of letters.
+        seeds: of the channel's draws.
+        thinking: whether the model thinks first.
+        answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
         batch_size: most requests that go through the engine together.
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
@@ -164,7 +164,7 @@ class Spec:
             )
 
     def tagged(self, begun: Mapping[str, Any]) -> Self:
-        """This, with the tags that a run was begun with before its own."""
+        """This, with a run's own tags before these."""
         return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
 
     @property
@@ -179,11 +179,11 @@ class Spec:
 
     @property
     def ego_alone(self) -> bool:
-        """Whether helpers are not asked, as a driver's are not."""
+        """Whether the model answers for the ego only, as a driver does."""
         return not capabilities(self.card.engine).asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
-        """Who is asked in a scene, the ego first."""
+        """The vehicles of a scene that the model answers for, the ego first."""
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def settings(self) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def versions(
         "llama-cpp-python",
     ),
 ) -> Any:
-    """Versions of what a result may depend on, as far as it is installed."""
+    """Versions of the installed packages that a result may depend on."""
     found = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:

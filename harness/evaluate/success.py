@@ -1,13 +1,13 @@
 """How an episode of frozen decisions is scored, without a simulator.
 
-The rule. A decision is looked up in its scene's outcome table: its action, followed by the full-view driver,
+The rule. The scene's outcome table judges a decision: its action, followed by the full-view driver,
 either clears the intersection (it is *safe*) or does not; a safe action clears it some seconds later than the
 best safe action would have (its *delay*). An episode succeeds if every decision is safe and the delays add up
-to no more than the scenario's allowance. A decision in which no action is safe blames nobody and is left out.
+to no more than the scenario's allowance. A decision in which no action is safe does not count.
 
 Why the delays count: after one needless SLOWER a perfect driver still gets through, so "safe" alone would
-make always braking perfect. Live driving is judged alike: clearing later than the full-view driver by more
-than the allowance is a forced failure. `harness dataset rank` holds the two against each other.
+make always braking perfect. The closed loop is judged alike: clearing later than the full-view driver by
+more than the allowance is a forced failure. `harness dataset rank` compares the two.
 """
 
 import json
@@ -26,13 +26,13 @@ from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import ROUNDING_S
 from harness.world.perception.graph import truth_graph
 
-# What decides how a reference driver fares on a dataset: other code finds nothing that was kept.
+# The code that a reference driver's success depends on: what other code kept does not count.
 _CODE = ("core/**/*.py", "world/**/*.py", "dataset/**/*.py", "evaluate/success.py")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of episodes, each array of shape (...).
+    """How episodes ended, each array of shape (...).
 
     Attributes:
         success: every avoidable decision safe, delays within the allowance.
@@ -106,7 +106,7 @@ def table(dataset: Dataset) -> Table:
 
 
 def judge_choices(laid: Table, chosen: Ints) -> Verdict:
-    """What becomes of the episodes if action `chosen` (n,) is taken in each scene."""
+    """How the episodes end if action `chosen` (n,) is taken in each scene."""
     rows = np.arange(len(chosen))
     return judge(
         laid.by_episode(laid.safe[rows, chosen], fill=True),
@@ -128,7 +128,7 @@ def driver_choices(dataset: Dataset, driver: str) -> Ints:
 
 
 def reference_success(dataset: Dataset) -> dict[str, float]:
-    """Share of a dataset's episodes in which each reference driver succeeds; played once and then kept."""
+    """Share of a dataset's episodes in which each reference driver succeeds; computed once and then kept."""
     laid = table(dataset)
     here = scenarios.is_here(dataset.scenario.name)  # of another's code no digest is known
     decided_by = [
@@ -147,7 +147,7 @@ def reference_success(dataset: Dataset) -> dict[str, float]:
 
 
 def _shares(data: bytes | None) -> dict[str, float] | None:
-    """What was kept of every reference driver; None where it is not that."""
+    """The kept share of every reference driver; None if the file holds something else."""
     try:
         shares = json.loads(data or b"")
         known = {driver: float(shares[driver]) for driver in DRIVERS}

@@ -1,7 +1,7 @@
-"""The one loop: what a world shows is asked, coordinated under every condition and seed, and acted on.
+"""The one loop: observe the world, get intents, coordinate under every condition and seed, act.
 
 Frozen scenes, the closed loop and the calibrated proxy of the paper's study are worlds. They differ in where
-their moments come from and in what an action leads to, and in nothing else.
+their moments come from and in where an action leads, and in nothing else. A moment is one decision point.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -50,7 +50,7 @@ class Decided(Generic[Moment]):
 
     Attributes:
         point: the condition.
-        moments: what the world showed.
+        moments: those the world showed.
         due: what was to be decided.
         result: what was, (n, ...).
     """
@@ -62,7 +62,7 @@ class Decided(Generic[Moment]):
 
 
 class World(Protocol[Moment]):
-    """Where decisions are made, and what comes of them."""
+    """Where decision points come from, and where actions lead."""
 
     def observe(self) -> Sequence[Moment]:
         """Every distinct moment in which some episode is to decide now; none if all episodes are decided."""
@@ -73,7 +73,7 @@ class World(Protocol[Moment]):
         ...
 
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
-        """Act on the decisions, one `Decided` a condition, and go on to the next moments."""
+        """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
 
 
@@ -131,7 +131,7 @@ class _Memory:
 def _fusion_calls(
     due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
 ) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
-    """Who is heard depends on no fusion call: each set of messages that any condition hears is asked once."""
+    """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
     if not any(point.asks_again for point in due):
         return None
     return ask.fusion_call(moments, heard_codes(due, intents))
@@ -220,14 +220,14 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]
     order = np.lexsort((point, rank[at], step, episode))
-    found = {
+    values = {
         **{name: np.concatenate([each[name] for each in numbers]) for name in numbers[0]},
         **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
         **more,
         **{
-            column: values
+            column: array
             for name, each in sent.items()
-            for column, values in by_message(name, np.where(asked, each, np.nan)).items()
+            for column, array in by_message(name, np.where(asked, each, np.nan)).items()
         },
         "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
     }  # fmt: skip
@@ -239,8 +239,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
             f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)
         },
     }  # fmt: skip
-    made = Decisions.of({**found, **labels}, actions, helpers)
-    return made.take(order)
+    return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 
 def _labels(of_scenes: Sequence[str | None], at: Ints, there: Any = True) -> Labels:

@@ -26,9 +26,9 @@ def _unsafe(run: Run) -> dict[str, int]:
 
 
 def _wrecks(run: Run) -> dict[str, int]:
-    """The last moment that a layout's failed episodes have in common with one that did not fail.
+    """The last decision point that a layout's failed episodes share with one that did not fail.
 
-    Where all episodes of a layout fail, it is the last moment of the first of them.
+    Where all episodes of a layout fail, it is the last decision point of the first of them.
     """
     d = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])[run.grid.places(d)]

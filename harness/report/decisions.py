@@ -1,4 +1,4 @@
-"""What a page knows of each decision: an index of all, and details in blocks that are read when opened."""
+"""What a page shows of each decision: an index of all, and details in blocks that are read when opened."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -21,7 +21,7 @@ from harness.runs.records import Answer, Decision
 from harness.world import scenarios
 
 BLOCK = 24  # scenes that are compressed and read together
-REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
+REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
 
 Messages = Sequence[Mapping[str, Any]]
 Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
@@ -96,7 +96,7 @@ class Decisions:
         return found
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
-        """The telling moments, played again; none where this simulator is not what the run's was."""
+        """The telling decision points, replayed; none where this simulator differs from the run's."""
         from harness.evaluate.replay import scene_of  # loads the simulator
 
         telling = [
@@ -106,7 +106,7 @@ class Decisions:
         ]
         found: dict[str, Scene] = {}
         for name in dict.fromkeys(telling):
-            # Who asks nobody, such as a driver, sees a moment with fewer eyes.
+            # A run without helpers, such as a driver's, has fewer viewers.
             here = [run for run in self._runs.runs if name in run.decisions.scenes]
             scene = scene_of(max(here, key=lambda run: len(run.answers_by_scene.get(name, ()))), name)
             if scene.id == name:
@@ -183,7 +183,7 @@ class Decisions:
                     asked = list(sent).index(key)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
-        decisions: dict[str, dict[str, Any]] = {}  # seeds that came to the same are told once
+        decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
         for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
             shown = {**_shown(d), "end": str(self._ends[n][row])}
             decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)

@@ -40,7 +40,7 @@ def write_report(
         runs: what to report.
         out: file to replace.
         prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
-            had heard; None where nobody knows. By default the run's own prompt version, if it is here.
+            had heard; None where they are unknown. By default the run's own prompt version, if it is here.
         progress: called with the number of scenes just packed.
 
     Returns:

@@ -111,7 +111,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
 
 def _references(runs: Runs) -> dict[str, float]:
-    """Success of the reference drivers: on frozen scenes by the rule, live where a run was driven by one."""
+    """Success of the reference drivers: on frozen scenes by the rule, in closed loop from their own runs."""
     if runs.dataset is None:
         found = {
             run.manifest.model["name"]: run

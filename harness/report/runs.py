@@ -17,12 +17,12 @@ from harness.world.scenario import Scenario
 
 @dataclass(frozen=True)
 class Runs:
-    """Finished runs on the same scenes, all frozen or all live.
+    """Finished runs on the same scenes, all frozen or all closed-loop.
 
     Attributes:
         runs: in the order given.
-        names: what to call each: model, prompt and, where that is no name yet, more. No two are the same.
-        dataset: where the scenes of frozen runs are from; None for live runs.
+        names: model, prompt and, where two would be equal, more.
+        dataset: where the scenes of frozen runs are from; None for closed-loop runs.
     """
 
     runs: tuple[Run, ...]
@@ -31,7 +31,7 @@ class Runs:
 
     @property
     def live(self) -> bool:
-        """Whether they were driven live."""
+        """Whether they are closed-loop runs."""
         return self.dataset is None
 
     @property
@@ -41,7 +41,7 @@ class Runs:
 
     @property
     def scenario(self) -> Scenario:
-        """What they decided in."""
+        """The scenario of their episodes."""
         if self.dataset is not None:
             return self.dataset.scenario
         world = self.runs[0].manifest.world

@@ -1,4 +1,4 @@
-"""What a page knows of a scene itself: who is where, what each viewer sees, what each action leads to."""
+"""What a page knows of a scene itself: who is where, what each viewer sees, where each action leads."""
 
 from typing import Any
 

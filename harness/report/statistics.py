@@ -65,7 +65,7 @@ def errors(run: Run) -> Table:
 
 
 def _unsafe(run: Run) -> Floats:
-    """1 or 0 a decision, (n,); NaN where nobody knows or no action was safe."""
+    """1 or 0 a decision, (n,); NaN where that is unknown or no action was safe."""
     d = run.decisions
     avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
     return np.where(avoidable, 1.0 - d["safe"], np.nan)

@@ -32,7 +32,7 @@ def interval(score: Score) -> str:
 
 
 def headline(run: Run) -> str:
-    """What came out, in one sentence: the best condition, and the one without V2V beside it."""
+    """The result in one sentence: the best condition, and the one without V2V beside it."""
     found = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
     model = run.manifest.model.get("name")
     if not found:

@@ -29,16 +29,16 @@ COLUMNS = {
     "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
 }  # fmt: skip
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
-# A column an action: the policy, and what each action would lead to.
+# A column an action: the policy, and the outcome of each action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
-# A column a message's place, from 1: who was asked, and what became of the reply.
+# A column a message's place, from 1: who was asked, and the fate of the reply.
 OF_MESSAGES = {"helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER}
 DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
     "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
     "arrival_ms": 3, "weight": 6,
 }  # fmt: skip
 
-ROWS = 2048  # that are made mappings at a time
+ROWS = 2048  # that become mappings at a time
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
@@ -88,9 +88,10 @@ class Decisions:
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
         """From arrays and `Labels` (n,) by name; a column that is not given is unknown."""
         n = len(columns["seed"])
+        fields = schema(actions, helpers)
         arrays = {
-            one.name: _array(columns[one.name], one.type) if one.name in columns else pa.nulls(n, one.type)
-            for one in schema(actions, helpers)
+            name: _array(columns[name], kind) if name in columns else pa.nulls(n, kind)
+            for name, kind in zip(fields.names, fields.types, strict=True)
         }
         return cls(pa.table(arrays), tuple(actions), helpers)
 
@@ -115,11 +116,11 @@ class Decisions:
         return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
-        """Whether it is known to be so, (n,)."""
+        """Whether a flag is known and true, (n,)."""
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
-        """A distribution, or what each action would lead to: (n, A)."""
+        """A distribution, or the outcome of each action: (n, A)."""
         key = f"{name} of actions"
         if key not in self._arrays:
             self._arrays[key] = np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
@@ -183,7 +184,7 @@ class Decisions:
 
     def infinite(self) -> str | None:
         """Name of a column with an infinite number; None if there is none."""
-        numbers = [one.name for one in self.table.schema if one.type == NUMBER]
+        numbers = [column.name for column in self.table.schema if column.type == NUMBER]
         return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
 
     def take(self, which: Any) -> "Decisions":

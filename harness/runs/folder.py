@@ -1,4 +1,4 @@
-"""A run's folder: one writer and one reader, whatever world was walked.
+"""A run's folder: one writer and one reader, for every world.
 
 `answers.jsonl` has an answer a line, `decisions.parquet` a decision a row; `episodes.csv` and `summary.csv`
 follow from them; `run.json` says what all was made of, and is written last.
@@ -60,7 +60,7 @@ class Run:
 
     @property
     def world(self) -> World:
-        """Whether its episodes were frozen scenes, or driven."""
+        """Frozen or closed-loop."""
         return "frozen" if isinstance(self.manifest.world, FrozenScenes) else "closed-loop"
 
     @property
@@ -75,7 +75,7 @@ class Run:
 
     @property
     def source(self) -> str:
-        """What its episodes are of."""
+        """The source of its episodes, for people."""
         world = self.manifest.world
         return world.name if isinstance(world, FrozenScenes) else f"{world.scenario['name']} (driven live)"
 
@@ -212,7 +212,7 @@ def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
 
 
 def dataset_of(run: Run) -> Dataset:
-    """The dataset that a run on frozen scenes was made on, the very same bytes.
+    """The dataset of a run on frozen scenes, with the same digest.
 
     Raises:
         UserError: it is not there, or has changed since.
@@ -273,7 +273,7 @@ def _answers(file: Path, actions: int) -> list[Answer]:
 
 
 def whole(file: Path, reader: Callable[[Path], T]) -> T:
-    """What a reader makes of a file. Raises UserError if it is broken."""
+    """A file as its reader returns it. Raises UserError if it is broken."""
     try:
         with uncollected():
             return reader(file)

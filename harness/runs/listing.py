@@ -13,7 +13,7 @@ from typing import Any, Literal
 from harness.core.errors import UserError, printable
 from harness.runs.formats import CONFIG, FORMAT, READ_BY, WORK
 
-DEPTH = 2  # a sweep lies in its run's folder, and a driven study's run in the study's
+DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
 _BROKEN = (
@@ -36,13 +36,13 @@ class Listed:
         name: its folder, from the folder that is listed.
         kind: `eval`, `drive`, `sweep` or `study`; `run` where a broken one does not say.
         state: `finished`, `unfinished` or `broken`.
-        date: when it was begun; of a study and a broken run, when it was last written.
-        why: of an unfinished one, the option that goes on with it; of a broken one, the file at fault, and
+        date: when it began; of a study and a broken run, when it was last written.
+        why: of an unfinished one, the option that continues it; of a broken one, the file at fault, and
             whose format it has where that is an older version's.
         model: name of its card; of a sweep, its sources.
         prompt: version.
         answer: answer mode.
-        tags: words that it was given to be found by.
+        tags: words to find it by.
         condition: the one of the highest success rate; the first of several.
         success: that rate, 0 to 1, over episodes.
         low: lower end of its 95 % interval; None where the data cannot bound it.
@@ -65,7 +65,7 @@ class Listed:
 
 
 def runs(folder: Path) -> list[Listed]:
-    """What lies in a folder, newest first. Nothing outside it is read: a link that leads out is passed over.
+    """The runs and studies in a folder, newest first. Links that lead out of it are skipped.
 
     Raises:
         UserError: there is no such folder.
@@ -94,7 +94,7 @@ def _within(path: str, root: str) -> bool:
 
 
 def _one(path: str, root: str) -> Listed | None:
-    """What a folder is; None if it is neither a run nor a study."""
+    """A folder as an entry; None if it is neither a run nor a study."""
 
     def has(*names: str) -> bool:
         file = os.path.join(path, *names)

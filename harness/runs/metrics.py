@@ -1,4 +1,4 @@
-"""What runs are measured by: one entry a metric, with values from the tables of decisions and episodes."""
+"""The registry of metrics: one entry a metric, with values from the tables of decisions and episodes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -149,7 +149,7 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
 
 def meaning(name: str, world: World) -> str:
-    """What a metric means there; empty for one that says so itself."""
+    """A metric's meaning in a world; empty for a name that says it all."""
     if name in DERIVED:
         return DERIVED[name]
     metric = METRICS.get(name)
@@ -198,7 +198,7 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Each metric's values, (C, S, E): of an episode's decisions, or what the episode's record says.
+    """Each metric's values, (C, S, E): of an episode's decisions, or the field of the episode's record.
 
     Args:
         metrics: which.
@@ -254,7 +254,7 @@ def over_episodes(name: str, values: Floats) -> Estimate:
 
 
 def in_range(name: str, e: Estimate) -> Estimate:
-    """Nothing here is below 0 and no share above 1, which Student's t does not know."""
+    """No metric here is below 0 and no share above 1; Student's t may go beyond."""
     most = 1.0 if name.endswith(("_rate", "_loss", "_mass")) else np.inf
     low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, most))
     return Estimate(e.value, low, high, e.n, e.n_excluded)

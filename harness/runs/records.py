@@ -15,12 +15,12 @@ class Answer(Struct, frozen=True, kw_only=True):
         viewer: id of the vehicle that answered.
         heard: ids of the helpers whose messages were in the prompt of a fusion call.
         role: `ego`, `helper`, or `merge` for the ego's fusion call.
-        raw: what the model wrote, untouched but for lone surrogates, which no file can hold.
+        raw: the completion, untouched but for lone surrogates, which no file can hold.
         finish_reason: `stop`, `length` or `error`.
         error: the engine's message; None if it answered.
         prompt_tokens: tokens in; None if the engine has no tokenizer.
         completion_tokens: tokens out; None if the engine has no tokenizer.
-        seconds: time of this answer where it was asked alone; None otherwise.
+        seconds: time of this answer where its request was alone; None otherwise.
         batch_size: how many requests went through the engine together.
         label_mass: probability on the letters together, of a read-out; None otherwise.
         retries: attempts that failed before this one.
@@ -29,10 +29,10 @@ class Answer(Struct, frozen=True, kw_only=True):
         prompt_sha256: digest of the chat messages.
         status: the parser's one outcome (`harness.parsing.status`).
         verdict: the status in three classes: `strict`, `recovered` or `failed`.
-        repairs: what was mended; empty unless recovered.
+        repairs: corrections before parsing; empty unless recovered.
         intent: probabilities in the order of the actions; None if failed.
         mass: their sum as written; None where none was.
-        message: what a helper says beside its intent; None if it says nothing.
+        message: the rest of a helper's answer; None if there is none.
         detail: one sentence for people.
     """
 
@@ -62,7 +62,7 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def id(self) -> str:
-        """Of the request: scene, viewer and whom it had heard."""
+        """Of the request: scene, viewer and the senders heard."""
         return f"{self.scene}/{self.key}"
 
     @property
@@ -122,7 +122,7 @@ class Decision(Struct, frozen=True, kw_only=True):
         fused: the policy, in the order of the actions.
         entropy_nats: of the ego's own intent.
         triggered: whether the ego asked.
-        own_failed: the ego's own answer could not be read.
+        own_failed: the ego's own answer could not be parsed.
         own_weight: weight of its intent in the policy; None where a fusion call answered.
         latency_ms: from seeing to acting.
         deadline_missed: it took longer than the window.
@@ -254,7 +254,7 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
-    """What a run was made of: `run.json`. `docs/files.md` has the meaning of each name."""
+    """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
 
     format: str
     name: str
@@ -280,5 +280,5 @@ class Manifest(Struct, frozen=True, kw_only=True):
 
     @property
     def of_run(self) -> dict[str, str]:
-        """What every line of a run's CSV files begins with."""
+        """The first columns of a run's CSV files."""
         return {"model": self.model["name"], "prompt": self.prompt["version"], "answer": self.answer}

@@ -1,4 +1,4 @@
-"""`summary.csv` and `episodes.csv`: both follow from the decisions, the answers and how episodes ended."""
+"""`summary.csv` and `episodes.csv`: both computed from decisions, answers and episodes' ends."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -71,7 +71,7 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
 
 
 def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
-    """What each condition gains over `BASELINE`, from success (C, S, E)."""
+    """The gain of each condition over `BASELINE`, from success (C, S, E)."""
     if BASELINE in conditions:
         for place, condition in enumerate(conditions):
             if condition != BASELINE:
@@ -98,7 +98,7 @@ def _of_answers(answers: Sequence[Answer]) -> Iterator[Score]:
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
-    """The episodes by place, with what follows from their decisions."""
+    """The episodes by place, with the columns computed from their decisions."""
     ordered, places = grid.ordered(episodes), grid.places(decisions)
     n = len(ordered)
 

@@ -1,4 +1,4 @@
-"""A run as pandas tables, for who computes with one: `harness.load`. Columns: docs/files.md."""
+"""A run as pandas tables, for notebooks and scripts: `harness.load`. Columns: docs/files.md."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

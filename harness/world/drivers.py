@@ -1,4 +1,4 @@
-"""Reference drivers: baselines that need no model and stand beside every model.
+"""Reference drivers: baselines for every model, which need none.
 
 `cruise` keeps going, `brake` always brakes, `local-view` plans with what the ego's sensors know and
 `full-view` plans with everything in view.

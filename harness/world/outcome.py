@@ -19,7 +19,7 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the ego.
+    """How an episode ended for the ego.
 
     Attributes:
         result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the

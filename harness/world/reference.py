@@ -1,4 +1,4 @@
-"""Live driving: reference drivers in the simulator, from start to outcome."""
+"""Reference drivers in closed loop, from start to outcome."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +16,7 @@ from harness.world.world import World
 
 
 def decide(driver: str, world: World) -> str:
-    """A driver's meta-action in a live world."""
+    """A driver's meta-action now."""
     scenario, state = world.scenario, world.state()
     seen = scene_graph(scenario, state, state.ego.id) if driver == "local-view" else {}
     return choose(scenario, driver, seen, truth_graph(scenario, state) if driver == PRIVILEGED else None)
@@ -30,7 +30,7 @@ def finish(world: World, driver: str) -> Outcome:
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
-    """One whole episode, not yet held against the full-view driver's time."""
+    """One whole episode, not yet compared with the full-view driver's time."""
     return finish(World.start(scenario, seed), driver)
 
 

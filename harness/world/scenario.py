@@ -1,4 +1,4 @@
-"""What a scenario provides. Everything else is handed one, and knows none by name."""
+"""What a scenario provides. All other code takes one as an argument, and names none."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The live world: one episode in the simulator, from its start to its outcome.
+"""The simulated world: one episode, from its start to its outcome.
 
 Frames are stepped here rather than by an environment's `step`, so that an episode ends in the frame in which
 it is decided.
@@ -24,17 +24,17 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class World:
-    """One live episode.
+    """One episode in the simulator.
 
     Attributes:
-        scenario: what is lived through.
+        scenario: whose episode it is.
         seed: seed of the episode's layout.
         layout: how it began.
         road: highway-env's road with its vehicles, the ego first.
         step: decisions taken so far.
         frame: frames simulated so far.
-        outcome: what has happened so far; its `ended` says whether the episode is decided.
-        hard_brakings: how often the ego has begun to brake harder than HARD_BRAKING_MPS2.
+        outcome: the outcome so far; its `ended` says whether the episode is decided.
+        hard_brakings: how often the ego began to brake harder than HARD_BRAKING_MPS2.
         braking_hard: whether it did so in the last frame.
     """
 
@@ -50,7 +50,7 @@ class World:
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
-        """The first moment of an episode."""
+        """The start of an episode."""
         layout = scenario.layout(seed, scenario.parameters)
         return cls(scenario, seed, layout, populated(scenario, layout))
 
@@ -105,7 +105,7 @@ class World:
         )  # fmt: skip
 
     def act(self, action: str) -> None:
-        """Take a decision by name and live through the time until the next one is due.
+        """Take an action by name and simulate until the next decision is due.
 
         After the scenario's last decision the action is held until the episode is decided.
         """
@@ -130,12 +130,12 @@ class World:
         ego = self.road.vehicles[0]
         kept = dict(vars(ego))
         self.take(action)
-        found = self.speed_index
+        index = self.speed_index
         vars(ego).update(kept)
-        return found
+        return index
 
     def advance(self, until_frame: int) -> None:
-        """Live on until so many frames are simulated or the episode is decided."""
+        """Simulate until so many frames have passed or the episode is decided."""
         vehicles = self.road.vehicles
         poses, speeds = [], [float(vehicles[0].speed)]
         while self.frame < until_frame and not self.outcome.ended:

@@ -1,4 +1,4 @@
-"""Gates: a difference that is not to be had, as typed after --fail-if."""
+"""Gates: a difference that fails a comparison, as typed after --fail-if."""
 
 import math
 import operator
@@ -44,7 +44,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a gate: the conditions in which it failed, with the value that failed it."""
+    """The result of a gate: the conditions in which it failed, each with the value that failed it."""
 
     gate: str
     failed: tuple[tuple[str, float], ...]

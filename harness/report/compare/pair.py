@@ -1,4 +1,4 @@
-"""Two finished runs of the same scenes with the same luck, read and laid out alike."""
+"""Two finished runs on the same scenes with the same draws, as arrays of one layout."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -28,7 +28,7 @@ class Side:
 
     Attributes:
         run: as it was read.
-        settings: what may make a difference, by dotted name; None is left out.
+        settings: those that may make a difference, by dotted name; None is left out.
         values: of each metric, (C, S, E) by the run's grid; NaN where unknown.
     """
 
@@ -64,7 +64,7 @@ class Pair:
         a: the one that is the base.
         b: the one that is compared with it.
         conditions: names that both have, in the order of `a`.
-        seeds: seeds of the channel's luck, the same in both, ascending.
+        seeds: of the channel's draws, the same in both, ascending.
         episodes: numbers of the episodes that both have, ascending.
     """
 

@@ -50,7 +50,7 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
 
 
 def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
-    """GitHub's Markdown, in which whatever a run says is code: no link, no picture and nobody called."""
+    """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
     pair = found.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
     said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]

@@ -22,7 +22,7 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
         listening: called with the address as soon as it is listened on.
 
     Raises:
-        UserError: the port cannot be had.
+        UserError: the port is not available.
     """
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -2,7 +2,7 @@
 
 Relative positions are in the viewer's frame: metres forward and to the left, headings in degrees
 counter-clockwise from the viewer's. Lane roles, sectors and conflicts are named from the *ego's* seat
-whoever looks, for helpers judge what the ego should do; a helper knows the ego's position and speed from
+for every viewer, since helpers judge what the ego should do; a helper knows the ego's position and speed from
 the request, not from its sensors.
 """
 

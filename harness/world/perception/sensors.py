@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.world.perception.rays import Sweep
 from harness.world.state import VehicleState, WorldState
 
@@ -73,7 +73,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
     sensors = tuple(name for name, yes in seen.items() if yes)
     if not sensors:
         return None
-    z = luck.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
+    z = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
 
     # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
     if seen["lidar"]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -66,11 +66,11 @@ class Parameters(Common):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's luck."""
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
     p, paths, crossings = parameters, road().paths, road().crossings
 
     def draw(what: str) -> float:
-        return float(luck.uniforms((1,), NAME, seed, what)[0])
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
 
     def between(what: str, bounds: tuple[float, float]) -> float:
         return bounds[0] + draw(what) * (bounds[1] - bounds[0])
@@ -118,7 +118,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
 
     # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
-    numbers = luck.generator(NAME, seed, "ids").permutation(3)
+    numbers = noise.generator(NAME, seed, "ids").permutation(3)
     roles = ("danger", "truck", "late")
     ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
     for name in sorted(others, key=ids.__getitem__):
