@@ -34,7 +34,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
 from harness.runs.folder import csv_text
-from harness.runs.records import Answer, Episode, Latency, Score
+from harness.runs.records import Answer, Episode, Latency, Score, Variant
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
@@ -80,8 +80,7 @@ def value(told: Walked, condition: str, metric: str, interval: str = "episodes")
 
 
 def test_a_summarys_columns(told: Walked) -> None:
-    of_run = {"model": "proxy", "prompt": "v2", "answer": "json"}
-    head, first, *_ = csv_text(Score, told.scores, of_run).splitlines()
+    head, first, *_ = csv_text(Score, told.scores, Variant("proxy", "v2", "json")).splitlines()
     assert head == "model,prompt,answer,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
     assert first.startswith("proxy,v2,json,single-local,success_rate,0.5,")
 

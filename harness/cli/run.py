@@ -57,7 +57,10 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
     return {
         "run": str(done.out),
         "manifest": msgspec.to_builtins(done.manifest),
-        "summary": [{**done.manifest.of_run, **msgspec.to_builtins(score)} for score in done.scores],
+        "summary": [
+            {**msgspec.to_builtins(done.manifest.variant), **msgspec.to_builtins(score)}
+            for score in done.scores
+        ],
     }
 
 

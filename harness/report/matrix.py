@@ -96,7 +96,7 @@ def lines(runs: Runs) -> list[Line]:
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                model, prompt = run.manifest.of_run["model"], run.manifest.of_run["prompt"]
+                model, prompt = run.manifest.variant.model, run.manifest.variant.prompt
                 found.append(
                     Line(
                         runs.names[n],

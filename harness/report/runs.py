@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import astuple
+
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
@@ -98,7 +100,7 @@ def _shown(run: Run) -> str:
 
 
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:
-    parts = [(*run.manifest.of_run.values(), run.path.name) for run in runs]
+    parts = [(*astuple(run.manifest.variant), run.path.name) for run in runs]
     for many in (2, 3, 4):
         names = [" · ".join(part[:many]) for part in parts]
         if len(set(names)) == len(names):

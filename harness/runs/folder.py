@@ -8,7 +8,7 @@ import csv
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
@@ -27,7 +28,7 @@ from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
 from harness.runs.formats import FORMAT, READ_BY
 from harness.runs.metrics import Grid, World
-from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score
+from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score, Variant
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -179,8 +180,8 @@ def write(
     """Write a run's files, the manifest last. Decisions are rounded already."""
     write_whole(out / "answers.jsonl", _ENCODER.encode_lines(answers))
     decisions.write(out / "decisions.parquet")
-    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.of_run))
-    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.of_run))
+    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
+    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
 
@@ -193,7 +194,7 @@ def write_part(
     shutil.rmtree(part, ignore_errors=True)
     decisions.write(part / "decisions.parquet")
     write_whole(part / "answers.jsonl", _ENCODER.encode_lines(answers))
-    write_whole(part / "episodes.csv", csv_text(Episode, episodes, {}))
+    write_whole(part / "episodes.csv", csv_text(Episode, episodes))
     os.replace(part, out)
 
 
@@ -229,14 +230,15 @@ def dataset_of(run: Run) -> Dataset:
     return dataset
 
 
-def csv_text(kind: type[Record], records: Iterable[Record], of_run: Mapping[str, object]) -> str:
+def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
     """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*of_run, *kind.__struct_encode_fields__])
+    before = asdict(variant) if variant else {}
+    writer.writerow([*before, *kind.__struct_encode_fields__])
     for record in records:
         values = (getattr(record, name) for name in kind.__struct_fields__)
-        writer.writerow([*of_run.values(), *("" if value is None else value for value in values)])
+        writer.writerow([*before.values(), *("" if value is None else value for value in values)])
     return text.getvalue()
 
 

@@ -208,6 +208,23 @@ class Episode(Struct, frozen=True, kw_only=True):
     never_acted: int | None = None
 
 
+class Variant(Struct, frozen=True):
+    """Who answered, and how they were asked: what every line of a run's CSV files begins with.
+
+    Attributes:
+        model: name of the card.
+        prompt: its version.
+        answer: the answer mode.
+    """
+
+    model: str
+    prompt: str
+    answer: str
+
+    def __str__(self) -> str:
+        return f"{self.model} · {self.prompt} · {self.answer}"
+
+
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     """An estimate of a metric: a line of `summary.csv`.
 
@@ -279,6 +296,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
     versions: dict[str, str] = field(default_factory=dict)
 
     @property
-    def of_run(self) -> dict[str, str]:
-        """The first columns of a run's CSV files."""
-        return {"model": self.model["name"], "prompt": self.prompt["version"], "answer": self.answer}
+    def variant(self) -> Variant:
+        """Who answered, and how they were asked."""
+        return Variant(self.model["name"], self.prompt["version"], self.answer)

@@ -76,7 +76,7 @@ def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.Dat
     """The live run's figures as a study has them."""
     import pandas as pd
 
-    source = f"{' · '.join(done.manifest.of_run.values())}, driven"
+    source = f"{done.manifest.variant}, driven"
     by_point: dict[str, list[Score]] = {}
     for score in done.scores:
         if score.metric in SHOWN or score.metric.startswith(("latency_p", "collision")):

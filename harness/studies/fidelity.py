@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import asdict
 
 from harness.core.errors import UserError
 from harness.core.files import write_whole
@@ -18,13 +19,14 @@ from harness.report.library import picture
 from harness.report.page import environment
 from harness.runs.folder import read
 from harness.runs.metrics import World, over_episodes
+from harness.runs.records import Variant
 from harness.studies import folder
 from harness.studies.figures import scatter
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WHO = ("model", "prompt", "answer")
+WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
 TEMPLATES = Path(__file__).parent / "templates"
@@ -99,7 +101,7 @@ def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
     run = read(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
     rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
-    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(**run.manifest.of_run)
+    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(**asdict(run.manifest.variant))
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:

@@ -60,7 +60,7 @@ class Stored:
                 "give a folder made by `harness eval`"
             )
         manifest = self.run.manifest
-        self.name = " · ".join(manifest.of_run.values())
+        self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         mine, whole = self.run.decisions.scenes, dataset_of(self.run)

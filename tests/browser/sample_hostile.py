@@ -98,7 +98,7 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     configure(folder, answer=mine)
     run = read(folder)
     scores = [*run.scores, Score("all", mine, 1.0, 1.0, 1.0, 4, 0, mine)]
-    text = csv_text(Score, scores, run.manifest.of_run)
+    text = csv_text(Score, scores, run.manifest.variant)
     (folder / "summary.csv").write_text(text, encoding="utf-8")
     return folder
 

@@ -265,7 +265,7 @@ def scored(run, tmp_path, *scores):
         for condition, metric, value, low, high in scores
     ]
     copy = copied(run, tmp_path)
-    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.of_run))
+    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.variant))
     return read(copy)
 
 

@@ -39,8 +39,8 @@ def line(d: Difference) -> Line:
 
 def who(side: Side) -> str:
     """Model, prompt and answer mode of a run."""
-    of_run = side.run.manifest.of_run
-    return f"{of_run['model']} · prompt {of_run['prompt']} · {of_run['answer']}"
+    variant = side.run.manifest.variant
+    return f"{variant.model} · prompt {variant.prompt} · {variant.answer}"
 
 
 def sides(pair: Pair) -> list[tuple[str, str]]:
