@@ -284,7 +284,7 @@ def test_an_unknown_time_is_unknown_and_never_zero(played: Dataset) -> None:
         assert (decision.latency_ms, decision.deadline_missed) == (None, None)
     assert {e.latency_ms for e in told.episodes} == {None}
     assert json.loads(msgspec.json.encode(told.episodes[0]))["latency_ms"] is None
-    head, first, *_ = csv_text(Episode, told.episodes, {}).splitlines()
+    head, first, *_ = csv_text(Episode, told.episodes).splitlines()
     assert dict(zip(head.split(","), first.split(","), strict=True))["latency_ms"] == ""
 
 

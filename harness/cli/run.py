@@ -54,6 +54,7 @@ def default_out(spec: "Spec", resume: bool) -> Path:
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
     """A finished run for machines: its folder, its manifest and the rows of its summary."""
+    variant = msgspec.to_builtins(done.manifest.variant)
     return {
         "run": str(done.out),
         "manifest": msgspec.to_builtins(done.manifest),
