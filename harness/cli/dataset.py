@@ -78,11 +78,11 @@ def show(
 
     if out.suffix not in (".svg", ".png"):
         raise UserError(f"--out {printable(out)} is no picture that can be written; end it in .svg or .png")
-    found = load.load(load.find(dataset)).scene(scene)
-    if viewer is not None and viewer not in found.viewers:
-        raise unknown(f"viewer of scene {found.id}", viewer, found.viewers)
+    drawn = load.load(load.find(dataset)).scene(scene)
+    if viewer is not None and viewer not in drawn.viewers:
+        raise unknown(f"viewer of scene {drawn.id}", viewer, drawn.viewers)
     picture = BytesIO()
-    draw(found, picture, "png" if out.suffix == ".png" else "svg", viewer)
+    draw(drawn, picture, "png" if out.suffix == ".png" else "svg", viewer)
     try:
         write_whole(out, picture.getvalue())
     except OSError as error:

@@ -29,25 +29,25 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Show what can run here: versions, machine, models, cache. Says what the other models lack."""
-    found = look(gpu)
+    facts = look(gpu)
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(json.dumps(facts, indent=1))
         return
-    of = dict(found["versions"])
+    of = dict(facts["versions"])
     _line("harness", f"{of.pop('harness')}, Python {of.pop('python')}, {of.pop('platform')}")
     _line("packages", ", ".join(f"{name} {version}" for name, version in of.items()))
-    memory = "unknown" if found["memory_gib"] is None else f"{found['memory_gib']:g} GiB"
-    _line("machine", f"{found['cores']} cores, {memory} of memory")
+    memory = "unknown" if facts["memory_gib"] is None else f"{facts['memory_gib']:g} GiB"
+    _line("machine", f"{facts['cores']} cores, {memory} of memory")
     _line(
-        "GPU", "; ".join(map(printable, found["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
+        "GPU", "; ".join(map(printable, facts["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
     )
-    size = f"{found['cache']['bytes'] / 1e6:.1f} MB" if found["cache"]["bytes"] else "empty"
-    _line("cache", f"{printable(found['cache']['file'], 1000)}, {size}")
-    _line("engines", ", ".join(engine for engine, lack in found["engines"].items() if lack is None))
-    _lacking([(engine, lack) for engine, lack in found["engines"].items() if lack is not None])
-    able = [model for model in found["models"] if model["missing"] is None]
+    size = f"{facts['cache']['bytes'] / 1e6:.1f} MB" if facts["cache"]["bytes"] else "empty"
+    _line("cache", f"{printable(facts['cache']['file'], 1000)}, {size}")
+    _line("engines", ", ".join(engine for engine, lack in facts["engines"].items() if lack is None))
+    _lacking([(engine, lack) for engine, lack in facts["engines"].items() if lack is not None])
+    able = [model for model in facts["models"] if model["missing"] is None]
     _line("models", ", ".join(model["name"] for model in able))
-    _lacking([(model["name"], model["remedy"]) for model in found["models"] if model["missing"]])
+    _lacking([(model["name"], model["remedy"]) for model in facts["models"] if model["missing"]])
     _lacking([(model["name"], model["remedy"]) for model in able if model["remedy"]])
 
 

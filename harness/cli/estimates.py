@@ -33,8 +33,8 @@ def shown(estimate: "Estimate", scale: float = 100.0) -> str:
 
 def interval(value: float | None, low: float | None, high: float | None, scale: float) -> str:
     """`value [low, high]`, one decimal; a dash for what is not known."""
-    known = (math.nan if number is None else number for number in (value, low, high))
-    numbers = ("–" if math.isnan(number) else f"{scale * number:.1f}" for number in known)
+    ends = (math.nan if number is None else number for number in (value, low, high))
+    numbers = ("–" if math.isnan(number) else f"{scale * number:.1f}" for number in ends)
     return "{} [{}, {}]".format(*numbers)
 
 

@@ -22,17 +22,17 @@ def command(
 
     if as_csv == as_jsonl:
         raise UserError("--csv or --jsonl: give one of them")
-    found = read(run)
+    source = read(run)
     folder = out or run
     try:
         if as_csv:
-            decisions, answers = found.decisions, found.answers  # both are read before anything is written
+            decisions, answers = source.decisions, source.answers  # both are read before anything is written
             written = [
                 decisions_csv(decisions, folder / "decisions.csv"),
-                answers_csv(answers, found.actions, folder / "answers.csv"),
+                answers_csv(answers, source.actions, folder / "answers.csv"),
             ]
         else:
-            written = [decisions_jsonl(found.decisions, folder / "decisions.jsonl")]
+            written = [decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
     except OSError as error:
         raise UserError(
             f"{'--out ' if out else ''}{printable(folder)} cannot be written ({error.strerror}); "

@@ -23,11 +23,13 @@ def command(
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder) as made:  # so that a full disk leaves nothing half-written
+        with TemporaryDirectory(dir=folder) as draft:  # so that a full disk leaves nothing half-written
             # Contents alone: what is installed may be read-only, and a project is there to be changed.
-            copytree(starter, made, copy_function=copyfile, dirs_exist_ok=True)
-            copytree(resources.folder("prompts") / PROMPT, Path(made, "prompts/mine"), copy_function=copyfile)
-            for whole in Path(made).iterdir():
+            copytree(starter, draft, copy_function=copyfile, dirs_exist_ok=True)
+            copytree(
+                resources.folder("prompts") / PROMPT, Path(draft, "prompts/mine"), copy_function=copyfile
+            )
+            for whole in Path(draft).iterdir():
                 whole.rename(folder / whole.name)
     except OSError as error:
         reason = printable(error.strerror)

@@ -58,10 +58,7 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
     return {
         "run": str(done.out),
         "manifest": msgspec.to_builtins(done.manifest),
-        "summary": [
-            {**msgspec.to_builtins(done.manifest.variant), **msgspec.to_builtins(score)}
-            for score in done.scores
-        ],
+        "summary": [{**variant, **msgspec.to_builtins(score)} for score in done.scores],
     }
 
 

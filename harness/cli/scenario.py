@@ -66,11 +66,11 @@ def check(
     from harness.world import reference as live
 
     with bar(f"driving {name}", episodes) as progress:
-        found = live.check(scenario, episodes, seed, workers, progress)
+        outcomes = live.check(scenario, episodes, seed, workers, progress)
     if as_json:
-        echo_json(_as_mapping(name, episodes, seed, found))
+        echo_json(_as_mapping(name, episodes, seed, outcomes))
     else:
-        _table(episodes, seed, found)
+        _table(episodes, seed, outcomes)
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenario":
@@ -101,24 +101,24 @@ def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
     }
 
 
-def _as_mapping(name: str, episodes: int, seed: int, found: dict[str, Any]) -> dict[str, Any]:
+def _as_mapping(name: str, episodes: int, seed: int, outcomes: dict[str, Any]) -> dict[str, Any]:
     from harness.core.statistics import Estimate
 
     drivers = {
         driver: {k: as_mapping(v) if isinstance(v, Estimate) else v for k, v in results.items()}
-        for driver, results in found.items()
+        for driver, results in outcomes.items()
     }
     return {"scenario": name, "episodes": episodes, "seed": seed, "drivers": drivers}
 
 
-def _table(episodes: int, seed: int, found: dict[str, Any]) -> None:
+def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     heads = ("driver", "success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes")
     rows = []
-    for driver, of in found.items():
+    for driver, of in outcomes.items():
         rates = (f"{100 * of[k].value:.1f}" for k in ("collision", "late", "time_out"))
         rows.append((driver, shown(of["success"]), *rates, str(of["other_crashes"])))
     table(heads, rows)
-    off_road = sum(round(of["off_road"].value * episodes) for of in found.values())
+    off_road = sum(round(of["off_road"].value * episodes) for of in outcomes.values())
     console().print(
         f"n = {episodes} episodes, seeds {seed} to {seed + episodes - 1}; Wilson intervals; "
         f"off the road: {off_road}"

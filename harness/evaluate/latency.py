@@ -94,8 +94,8 @@ def lacks_fusion(latency: Latency, answers: Mapping[str, Answer]) -> bool:
 
 def with_fusion(latency: Latency, backend: Backend, asked: Sequence[Request]) -> Latency:
     """With the time of a fusion call, measured on a sample of these if none is declared."""
-    found = timed(backend, sample(asked))
-    return replace(latency, fusion_s=found.ego_s, n={**latency.n, "merge": found.n["ego"]})
+    sampled = timed(backend, sample(asked))
+    return replace(latency, fusion_s=sampled.ego_s, n={**latency.n, "merge": sampled.n["ego"]})
 
 
 def inference_s(

@@ -150,11 +150,11 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
         decision = played.decisions[place]
         thinking = world.frame < _acts_in(decision, p)
         outcome = world.outcome
-        told = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
-        told += f" with {outcome.partner}" if outcome.partner else ""
+        ending = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
+        ending += f" with {outcome.partner}" if outcome.partner else ""
         since_s = (world.frame - begins[place]) / p.simulation_hz
         progress(1)
-        yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, told)
+        yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, ending)
         if outcome.ended:
             return
         until = world.frame + (1 if thinking else EVERY_FRAMES)

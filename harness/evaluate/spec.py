@@ -229,10 +229,10 @@ def versions(
     ),
 ) -> Any:
     """Versions of the installed packages that a result may depend on."""
-    found = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return installed

@@ -150,7 +150,7 @@ def _shares(data: bytes | None) -> dict[str, float] | None:
     """The kept share of every reference driver; None if the file holds something else."""
     try:
         shares = json.loads(data or b"")
-        known = {driver: float(shares[driver]) for driver in DRIVERS}
+        by_driver = {driver: float(shares[driver]) for driver in DRIVERS}
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return known if all(0.0 <= share <= 1.0 for share in known.values()) else None
+    return by_driver if all(0.0 <= share <= 1.0 for share in by_driver.values()) else None

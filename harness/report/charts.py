@@ -41,14 +41,14 @@ def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
     condition = colours_of(rows, "condition")
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
-    known = {key for row in rows for key, value in row.items() if value is not None}
+    present = {key for row in rows for key, value in row.items() if value is not None}
     along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
     along_y = {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}}
     ends = {"low": along_y, "latency_low": along_x}
     return layered(
         band(*REACTION_MS, "reaction window, 150 to 250 ms"),
         _references(references, y),
-        *(interval(**along, color=condition) for end, along in ends.items() if end in known),
+        *(interval(**along, color=condition) for end, along in ends.items() if end in present),
         point(90, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)),
         rows=rows,
         height=320,

@@ -34,14 +34,14 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
     """The first answers of each status but strict, and where each stands."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    by_status: dict[str, list[dict[str, Any]]] = {}
     for n, run in enumerate(runs.runs):
         for answer in run.answers:
             if answer.status != "strict":
-                of = found.setdefault(answer.status, [])
+                of = by_status.setdefault(answer.status, [])
                 if len(of) < EXAMPLES:
                     of.append({"run": n, "answer": answer})
-    return [{"status": status, "answers": of} for status, of in found.items()]
+    return [{"status": status, "answers": of} for status, of in by_status.items()]
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:

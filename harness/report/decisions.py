@@ -85,15 +85,15 @@ class Decisions:
 
     def _frozen(self) -> dict[str, Scene]:
         assert self._runs.dataset is not None
-        found = {scene.id: scene for scene in self._runs.dataset.scenes}
+        by_id = {scene.id: scene for scene in self._runs.dataset.scenes}
         for run in self._runs.runs:
             for scene in run.decisions.scenes:
-                if scene not in found:
+                if scene not in by_id:
                     raise UserError(
                         f"{printable(run.path / 'decisions.parquet')} has scene {printable(scene)!r}, "
                         "which its dataset has not; make the run again"
                     )
-        return found
+        return by_id
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling decision points, replayed; none where this simulator differs from the run's."""
@@ -104,14 +104,14 @@ class Decisions:
             for run, of in zip(self._runs.runs, failed, strict=True)
             for scene in pick(run, of, REPLAYED)
         ]
-        found: dict[str, Scene] = {}
+        replayed: dict[str, Scene] = {}
         for name in dict.fromkeys(telling):
             # A run without helpers, such as a driver's, has fewer viewers.
             here = [run for run in self._runs.runs if name in run.decisions.scenes]
             scene = scene_of(max(here, key=lambda run: len(run.answers_by_scene.get(name, ()))), name)
             if scene.id == name:
-                found[name] = scene
-        return found
+                replayed[name] = scene
+        return replayed
 
     def _indexed(self, n: int, first_failures: Sequence[str]) -> dict[str, Any]:
         """One run's part of the index: a letter a scene, condition and seed, in this order."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
+from msgspec.structs import astuple
 
 from harness.core.paired import SuccessTest, success_test
 from harness.report.runs import Runs
@@ -90,26 +91,15 @@ def lines(runs: Runs) -> list[Line]:
     """Every run under each of its conditions, by condition and then in the runs' order."""
     ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
-    found = []
+    rows = []
     for condition in runs.conditions:
         marks = _marks([of.get(condition) for of in ended])
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                model, prompt = run.manifest.variant.model, run.manifest.variant.prompt
-                found.append(
-                    Line(
-                        runs.names[n],
-                        model,
-                        prompt,
-                        run.manifest.answer,
-                        condition,
-                        scores,
-                        lengths[n],
-                        *marks[n],
-                    )
-                )
-    return found
+                variant = astuple(run.manifest.variant)
+                rows.append(Line(runs.names[n], *variant, condition, scores, lengths[n], *marks[n]))
+    return rows
 
 
 def grids(found: Sequence[Line]) -> list[Grid]:
@@ -145,24 +135,24 @@ def _tokens(run: Run) -> tuple[float | None, float | None]:
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
     """Success, 0 or 1, by condition and, in each, by episode and seed."""
-    found: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
+    by_condition: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
     for episode in run.episodes:
-        found[episode.condition][episode.episode, episode.seed] = float(episode.success)
-    return found
+        by_condition[episode.condition][episode.episode, episode.seed] = float(episode.success)
+    return by_condition
 
 
 def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Behind | None]]:
     """What each run is against the best, paired by episode; nothing where there is only one."""
-    known = [n for n, of in enumerate(ended) if of]
-    if len(known) < 2:
+    scored = [n for n, of in enumerate(ended) if of]
+    if len(scored) < 2:
         return [("", None)] * len(ended)
-    best = max(known, key=lambda n: np.mean(list((ended[n] or {}).values())))
-    found: list[tuple[str, Behind | None]] = []
+    best = max(scored, key=lambda n: np.mean(list((ended[n] or {}).values())))
+    marks: list[tuple[str, Behind | None]] = []
     for n, of in enumerate(ended):
         behind = None if n == best else _behind(of or {}, ended[best] or {})
         mark = "" if behind is None else CLOSE if behind.undecided else WORSE
-        found.append((BEST if n == best else mark, behind))
-    return found
+        marks.append((BEST if n == best else mark, behind))
+    return marks
 
 
 def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]) -> Behind | None:
@@ -177,15 +167,15 @@ def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int],
 
 def headline(found: Sequence[Line]) -> str:
     """What came out of several runs: under each condition the best, and which cannot be told from it."""
-    told = []
+    best = []
     for line in found:
         success = line.scores[SUCCESS]
         if line.mark == BEST and success:
             close = [o.name for o in found if o.condition == line.condition and o.mark == CLOSE]
             rest = f", not told apart from {', '.join(close)}" if close else ""
-            told.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
+            best.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
     return (
-        f"Best under {'; '.join(told)}."
-        if told
+        f"Best under {'; '.join(best)}."
+        if best
         else "The runs share no episodes, so none is called the best."
     )

@@ -132,18 +132,18 @@ def inference_s(latency: Latency) -> dict[str, float | None] | None:
 
 def environment(*more: Path) -> Environment:
     """The report's templates, and those of other folders: everything is escaped and made `visible`."""
-    found = Environment(
+    templates = Environment(
         loader=FileSystemLoader([*more, TEMPLATES]),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=visible,
     )
-    found.filters |= {
+    templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown,
         "latency_source": words.latency_source, "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
-    return found
+    return templates
 
 
 def visible(value: Any) -> Any:

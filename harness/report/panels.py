@@ -113,12 +113,12 @@ def panels(runs: Runs) -> Iterator[Panel]:
 def _references(runs: Runs) -> dict[str, float]:
     """Success of the reference drivers: on frozen scenes by the rule, in closed loop from their own runs."""
     if runs.dataset is None:
-        found = {
+        drivers = {
             run.manifest.model["name"]: run
             for run in runs.runs
             if (engine := find(str(run.manifest.model.get("engine")))) and engine.capabilities.reference
         }
-        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in found.items()}
+        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in drivers.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}
     episodes = {number for run in runs.runs for number in run.grid.episodes}
     driven = replace(

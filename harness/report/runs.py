@@ -67,8 +67,8 @@ def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
     Raises:
         UserError: a folder is no run, its dataset is gone or has changed, or two are not of the same scenes.
     """
-    found = [read(path) for path in dict.fromkeys(paths)]
-    first, *others = found
+    runs = [read(path) for path in dict.fromkeys(paths)]
+    first, *others = runs
     for other in others:
         one, two = _scenes(first), _scenes(other)
         if one != two:
@@ -81,7 +81,7 @@ def gather(paths: Sequence[Path], dataset: Dataset | None = None) -> Runs:
         dataset = None
     elif dataset is None or dataset.sha256 != world.sha256:
         dataset = dataset_of(first)
-    return Runs(tuple(found), _names(found), dataset)
+    return Runs(tuple(runs), _names(runs), dataset)
 
 
 def _scenes(run: Run) -> Any:

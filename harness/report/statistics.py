@@ -22,16 +22,16 @@ CERTAINTY = 0.1
 
 def success(run: Run) -> Table:
     """Success and latency of each condition, of which both are known."""
-    told = []
+    rows = []
     for condition in run.conditions:
         latency, rate = run.score(condition, LATENCY), run.score(condition, SUCCESS)
         if latency and rate:
-            told.append({
+            rows.append({
                 "condition": condition, "latency_ms": latency.value, "latency_low": latency.low,
                 "latency_high": latency.high, "success": rate.value, "low": rate.low, "high": rate.high,
                 "n": rate.n, "interval": rate.interval,
             })  # fmt: skip
-    return told
+    return rows
 
 
 def statuses(run: Run) -> Table:
@@ -89,8 +89,8 @@ def entropies(run: Run) -> Table:
     p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
     if not p:
         return []
-    known = np.array(p, dtype=float)
-    nats = -np.sum(known * np.log(np.where(known > 0, known, 1.0)), axis=1)
+    probabilities = np.array(p, dtype=float)
+    nats = -np.sum(probabilities * np.log(np.where(probabilities > 0, probabilities, 1.0)), axis=1)
     return _histogram(nats, ENTROPY_NATS, "entropy_nats")
 
 

@@ -33,20 +33,20 @@ def interval(score: Score) -> str:
 
 def headline(run: Run) -> str:
     """The result in one sentence: the best condition, and the one without V2V beside it."""
-    found = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
+    scores = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
     model = run.manifest.model.get("name")
-    if not found:
+    if not scores:
         return f"{model} on {run.source}: the run has no success rate."
-    best = max(found, key=lambda c: found[c].value or 0.0)
-    text = f"With {model}, {best} {_clears(found[best])} of {run.source}"
+    best = max(scores, key=lambda c: scores[c].value or 0.0)
+    text = f"With {model}, {best} {_clears(scores[best])} of {run.source}"
     latency = run.score(best, LATENCY)
     if latency is not None:
         text += f" at {shown(latency)['value']} a decision"
-    alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in found]
-    base = alone[0] if alone else min(found, key=lambda c: found[c].value or 0.0)
+    alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
+    base = alone[0] if alone else min(scores, key=lambda c: scores[c].value or 0.0)
     if base == best:
-        return text + (", and no other condition does better." if len(found) > 1 else ".")
-    text += f"; {base} {_clears(found[base])}"
+        return text + (", and no other condition does better." if len(scores) > 1 else ".")
+    text += f"; {base} {_clears(scores[base])}"
     gain = run.score(best, GAIN + base)
     if gain is not None and gain.low is not None and gain.high is not None:
         clear = "a clear difference" if gain.low > 0 or gain.high < 0 else "which may be chance"
@@ -72,8 +72,8 @@ def latency_source(latency: Latency) -> str:
         "paper": "the paper's, not measured here",
     }[latency.source]
     by_role = {"ego": latency.ego_s, "helper": latency.helper_s, "ego with messages": latency.fusion_s}
-    known = [f"{role} {s * 1000:.0f} ms" for role, s in by_role.items() if s is not None]
-    return f"{', '.join(known) or 'each answer has its own time'}; {source} ({latency.basis})"
+    times = [f"{role} {s * 1000:.0f} ms" for role, s in by_role.items() if s is not None]
+    return f"{', '.join(times) or 'each answer has its own time'}; {source} ({latency.basis})"
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

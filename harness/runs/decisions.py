@@ -152,14 +152,14 @@ class Decisions:
         changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]
         names = codes.dictionary.to_pylist()
-        found = {
+        ranges = {
             names[codes.indices[start].as_py()]: range(start, stop)
             for start, stop in pairwise(starts)
             if stop > start
         }
-        if len(found) < len(starts) - 1:
+        if len(ranges) < len(starts) - 1:
             raise ValueError("the decisions of one decision point do not stand together")
-        return found
+        return ranges
 
     def records(self, start: int, stop: int) -> list[Decision]:
         """Some rows, one by one."""

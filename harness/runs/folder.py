@@ -112,17 +112,17 @@ class Run:
     @cached_property
     def answers_by_scene(self) -> dict[str, list[Answer]]:
         """The answers of each decision point, in their order."""
-        found: dict[str, list[Answer]] = {}
+        by_scene: dict[str, list[Answer]] = {}
         for answer in self.answers:
-            found.setdefault(answer.scene, []).append(answer)
-        return found
+            by_scene.setdefault(answer.scene, []).append(answer)
+        return by_scene
 
     def score(self, condition: str, metric: str) -> Score | None:
         """A metric's value in one condition; where it has several intervals, the one over episodes."""
-        found = [
+        candidates = [
             s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
-        return min(found, key=lambda s: s.interval != "episodes", default=None)
+        return min(candidates, key=lambda s: s.interval != "episodes", default=None)
 
     def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
         episodes = _records(file, Episode)
@@ -162,11 +162,11 @@ def read(path: Path) -> Run:
             "give a folder made by `harness eval` or `harness drive`"
         )
     stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
-    found = stated.get("format") if isinstance(stated, dict) else None
-    if found != FORMAT:
-        old = READ_BY.get(found) if isinstance(found, str) else None
+    version = stated.get("format") if isinstance(stated, dict) else None
+    if version != FORMAT:
+        old = READ_BY.get(version) if isinstance(version, str) else None
         raise UserError(
-            f"{printable(file)} has format {printable(found)!r}, not {FORMAT!r}; "
+            f"{printable(file)} has format {printable(version)!r}, not {FORMAT!r}; "
             + (f"harness {old} reads it: run again, or install that version" if old
                else "give a folder made by `harness eval` or `harness drive`")
         )  # fmt: skip

@@ -126,29 +126,29 @@ def _one(path: str, root: str) -> Listed | None:
 
 
 def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
-    made = Listed("", "run", "broken", written, "run.json")
+    listed = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
         if config["format"] in READ_BY:
-            return replace(made, why=f"run.json: format of harness {READ_BY[config['format']]}")
+            return replace(listed, why=f"run.json: format of harness {READ_BY[config['format']]}")
         if config["format"] != FORMAT:
-            return made
-        made = replace(made, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
-        made = replace(_described(made, config), why="summary.csv")
+            return listed
+        listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
+        listed = replace(_described(listed, config), why="summary.csv")
         if not has_summary:
-            return made
+            return listed
         with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
             # A summary may have a thousand rows, and a folder a thousand summaries.
-            head, *told = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
+            head, *lines = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
         which = ("success_rate", "episodes")
-        rows = [row for row in csv.DictReader([head, *told]) if (row["metric"], row["interval"]) == which]
+        rows = [row for row in csv.DictReader([head, *lines]) if (row["metric"], row["interval"]) == which]
         best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
         value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
         return replace(
-            made, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
+            listed, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
         )
     except _BROKEN:
-        return made
+        return listed
 
 
 def _described(made: Listed, config: dict[str, Any]) -> Listed:

@@ -211,8 +211,8 @@ def by_episode(
     def values(metric: Metric) -> Floats:
         if not metric.episodes:
             return of_decisions(metric, decisions, places, len(episodes))
-        found = [metric.episodes(episode) for episode in episodes]
-        return np.array([np.nan if v is None else float(v) for v in found])
+        numbers = [metric.episodes(episode) for episode in episodes]
+        return np.array([np.nan if v is None else float(v) for v in numbers])
 
     return {metric.name: values(metric).reshape(grid.shape) for metric in metrics}
 
@@ -262,8 +262,8 @@ def in_range(name: str, e: Estimate) -> Estimate:
 
 def percentiles(latency_ms: Floats) -> Floats:
     """`PERCENTILES` of the latencies (n,) that are known; NaN where none is."""
-    known = latency_ms[~np.isnan(latency_ms)]
-    return np.percentile(known, PERCENTILES) if len(known) else np.full(len(PERCENTILES), np.nan)
+    measured = latency_ms[~np.isnan(latency_ms)]
+    return np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
 
 
 def unit(name: str) -> tuple[float, str, int]:

@@ -98,5 +98,5 @@ def load(run: Path) -> Tables:
     Raises:
         UserError: it is no finished run, or one of another version.
     """
-    found = read(run)
-    return Tables(run, msgspec.json.decode(msgspec.json.encode(found.manifest)), found)
+    source = read(run)
+    return Tables(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)

@@ -56,37 +56,37 @@ def gate(text: str) -> Gate:
     Raises:
         UserError: it cannot be read, or names no metric that is compared.
     """
-    found = _GATE.fullmatch(text)
+    match = _GATE.fullmatch(text)
     try:
-        number = float(found["number"]) if found else math.nan
+        number = float(match["number"]) if match else math.nan
     except ValueError:
         number = math.nan
-    if not found or not math.isfinite(number):
+    if not match or not math.isfinite(number):
         raise UserError(
             f"--fail-if {printable(text)!r} cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as '6g:success_rate < -0.01'"
         )
-    if found["metric"] not in NAMES:
-        raise unknown("metric of --fail-if", found["metric"], NAMES)
-    if found["end"] not in (None, *ENDS):
-        raise unknown(f"end of {found['metric']}'s interval in --fail-if", found["end"], ENDS)
-    condition = found["condition"]
+    if match["metric"] not in NAMES:
+        raise unknown("metric of --fail-if", match["metric"], NAMES)
+    if match["end"] not in (None, *ENDS):
+        raise unknown(f"end of {match['metric']}'s interval in --fail-if", match["end"], ENDS)
+    condition = match["condition"]
     return Gate(
-        text, condition and condition.strip(), found["metric"], found["end"] or "value", found["op"], number
+        text, condition and condition.strip(), match["metric"], match["end"] or "value", match["op"], number
     )
 
 
-def judge(gate: Gate, found: Comparison) -> Verdict:
+def judge(gate: Gate, comparison: Comparison) -> Verdict:
     """Hold a gate against a comparison.
 
     Raises:
         UserError: its condition is not compared, or the difference is not known there.
     """
-    names = found.pair.conditions
+    names = comparison.pair.conditions
     if gate.condition is not None and gate.condition not in names:
         raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, names)
     failed = []
-    for condition in found.conditions:
+    for condition in comparison.conditions:
         if gate.condition in (None, condition.condition):
             changes = [d.change for d in condition.differences if d.metric == gate.metric]
             value = float(getattr(changes[0], gate.end)) if changes else math.nan

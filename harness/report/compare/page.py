@@ -11,7 +11,7 @@ from harness.report.page import environment
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
     """The page; `most` episodes and requests are listed of each kind."""
     template = environment(TEMPLATES).get_template("compare.html.j2")
-    return template.render(found=found, pair=found.pair, verdicts=verdicts, most=most, words=words)
+    return template.render(found=comparison, pair=comparison.pair, verdicts=verdicts, most=most, words=words)

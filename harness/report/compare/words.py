@@ -61,9 +61,9 @@ def paired(pair: Pair) -> str:
     return said
 
 
-def differing(found: Comparison) -> str:
+def differing(comparison: Comparison) -> str:
     """What kinds of settings the runs differ in."""
-    kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in found.settings))
+    kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
@@ -97,14 +97,14 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     return _listed(said, len(some), most)
 
 
-def answers_flipped(found: Comparison, most: int) -> list[tuple[str, str]]:
+def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
     """How many answers of a role changed their verdict, and up to so many of them."""
     return [
         (
-            f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}",
+            f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",
             _listed(t.requests[:most], len(t.requests), most),
         )
-        for t in found.answers
+        for t in comparison.answers
     ]
 
 
@@ -113,13 +113,13 @@ def _listed(some: Sequence[str], n: int, most: int) -> str:
     return ", ".join([*some, f"{n - most} more"] if n > most else some)
 
 
-def settings(found: Comparison) -> list[str]:
+def settings(comparison: Comparison) -> list[str]:
     """Each setting in which the runs differ, with both values."""
 
     def shown(value: str | None) -> str:
         return "none" if value is None else printable(value, 60)
 
-    return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in found.settings]
+    return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in comparison.settings]
 
 
 def judged(verdict: Verdict) -> str:
