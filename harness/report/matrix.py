@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
-from msgspec.structs import astuple
 
 from harness.core.paired import SuccessTest, success_test
 from harness.report.runs import Runs
@@ -97,8 +96,9 @@ def lines(runs: Runs) -> list[Line]:
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                variant = astuple(run.manifest.variant)
-                rows.append(Line(runs.names[n], *variant, condition, scores, lengths[n], *marks[n]))
+                who = run.manifest.variant
+                of_line = runs.names[n], who.model, who.prompt, who.answer, condition
+                rows.append(Line(*of_line, scores, lengths[n], *marks[n]))
     return rows
 
 
