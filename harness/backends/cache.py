@@ -147,7 +147,7 @@ class Cached:
         except (sqlite3.Error, OSError) as error:
             print(
                 f"harness: completion cache {printable(self._file.path)}: {printable(error)}; "
-                "this run goes on without it; delete the file, or set SWARMDRIVE_CACHE to another folder",
+                "this run continues without it; delete the file, or set SWARMDRIVE_CACHE to another folder",
                 file=sys.stderr,
             )
             self._file = None

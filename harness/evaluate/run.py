@@ -198,7 +198,7 @@ def _begin(spec: Spec) -> tuple[dict[str, Any], Latency]:
     if latency.ego_s is None or latency.helper_s is None:
         raise UserError(
             f"--model {printable(spec.card.name)}: none of {len(scenes)} trial answers could be timed, and "
-            "no episode goes on without a latency; see what `harness model check` says"
+            "an episode needs a latency; see what `harness model check` says"
         )
     if any(point.asks_again for point in spec.points):
         asker = Asker(trial, lambda: backend, latency)

@@ -30,7 +30,7 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
             listener.bind((LOOPBACK, port))
             listener.listen()
         except OSError as error:
-            what = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be had ({error.strerror})"
+            what = "is in use" if error.errno == errno.EADDRINUSE else f"is not available ({error.strerror})"
             raise UserError(f"--port {port} {what}; give another, or 0 for a free one") from None
         listening(f"http://{LOOPBACK}:{listener.getsockname()[1]}/")
         config = uvicorn.Config(
