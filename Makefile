@@ -7,13 +7,16 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
 
-.PHONY: eval test check browser docs bench clean
+.PHONY: eval test check light browser docs bench clean
 
 eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
 
 test: check browser ## every check and every test
 	$(BIN)/python -m pytest -n 2
+
+light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
+	.venv-light/bin/python -m pytest -n 2 $(ONLY)
 
 browser: ## Debian's chromium for the tests that open pages, which are skipped where there is none
 	@command -v chromium >/dev/null || (apt-get update --quiet=2 && apt-get install --quiet=2 --yes \
@@ -30,6 +33,7 @@ docs: .venv/docs ## the documentation as a site: build/docs/index.html
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --nitpicky docs build/docs
 
 bench: .venv/dev ## the benchmarks; see benchmarks/README.md
+	$(BIN)/python benchmarks/commands.py
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python benchmarks/own_time.py
 	$(BIN)/python benchmarks/coordinate.py
@@ -37,6 +41,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/answer_modes.py
 	$(BIN)/python benchmarks/drive.py
 	$(BIN)/python benchmarks/report.py
+	$(BIN)/python benchmarks/load.py
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -53,5 +58,11 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(LLAMA_CPP) $(INSTALL) --editable '.[transformers,llama-cpp,dev]'
 	touch $@ .venv/base .venv/docs
 
+.venv-light/test: pyproject.toml requirements.lock
+	$(PYTHON) -m venv .venv-light
+	.venv-light/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
+		--constraint requirements.lock --editable '.[test]'
+	touch $@
+
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf .venv .venv-light build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

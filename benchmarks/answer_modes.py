@@ -29,6 +29,7 @@ from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.asking import requests
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 
@@ -71,7 +72,8 @@ def main() -> None:
 def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[Request]:
     """The ego's requests, spread over the shipped dataset."""
     dataset = load.load(load.find(DATASET))
-    spec = Spec(card, prompts.load("v2"), dataset, tuple(POINTS.values()), (0,), answer=mode)  # type: ignore[arg-type]
+    source, points = FrozenSource(dataset), tuple(POINTS.values())
+    spec = Spec(card, prompts.load("v2"), source, points, (0,), answer=mode)  # type: ignore[arg-type]
     scenes = dataset.scenes[:: max(1, len(dataset.scenes) // count)][:count]
     egos = [r for r in requests(spec, scenes) if r.role == "ego"]
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos

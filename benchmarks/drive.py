@@ -25,15 +25,19 @@ from harness.backends import cards
 from harness.backends.proxy import Proxy
 from harness.coordination.operating_point import POINTS
 from harness.dataset import freeze
-from harness.evaluate.drive import run
-from harness.evaluate.live import drive
-from harness.evaluate.live_spec import Drive, spec_of
+from harness.evaluate.asking import Asker
+from harness.evaluate.live_world import LiveSource, LiveWorld
+from harness.evaluate.run import evaluate
+from harness.evaluate.spec import Spec
+from harness.evaluate.walk import table, walk
 from harness.prompts import versions as prompts
+from harness.runs.records import Episode, Latency
 from harness.world import reference as live
 from harness.world import simulator
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
-LATENCY = {"source": "card", "inference_s": {"ego": 0.145, "helper": 0.145}, "basis": "the proxy's card"}
+LATENCY = Latency("card", "the proxy's card", 0.145, 0.145)
 # Functions whose time makes up a part: frames, what is seen, and who drives. The rest is the harness's own.
 PARTS: dict[str, tuple[Any, str]] = {
     "highway-env": (World, "_step"),
@@ -50,17 +54,17 @@ def main() -> None:
     arguments.add_argument("--seeds", type=int, default=5)
     arguments.add_argument("--repeats", type=int, default=5)
     given = arguments.parse_args()
-    spec = spec_of(
-        cards.resolve("proxy"), prompts.load("v2"), tuple(POINTS.values()), tuple(range(given.seeds)),
-        episodes=given.episodes,
+    spec = Spec(
+        cards.resolve("proxy"), prompts.load("v2"), LiveSource(0, given.episodes), tuple(POINTS.values()),
+        tuple(range(given.seeds)),
     )  # fmt: skip
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 
-    drive(spec, Proxy(), LATENCY, range(1))  # pays for imports and compiled templates
+    drive(spec, range(1))  # pays for imports and compiled templates
     # By turns, and the least of each: what else the machine does only ever adds.
     turns = [(frame_us(), frame_us(plain=True)) for _ in range(given.repeats)]
     cheap_us, plain_us = map(min, zip(*turns, strict=True))
-    parts, frames, frames_lived = shares(spec)
+    parts, frames, frames_lived = shares(spec, range(given.episodes))
     walls = {workers: wall_s(spec, workers, 2) for workers in (1, 2)}
     total = sum(parts.values())
 
@@ -85,12 +89,12 @@ def main() -> None:
 
 def frame_us(plain: bool = False) -> float:
     """CPU time of a frame, over ten seconds of four layouts with a braking ego."""
-    worlds = [World.start(seed) for seed in (0, 1, 6, 10)]
+    worlds = [World.start(SCENARIO, seed) for seed in (0, 1, 6, 10)]
     with highway_envs_own() if plain else ExitStack():
         start = process_time()
         for world in worlds:
             world.take("SLOWER")
-            world.advance(world.env.parameters.simulation_hz * 10)
+            world.advance(SCENARIO.parameters.simulation_hz * 10)
         return (process_time() - start) * 1e6 / sum(world.frame for world in worlds)
 
 
@@ -107,7 +111,16 @@ def highway_envs_own() -> Iterator[None]:
         yield
 
 
-def shares(spec: Drive) -> tuple[dict[str, float], int, int]:
+def drive(spec: Spec, numbers: range) -> list[Episode]:
+    """Walk some episodes and lay their decisions out as a table."""
+    world = LiveWorld(SCENARIO, 0, numbers, spec.points, spec.seeds, spec.ego_alone)
+    asker = Asker(spec, Proxy, LATENCY)
+    decided = [part for step in walk(world, spec.points, asker) for part in step]
+    table(decided, world.columns(), spec.actions)
+    return world.episodes()
+
+
+def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
     """Seconds of each part in one process, frames simulated, and frames lived through by all episodes."""
     spent = dict.fromkeys(PARTS, 0.0)
     calls = dict.fromkeys(PARTS, 0)
@@ -127,21 +140,20 @@ def shares(spec: Drive) -> tuple[dict[str, float], int, int]:
         for part, (owner, name) in PARTS.items():
             stack.enter_context(patch.object(owner, name, clocked(part, getattr(owner, name))))
         start = perf_counter()
-        _, episodes = drive(spec, Proxy(), LATENCY, range(spec.episodes))
+        episodes = drive(spec, numbers)
         total = perf_counter() - start
-    lived = round(
-        sum(e["time_s"] for e in episodes) * simulator.OccludedIntersectionEnv.parameters.simulation_hz
-    )
+    lived_s = sum(episode.time_s or 0.0 for episode in episodes)
+    lived = round(lived_s * SCENARIO.parameters.simulation_hz)
     return {**spent, "own": total - sum(spent.values())}, calls["highway-env"], lived
 
 
-def wall_s(spec: Drive, workers: int, repeats: int) -> float:
+def wall_s(spec: Spec, workers: int, repeats: int) -> float:
     """Wall time of a whole run, its folder written: the least of some."""
 
     def once() -> float:
         with tempfile.TemporaryDirectory() as folder:
             start = perf_counter()
-            run(spec, Path(folder) / "run", False, workers, lambda done: None)
+            evaluate(spec, Path(folder) / "run", False, lambda done: None, workers=workers)
             return perf_counter() - start
 
     return min(once() for _ in range(repeats))

@@ -28,21 +28,22 @@ from harness.coordination.operating_point import POINTS
 from harness.core.files import canonical_json
 from harness.core.resources import DATASET
 from harness.dataset import load
-from harness.evaluate import asking, evaluate, intents
+from harness.evaluate import asking, run, walk
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.prompts.versions import Prompt
-from harness.runs import record
+from harness.runs import folder as folders
+from harness.runs.folder import read
 
 AIM_MS = 0.3
 # Functions whose time makes up a part; `complete` is the backend's own and no part of the harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
     "prompt": [(Prompt, "render")],
-    "parse": [(intents, "parse")],
-    "coordinate": [(evaluate, "score")],
-    "record": [(asking, "answer_of"), (asking, "canonical_json"), (record, "rows"), (record, "episodes"),
-               (evaluate, "summary"), (evaluate, "write_whole")],
+    "parse": [(asking, "parse")],
+    "coordinate": [(walk, "coordinate")],
+    "record": [(asking, "_keep"), (run, "table"), (run, "counted"), (run, "scores"), (folders, "write")],
 }  # fmt: skip
 LIMIT = "limit"
 
@@ -61,12 +62,13 @@ def main() -> None:
     dataset = load.load(load.find(given.dataset))
     loading_ms = (process_time() - start) * 1000 / len(dataset.scenes)
     specs = [
-        Spec(cards.resolve("proxy"), prompts.load(given.prompt), replicated(dataset, size),
+        Spec(cards.resolve("proxy"), prompts.load(given.prompt), FrozenSource(replicated(dataset, size)),
              tuple(POINTS.values()), tuple(range(5)))
         for size in given.sizes
     ]  # fmt: skip
-    run(specs[0], ["proxy"])  # pays for imports and compiled templates
-    requests = asking.request_count(specs[1]) / len(specs[1].dataset.scenes)
+    evaluated(specs[0], ["proxy"])  # pays for imports and compiled templates
+    scenes = scenes_of(specs[1])
+    requests = asking.request_count(specs[1], scenes) / len(scenes)
     # Clocks around every call take time too, so the total comes from runs with the proxy's alone.
     total = slopes(specs, ["proxy"], given.repeats)
     parts = slopes(specs, list(PARTS), given.repeats)
@@ -113,16 +115,24 @@ def slopes(specs: list[Spec], parts: list[str], repeats: int) -> dict[str, float
     """Milliseconds a decision more costs, by part: median over repeats of the slope between two sizes."""
     found: dict[str, list[float]] = {}
     for _ in range(repeats):
-        small, large = (run(spec, parts) for spec in specs)
-        more = len(specs[1].dataset.scenes) - len(specs[0].dataset.scenes)
+        small, large = (evaluated(spec, parts) for spec in specs)
+        more = len(scenes_of(specs[1])) - len(scenes_of(specs[0]))
         for part in large:
             found.setdefault(part, []).append((large[part] - small[part]) * 1000 / more)
     return {part: statistics.median(values) for part, values in found.items()}
 
 
-def run(spec: Spec, parts: list[str]) -> dict[str, float]:
+def scenes_of(spec: Spec) -> tuple[load.Scene, ...]:
+    """The scenes of an evaluation."""
+    assert isinstance(spec.source, FrozenSource)
+    return spec.source.dataset.scenes
+
+
+def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
     """CPU seconds of one evaluation: its parts, all its own time, and the limit for its record."""
-    fresh = replace(spec, dataset=replace(spec.dataset, scenes=tuple(map(again, spec.dataset.scenes))))
+    assert isinstance(spec.source, FrozenSource)
+    scenes = tuple(map(again, scenes_of(spec)))
+    fresh = replace(spec, source=FrozenSource(replace(spec.source.dataset, scenes=scenes)))
     with tempfile.TemporaryDirectory() as folder:
         spent: defaultdict[str, float] = defaultdict(float)
         with ExitStack() as clocks:
@@ -130,11 +140,11 @@ def run(spec: Spec, parts: list[str]) -> dict[str, float]:
                 for owner, name in PARTS[part]:
                     clocks.enter_context(clocked(owner, name, spent, part))
             start = process_time()
-            out = evaluate.evaluate(fresh, Path(folder) / "run", False, lambda done: None).out
+            out = run.evaluate(fresh, Path(folder) / "run", False, lambda done: None).out
             whole = process_time() - start
         own = whole - spent["proxy"]
         other = whole - sum(spent.values())
-        limit = limit_s(fresh, (out / "rows.jsonl").read_text().splitlines())
+        limit = limit_s(fresh, out)
     return {**spent, "other": other, "own": own, LIMIT: limit}
 
 
@@ -143,22 +153,23 @@ def again(scene: load.Scene) -> load.Scene:
     return load.Scene(scene.record)
 
 
-def limit_s(spec: Spec, rows: list[str]) -> float:
-    """CPU seconds of what no harness with this record can leave out, done with the standard library alone.
+def limit_s(spec: Spec, out: Path) -> float:
+    """CPU seconds of what no harness with this record can leave out.
 
-    Every prompt hashed, every answer decoded as JSON, every row encoded as JSON; rendering, scoring and
-    bookkeeping for nothing.
+    Every prompt hashed, every answer decoded as JSON, every line of answers encoded as JSON, with the
+    standard library alone, and the decisions written by Arrow; rendering and bookkeeping for nothing.
     """
-    messages = [request.messages for request in asking.requests(spec, spec.dataset.scenes)]
-    decoded = [json.loads(row) for row in rows]
+    messages = [request.messages for request in asking.requests(spec, scenes_of(spec))]
+    decoded = [json.loads(line) for line in (out / "answers.jsonl").read_text().splitlines()]
+    decisions = read(out).decisions
     start = process_time()
     for message in messages:
         hashlib.sha256(canonical_json(message).encode()).hexdigest()
-    for row in decoded:
-        for answer in row["answers"].values():
-            json.loads(answer["raw"][answer["raw"].index("{") :])
-    for row in decoded:
-        canonical_json(row)
+    for answer in decoded:
+        json.loads(answer["raw"][answer["raw"].index("{") :])
+    for answer in decoded:
+        canonical_json(answer)
+    decisions.write(out / "again.parquet")
     return process_time() - start
 
 

@@ -1,8 +1,8 @@
 """What a report weighs, how long it takes to write, and how long a browser takes to open it.
 
-The proxy's run on the shipped dataset; for more decisions its scenes are repeated as further episodes. A page
-is *readable* at its first contentful paint, *ready* when every decision can be filtered and opened, *drawn*
-when the last chart is. The limit is a page of the same bytes whose script is taken out.
+The proxy's run on the shipped dataset; for more decisions all its scenes are repeated as further episodes.
+A page is *readable* at its first contentful paint, *ready* when every decision can be filtered and opened,
+*drawn* when the last chart is. The limit is a page of the same bytes whose script is taken out.
 
     python benchmarks/report.py [--decisions 1440 20160] [--repeats 5]
 """
@@ -17,20 +17,24 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from msgspec import structs
 from playwright.sync_api import Browser, sync_playwright
 
 from harness.backends import cards
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import Scene, find, load
-from harness.evaluate.evaluate import evaluate
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.report.page import render
 from harness.report.runs import Runs, gather
-from harness.runs.folder import Row
+from harness.runs import folder
+from harness.runs.decisions import Decisions, Labels
 
 READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
+SHIFT = 10_000  # of the numbers of repeated episodes
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"
 
 
@@ -44,20 +48,21 @@ def main() -> None:
     if chromium is None:
         raise SystemExit("no chromium here; `make browser` installs it")
     found = []
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        base = Path(folder)
+    with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
+        base = Path(scratch)
         spec = Spec(
             cards.resolve("proxy"),
             prompts.load("v2"),
-            load(find(DATASET)),
+            FrozenSource(load(find(DATASET))),
             tuple(POINTS.values()),
             tuple(range(5)),
         )
-        evaluate(spec, base / "run", False, lambda done: None, None)
+        evaluate(spec, base / "run", False, lambda done: None)
         runs = gather([base / "run"])
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         for n in given.decisions:
-            found.append(measured(repeated(runs, n), base / f"{n}.html", browser, given.repeats))
+            many = repeated(runs, n, base / str(n))
+            found.append(measured(many, base / f"{n}.html", browser, given.repeats))
         browser.close()
     names = list(found[0])
     for name in names:
@@ -65,23 +70,44 @@ def main() -> None:
     print(json.dumps(found))
 
 
-def repeated(runs: Runs, decisions: int) -> Runs:
-    """The same run on so many scenes: those it has, again and again as other episodes."""
+def repeated(runs: Runs, decisions: int, out: Path) -> Runs:
+    """The same run on at least so many scenes: those it has, again and again as other episodes."""
     [run], dataset = runs.runs, runs.dataset
     assert dataset is not None
-    scenes: list[Scene] = []
-    rows: list[Row] = []
-    for turn in range(-(-decisions // len(run.rows))):
-        for row in run.rows[: decisions - len(rows)]:
-            episode = row["episode"] + turn * 10_000
-            rows.append({**row, "episode": episode, "scene": f"{episode:05d}-{row['step']}"})
-        for scene in dataset.scenes:
-            episode = scene.record["episode"] + turn * 10_000
-            named = {"episode": episode, "scene": f"{episode:05d}-{scene.record['step']}"}
-            scenes.append(Scene({**scene.record, **named}))
-    return replace(
-        runs, runs=(replace(run, rows=tuple(rows)),), dataset=replace(dataset, scenes=tuple(scenes))
+    d, ids = run.decisions, list(run.decisions.scenes)
+    codes = d.codes("scene", ids)
+    shifts = range(0, -(-decisions // len(ids)) * SHIFT, SHIFT)
+    folder.write(
+        out,
+        run.manifest,
+        Decisions.concat(
+            [
+                d.replace(
+                    scene=Labels(codes, [shifted(scene, by) for scene in ids]),
+                    episode=d.whole("episode") + by,
+                )
+                for by in shifts
+            ]
+        ),
+        [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
+        [structs.replace(answer, scene=shifted(answer.scene, by)) for by in shifts for answer in run.answers],
+        run.scores,
     )
+    scenes = [
+        Scene({
+            **scene.record, "scene": shifted(scene.id, by), "episode": scene.record["episode"] + by,
+        })
+        for by in shifts for scene in dataset.scenes
+    ]  # fmt: skip
+    many = folder.read(out)
+    _ = many.decisions, many.answers, many.scores  # reading is not timed
+    return replace(runs, runs=(many,), dataset=replace(dataset, scenes=tuple(scenes)))
+
+
+def shifted(scene: str, by: int) -> str:
+    """A scene's id in an episode that much further."""
+    episode, _, step = scene.partition("-")
+    return f"{int(episode) + by:05d}-{step}"
 
 
 def measured(runs: Runs, out: Path, browser: Browser, repeats: int) -> dict[str, Any]:
@@ -92,15 +118,16 @@ def measured(runs: Runs, out: Path, browser: Browser, repeats: int) -> dict[str,
     out.write_text(page, encoding="utf-8")
     bare = out.with_suffix(".bare.html")
     bare.write_text(page[: page.rindex("<script>")] + "</body></html>", encoding="utf-8")
-    last = runs.runs[0].rows[-1]["scene"]
+    decisions = runs.runs[0].decisions
+    last = list(decisions.scenes)[-1]
     opened = [times(browser, out, "body[data-drawn]") for _ in range(repeats)]
     alone = [times(browser, out, "#decision[data-drawn]", f"#scene={last}") for _ in range(repeats)]
     plain = [times(browser, bare, "body") for _ in range(repeats)]
     readable, ready, drawn = (median(of) for of in zip(*opened, strict=True))
     limit = median(of[1] for of in plain)
     return {
-        "decisions (scenes)": len(runs.runs[0].rows),
-        "with conditions and seeds": sum(len(row["decisions"]) for row in runs.runs[0].rows),
+        "decisions (scenes)": len(decisions.scenes),
+        "with conditions and seeds": len(decisions),
         "written, s": round(written_s, 1),
         "size, MB": round(out.stat().st_size / 1e6, 1),
         "readable, s": round(readable, 2),

@@ -17,10 +17,11 @@ from time import perf_counter, process_time
 import numpy as np
 
 from harness.coordination.operating_point import POINTS
+from harness.runs.folder import read
+from harness.studies.axes import Setting
 from harness.studies.calibrated import STEPS, Calibrated
 from harness.studies.paper import SEEDS, panels
 from harness.studies.play import play
-from harness.studies.setting import Setting
 
 HARNESS = [sys.executable, "-m", "harness"]
 
@@ -72,7 +73,7 @@ def sweep() -> dict[str, float]:
         run = f"{folder}/run"
         timed([*HARNESS, "eval", "--model", "proxy", "--limit", "200", "--out", run])
         wall_s = timed([*HARNESS, "sweep", run, "--over", "tau", "--grid", "0.1:1.09:0.01"])
-        scenes = len((Path(run) / "rows.jsonl").read_text().splitlines())
+        scenes = len(read(Path(run)).decisions.scenes)
     return {"sweep_wall_s": wall_s, "sweep_points": 100, "sweep_scenes": scenes}
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from harness.runs.tables import Tables
 
 __all__ = ["UserError", "load"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def load(run: "str | PathLike[str]") -> "Tables":

@@ -12,6 +12,7 @@ from hypothesis import settings
 from harness import cli
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 EPISODES, SEED = 4, 100
 
@@ -39,7 +40,7 @@ def small_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.Fixture
     with (base / "small.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (base / "small" / "manifest.json").is_file():
-            build(base / "small", EPISODES, SEED, 1, lambda done: None)
+            build(SCENARIO, base / "small", EPISODES, SEED, 1, lambda done: None)
     return base / "small"
 
 

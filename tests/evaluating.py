@@ -2,49 +2,131 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.coordination.operating_point import POINTS, OperatingPoint
-from harness.dataset.load import Dataset
-from harness.evaluate.asking import ask_all, requests
-from harness.evaluate.evaluate import Evaluated, evaluate
-from harness.evaluate.intents import Answered, intents
-from harness.evaluate.scoring import Scored, draw, score
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.asking import Asker, requests
+from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.live_world import LiveSource
+from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
-from harness.evaluate.success import Table, table
+from harness.evaluate.walk import Decided, table, walk
 from harness.prompts import versions as prompts
+from harness.runs import folder
+from harness.runs.decisions import Decisions
+from harness.runs.metrics import Grid
+from harness.runs.records import Answer, Decision, Episode, Latency, Score
+from harness.runs.summary import counted, scores
 
-FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
+FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
 
 
-def spec_of(dataset: Dataset, model: str = "proxy", prompt: str = "v2", **options: Any) -> Spec:
+def spec_of(
+    dataset: Dataset, model: str = "proxy", prompt: str = "v2", limit: int | None = None, **options: Any
+) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(cards.resolve(model), prompts.load(prompt), dataset, **options)
+    return Spec(cards.resolve(model), prompts.load(prompt), FrozenSource(dataset, limit), **options)
+
+
+def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:
+    options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
+    return Spec(cards.resolve(model), prompts.load("v2"), LiveSource(first_seed, episodes), **options)
 
 
 def run(spec: Spec, out: Path, resume: bool = False) -> Evaluated:
     return evaluate(spec, out, resume, lambda done: None)
 
 
-def rows_of(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out / "rows.jsonl").read_text(encoding="utf-8").splitlines()]
-
-
-def decisions(rows: list[dict[str, Any]], condition: str) -> list[dict[str, Any]]:
-    return [d for row in rows for d in row["decisions"] if d["condition"] == condition]
-
-
-def figure(done: Evaluated, condition: str, metric: str, interval: str = "episodes") -> Any:
+def figure(done: "Evaluated | Walked", condition: str, metric: str, interval: str = "episodes") -> Score:
     """The one row of a summary that says this."""
-    t = done.summary
-    [row] = t[(t.condition == condition) & (t.metric == metric) & (t.interval == interval)].itertuples()
-    return row
+    wanted = (condition, metric, interval)
+    [score] = [s for s in done.scores if (s.condition, s.metric, s.interval) == wanted]
+    return score
+
+
+def same_files(one: Path, other: Path) -> bool:
+    """Whether two runs have the same tables: bytes, and of decisions.parquet values and their types."""
+    texts = [name for name in FILES if name != "decisions.parquet"]
+    return same_decisions(one, other) and all(
+        (one / name).read_bytes() == (other / name).read_bytes() for name in texts
+    )
+
+
+def same_decisions(one: Path, other: Path) -> bool:
+    """Whether two runs have the same decisions.parquet: values and their types."""
+    tables = [folder.read(run).decisions.table for run in (one, other)]
+    return bool(tables[0].equals(tables[1]))
+
+
+def same_scores(one: Evaluated, other: Evaluated) -> bool:
+    """Whether two summaries say the same, whoever the model was."""
+    return list(one.scores) == list(other.scores)
+
+
+def decisions(out: Path, condition: str | None = None) -> list[Decision]:
+    """A run's decisions under a condition, by scene and seed."""
+    found = folder.read(out).decisions
+    return [d for d in found.records(0, len(found)) if condition in (None, d.condition)]
+
+
+A_TENTH = Latency("card", "declared: for this test", 0.1, 0.1, 0.1)
+
+
+@dataclass(frozen=True)
+class Walked:
+    """A walk through frozen scenes: what was decided, and what a run's tables would have of it."""
+
+    parts: Sequence[Decided[Scene]]
+    decisions: Decisions
+    episodes: Sequence[Episode]
+    answers: Sequence[Answer]
+    scores: Sequence[Score]
+
+    def result(self, point: OperatingPoint, name: str, seed: int = 0) -> list[Any]:
+        """A field of the coordination in each scene, in the order of their names."""
+        by_scene = {
+            part.moments[at].id: getattr(part.result, name)[row]
+            for part in self.parts if part.point == point
+            for row, (at, its_seed) in enumerate(zip(part.due.at, part.due.seed, strict=True))
+            if its_seed == seed
+        }  # fmt: skip
+        return [by_scene[scene] for scene in sorted(by_scene)]
+
+    def records(self, condition: str) -> list[Decision]:
+        """The decisions under a condition, by scene and seed."""
+        found = self.decisions.records(0, len(self.decisions))
+        return [decision for decision in found if decision.condition == condition]
+
+
+def asker_of(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Asker:
+    """An asker that has asked about every scene."""
+    asker = Asker(spec, lambda: backend, latency, kept)
+    asker.ask(list(requests(spec, scenes_of(spec))))
+    return asker
+
+
+def scenes_of(spec: Spec) -> tuple[Scene, ...]:
+    assert isinstance(spec.source, FrozenSource)
+    return spec.source.dataset.scenes
+
+
+def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Walked:
+    """A whole evaluation but for its folder: asked, walked and scored."""
+    asker = asker_of(spec, backend, latency, kept)
+    assert isinstance(spec.source, FrozenSource)
+    world = FrozenWorld(spec.source.dataset, spec.seeds)
+    parts = list(chain.from_iterable(walk(world, spec.points, asker)))
+    made = table(parts, world.columns(), spec.actions)
+    grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
+    episodes = counted(grid, made, world.episodes())
+    answers = folder.ordered(asker.answers.values(), made)
+    return Walked(parts, made, episodes, answers, scores("frozen", grid, made, episodes, answers))
 
 
 class Scripted:
@@ -79,22 +161,6 @@ def says(p: Sequence[float], role: str = "ego", actions: Sequence[str] = ("SLOWE
 
 def sure(action: str, role: str = "ego") -> str:
     return says([float(a == action) for a in ("SLOWER", "IDLE", "FASTER")], role)
-
-
-def ask(spec: Spec, backend: Backend, folder: Path) -> Answered:
-    """Every answer asked for and read."""
-    by_id = ask_all(
-        spec, backend, requests(spec, spec.dataset.scenes), folder / "answers.jsonl", lambda done: None
-    )
-    return intents(spec.dataset, by_id, spec.answer, spec.thinking)
-
-
-def scored(
-    spec: Spec, known: Answered, point: OperatingPoint, seed: int = 0, infer_s: float = 0.1
-) -> tuple[Table, Scored]:
-    laid = table(spec.dataset)
-    timed = replace(known, inference_s=np.full(known.distance_m.shape, infer_s))
-    return laid, score(laid, timed, point, seed, draw(laid, seed, known.valid.shape))
 
 
 def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:

@@ -61,10 +61,10 @@ class _Handler(BaseHTTPRequestHandler):
             told = {"id": name, "sha": COMMIT, "siblings": [{"rfilename": f} for f in files]}
             self._send(200, json.dumps(told).encode(), {}, body)
         elif path.startswith(f"{name}/tree/"):
-            told = [
+            entries = [
                 {"type": "file", "path": f, "size": len(d or b""), "oid": _oid(d)} for f, d in files.items()
             ]
-            self._send(200, json.dumps(told).encode(), {}, body)
+            self._send(200, json.dumps(entries).encode(), {}, body)
         else:
             revision, _, file = api.split("/resolve/", 1)[-1].partition("/")
             if file not in files:

@@ -10,23 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import Scripted, decisions, failed, rows_of, spec_of
+from evaluating import Scripted, decisions, failed, same_decisions, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
+from run_on_disk import answers_of
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Rendering, Request
-from harness.backends.cache import NOT_IN_KEY, Cached, default_file, key
+from harness.backends.base import Completion, Request
+from harness.backends.cache import NOT_IN_KEY, Cached, CompletionFile, cached, default_file, key
 from harness.backends.cards import Latency
-from harness.backends.completion_file import CompletionFile
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset, load
-from harness.evaluate.evaluate import Evaluated, evaluate
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 BASE = Request("00000-0/v1", "ego", ({"role": "user", "content": "Scene"},), ACTIONS, 64)
@@ -43,6 +45,7 @@ CHANGED: dict[str, Any] = {
     "sample": 1,
     "view": {"nodes": []},
     "truth": {"nodes": []},
+    "scenario": SCENARIO,
 }
 
 
@@ -78,7 +81,7 @@ def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None
         assert same == (name in NOT_IN_KEY), name
 
 
-@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "view", "truth"}))
+@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "view", "truth", "scenario"}))
 def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str, file: Path) -> None:
     talker = Talker()
     Cached(talker, file).complete([BASE])
@@ -250,12 +253,9 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     latency = options.pop("latency", Latency("card", 0.1, "declared: for this test"))
     card = replace(card, latency=latency)
     points = tuple(POINTS.values())
-    spec = Spec(card, prompts.load("v2"), data, points, (0,), device="cpu", dtype="float32", **options)
+    source = FrozenSource(data)
+    spec = Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
     return evaluate(spec, out, False, lambda done: None, cache)
-
-
-def answers_of(out: Path) -> list[dict[str, Any]]:
-    return [answer for row in rows_of(out) for answer in row["answers"].values()]
 
 
 def test_a_run_from_the_cache_is_the_run_that_was_asked(
@@ -265,19 +265,22 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     asked = tiny_run(tiny, data, tmp_path / "asked", None)
     first = tiny_run(tiny, data, tmp_path / "first", file)
     again = tiny_run(tiny, data, tmp_path / "again", file)
-    assert (tmp_path / "first/rows.jsonl").read_bytes() == (tmp_path / "asked/rows.jsonl").read_bytes()
+    assert (tmp_path / "first/answers.jsonl").read_bytes() == (tmp_path / "asked/answers.jsonl").read_bytes()
+    for name in ("first", "again"):
+        assert same_decisions(tmp_path / name, tmp_path / "asked")
     for table in ("summary.csv", "episodes.csv"):
         assert (tmp_path / "again" / table).read_bytes() == (tmp_path / "asked" / table).read_bytes()
-    good = [a["error"] is None for a in answers_of(tmp_path / "asked")]
+    good = [a.error is None for a in answers_of(tmp_path / "asked")]
     assert any(good)
     assert not all(good), "prompts too long for the model are no answers, and are not kept"
-    assert [a["cached"] for a in answers_of(tmp_path / "again")] == good
-    assert [r.manifest["cached_answers"] for r in (asked, first, again)] == [0, 0, sum(good)]
+    assert [a.cached for a in answers_of(tmp_path / "again")] == good
+    assert [r.manifest.cached_answers for r in (asked, first, again)] == [0, 0, sum(good)]
 
     file.unlink()
     spec = spec_of(data, f"replay:{tmp_path / 'again'}", seeds=(0,))
     evaluate(spec, tmp_path / "replayed", False, lambda done: None)
-    assert (tmp_path / "replayed/rows.jsonl").read_bytes() == (tmp_path / "again/rows.jsonl").read_bytes()
+    assert answers_of(tmp_path / "replayed") == answers_of(tmp_path / "again")
+    assert same_decisions(tmp_path / "replayed", tmp_path / "again")
 
 
 MEASURED = Latency("measured", None, "this machine")
@@ -289,9 +292,9 @@ def test_batches_are_timed_though_every_answer_is_kept(
     data = load(small_path, limit=1)
     for name in ("first", "again"):
         done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=4)
-        assert done.manifest["latency"]["n"]["ego"] > 0
-        assert done.manifest["latency"]["inference_s"]["ego"] > 0
-    assert done.manifest["cached_answers"] > 0
+        assert done.manifest.latency.n["ego"] > 0
+        assert done.manifest.latency.ego_s > 0
+    assert done.manifest.cached_answers > 0
 
 
 def test_one_by_one_the_cached_answers_take_the_median_of_those_that_were_asked(
@@ -300,14 +303,13 @@ def test_one_by_one_the_cached_answers_take_the_median_of_those_that_were_asked(
     few, data = load(small_path, limit=1), load(small_path, limit=2)
     tiny_run(tiny, few, tmp_path / "few", file, latency=MEASURED, batch_size=1)
     done = tiny_run(tiny, data, tmp_path / "run", file, latency=MEASURED, batch_size=1)
-    assert done.manifest["latency"]["inference_s"] is None
-    rows = rows_of(tmp_path / "run")
-    own = [row["answers"]["v1"] for row in rows]
-    assert all(a["seconds"] is None for a in own if a["cached"])
-    assert any(a["cached"] for a in own)
-    typical = float(np.median([a["seconds"] for a in own if a["seconds"] is not None]))
-    expected = [1000 * (a["seconds"] or typical) for a in own]
-    found = [d["latency_ms"] for d in decisions(rows, "single-local")]
+    assert done.manifest.latency.each_its_own
+    own = [a for a in answers_of(tmp_path / "run") if a.viewer == "v1"]
+    assert all(a.seconds is None for a in own if a.cached)
+    assert any(a.cached for a in own)
+    typical = float(np.median([a.seconds for a in own if a.seconds is not None]))
+    expected = [1000 * (a.seconds or typical) for a in own]
+    found = [d.latency_ms for d in decisions(tmp_path / "run", "single-local")]
     assert found == pytest.approx(expected, abs=1e-3)
 
 
@@ -317,11 +319,11 @@ def test_one_by_one_with_every_answer_kept_a_sample_is_timed(
     data = load(small_path, limit=1)
     for name in ("first", "again"):
         done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=1)
-    latency = done.manifest["latency"]
-    assert latency["n"]["ego"] > 0
-    assert all(a["seconds"] is None for a in answers_of(tmp_path / "again"))
-    for decision in decisions(rows_of(tmp_path / "again"), "single-local"):
-        assert decision["latency_ms"] == pytest.approx(1000 * latency["inference_s"]["ego"], abs=1e-3)
+    latency = done.manifest.latency
+    assert latency.n["ego"] > 0
+    assert all(a.seconds is None for a in answers_of(tmp_path / "again"))
+    for decision in decisions(tmp_path / "again", "single-local"):
+        assert decision.latency_ms == pytest.approx(1000 * latency.ego_s, abs=1e-3)
 
 
 def test_a_served_models_answers_are_kept_and_its_key_is_not(
@@ -333,13 +335,13 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
         card = cards.load("openai-example")
         assert card.server is not None
         card = replace(card, server=replace(card.server, base_url=there.url))
-        spec = Spec(card, prompts.load("v2"), data, tuple(POINTS.values()), (0,))
+        spec = Spec(card, prompts.load("v2"), FrozenSource(data), tuple(POINTS.values()), (0,))
         manifests = [
             evaluate(spec, tmp_path / name, False, lambda done: None, file).manifest
             for name in ("first", "again")
         ]
     asked = len(answers_of(tmp_path / "first"))
-    assert [m["cached_answers"] for m in manifests] == [0, asked]
+    assert [m.cached_answers for m in manifests] == [0, asked]
     assert not any(b"5ecret" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 
@@ -354,18 +356,20 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     folder = tiny_qwen3.build(tmp_path / "tiny", context_tokens=2048)
     gguf_export.export(folder, tmp_path / "tiny.gguf", "F32")
     card = replace(cards.resolve(str(tmp_path / "tiny.gguf")), max_new_tokens=6)
-    spec = Spec(card, prompts.load("v2"), load(small_path, limit=1), tuple(POINTS.values()), (0,))
+    source = FrozenSource(load(small_path, limit=1))
+    spec = Spec(card, prompts.load("v2"), source, tuple(POINTS.values()), (0,))
     for name in ("first", "again"):
         done = evaluate(spec, tmp_path / name, False, lambda done: None, file)
     answers = answers_of(tmp_path / "again")
-    assert done.manifest["cached_answers"] == len(answers)
-    assert [a["raw"] for a in answers] == [a["raw"] for a in answers_of(tmp_path / "first")]
+    assert done.manifest.cached_answers == len(answers)
+    assert [a.raw for a in answers] == [a.raw for a in answers_of(tmp_path / "first")]
 
 
 def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:
     for model in ("proxy", "local-view"):
-        backend: Backend = open_backend(cards.load(model))
-        assert not isinstance(backend, Rendering)
+        card = cards.load(model)
+        backend = open_backend(card)
+        assert cached(backend, card, file) is backend
         evaluate(spec_of(small, model), tmp_path / model, False, lambda done: None, file)
     assert not file.exists()
-    assert isinstance(Talker(), Rendering)
+    assert isinstance(cached(Talker(), cards.load("openai-example"), file), Cached)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from harness.backends import cards
 from harness.backends.failures import Failures
+from harness.backends.registry import capabilities
 from harness.backends.servers import Server
 from harness.core import resources
 from harness.core.errors import UserError
@@ -67,9 +68,9 @@ def test_every_shipped_card_loads_under_its_file_name() -> None:
 
 def test_language_models_declare_no_latency_that_was_not_measured() -> None:
     for card in cards.load_all():
-        if card.engine in (*cards.WEIGHTED, "openai"):
+        if capabilities(card.engine).renders:
             assert (card.latency.source, card.latency.inference_s) == ("measured", None), card.name
-            from_hub = card.engine in cards.WEIGHTED and "/" in str(card.weights)
+            from_hub = capabilities(card.engine).has_weights and "/" in str(card.weights)
             assert card.licence or not from_hub, card.name
 
 

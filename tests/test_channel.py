@@ -1,17 +1,27 @@
 """Which replies cross, and when they have arrived."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.channel import NO_CHANNEL, PROFILES, density_coupled_loss, link_up, reply_delay_s
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Draws, Links, density_coupled_loss, link_up
 from harness.core.noise import uniforms
 
-V2X, SIXG = PROFILES["v2x"], PROFILES["6g"]
+V2X: Any = CHANNELS["v2x"]
+SIXG: Any = CHANNELS["6g"]
 RANGE_M = np.array([10.0, 20.0, 30.0])
 ALL = np.array([True, True, True])
 NONE_S = np.zeros(3)
+
+
+def reply_delay_s(channel, asked, ready_s, range_m, payload_bits, jitter, roadside_edge=False):
+    links = Links(asked, ready_s, range_m, payload_bits, in_radius=asked, rounds=np.zeros_like(asked))
+    channel = replace(channel, roadside_edge=roadside_edge)
+    return channel.deliver(links, Draws(np.zeros((*asked.shape, 2)), jitter)).delay_s
 
 
 def test_density_coupled_loss_meets_the_papers_three_points_and_ends_at_one():
@@ -24,28 +34,28 @@ def test_density_coupled_loss_meets_the_papers_three_points_and_ends_at_one():
     [(0.5, 0.5, True), (0.05, 0.5, False), (0.5, 0.05, False), (0.08, 0.08, True)],
 )
 def test_request_and_reply_must_both_cross(request_draw, reply_draw, heard):
-    assert link_up(np.array([[request_draw, reply_draw]]), np.float64(0.08)).tolist() == [heard]
+    assert link_up(np.array([[request_draw, reply_draw]]), np.array(0.08)).tolist() == [heard]
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.012, 0.08, 0.4, 1.0])
 def test_a_helper_is_heard_with_the_square_of_the_chance_to_cross(loss):
-    up = link_up(uniforms((40_000, 1, 2), "round trip"), np.float64(loss))
+    up = link_up(uniforms((40_000, 1, 2), "round trip"), np.array(loss))
     assert np.mean(up) == pytest.approx((1 - loss) ** 2, abs=0.01)
 
 
 def test_a_roadside_edge_gives_the_reply_a_second_path_and_the_request_none():
     draws = np.array([[0.5, 0.05], [0.05, 0.5], [0.5, 0.005]])
-    assert link_up(draws, np.float64(0.08)).tolist() == [False, False, False]
-    assert link_up(draws, np.float64(0.08), roadside_edge=True).tolist() == [True, False, False]
+    assert link_up(draws, np.array(0.08)).tolist() == [False, False, False]
+    assert link_up(draws, np.array(0.08), roadside_edge=True).tolist() == [True, False, False]
 
 
 def test_each_decision_may_have_its_own_loss():
     draws = np.full((2, 1, 2), 0.1)
-    assert link_up(draws, np.array([0.05, 0.2])).tolist() == [[True], [False]]
+    assert link_up(draws, np.array([[0.05], [0.2]])).tolist() == [[True], [False]]
 
 
 def test_nothing_crosses_without_a_channel():
-    assert not link_up(np.full((2, 2), 0.999), np.float64(NO_CHANNEL.loss)).any()
+    assert not link_up(np.full((2, 2), 0.999), np.array(NO_CHANNEL.loss)).any()
 
 
 def test_v2x_serves_the_nearest_first_and_the_kth_pays_k_slots():

@@ -14,7 +14,8 @@ from evaluating import spec_of
 from tokenizers import Tokenizer, models
 
 from harness import cli
-from harness.cli.evaluate import default_out, parse_seeds
+from harness.cli.options import parse_seeds
+from harness.cli.run import default_out
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 
@@ -143,7 +144,7 @@ def test_a_manifest_that_is_none_is_one_line(harness: Harness, broken: Path) -> 
     (broken / "manifest.json").write_text("{")
     assert "manifest.json cannot be read" in one_line(harness("eval", "--dataset", broken))
     (broken / "manifest.json").write_text('{"\\u001b[31m": 1}')
-    assert "manifest.json at $: " in one_line(harness("eval", "--dataset", broken))
+    assert "manifest.json: unknown key in manifest " in one_line(harness("eval", "--dataset", broken))
 
 
 def test_a_tokenizer_that_is_none_is_one_line(harness: Harness, small_path: Path, tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
     assert "prompt tokens: not counted" in said.out
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
-    assert (told["requests"], told["seeds"], told["limit"]) == (24, [0, 1, 2, 3, 4], None)
+    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (24, [0, 1, 2, 3, 4], None)
     assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
 
 

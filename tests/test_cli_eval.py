@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from evaluating import same_files
 
 Said = tuple[int, str, str]
 
@@ -20,7 +21,8 @@ def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said],
     assert out.splitlines()[-1] == f"wrote {folder / 'report.html'}"
     assert {p.name for p in folder.iterdir()} >= {
         "run.json",
-        "rows.jsonl",
+        "answers.jsonl",
+        "decisions.parquet",
         "episodes.csv",
         "summary.csv",
         "report.html",
@@ -61,8 +63,7 @@ def test_the_command_in_the_manifest_runs_it_again(
         "eval", "--dataset", small_path, "--limit", "1", "--seeds", "0,3", "--condition", "6g", "--out", "a b"
     )
     manifest = json.loads((tmp_path / "a b" / "run.json").read_text())
-    rows = (tmp_path / "a b" / "rows.jsonl").read_bytes()
     (tmp_path / "a b").rename(tmp_path / "first")
     code, _, _ = harness(*shlex.split(manifest["command"])[1:])
     assert code == 0
-    assert (tmp_path / "a b" / "rows.jsonl").read_bytes() == rows
+    assert same_files(tmp_path / "a b", tmp_path / "first")

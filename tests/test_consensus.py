@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from harness.coordination.consensus import (
-    RULES,
+    POOLS,
     inverse_distance_weights,
     linear_pool,
     log_pool,
@@ -94,29 +94,29 @@ def heard(draw: Any) -> tuple[Any, Any]:
     return p, raw / raw.sum(axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
 def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_heard(rule: str, case: Any):
     p, weights = case
-    fused = RULES[rule](p, weights)
+    fused = POOLS[rule](p, weights)
     assert fused.sum(axis=-1) == pytest.approx(1.0)
     assert (fused >= 0).all()
     alone = weights[:, 0] == 1
     assert fused[alone] == pytest.approx(p[alone, 0])
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POOLS)
 @given(case=heard(), data=st.data())
 def test_the_order_of_helpers_changes_no_policy(rule: str, case: Any, data: Any):
     p, weights = case
     order = [0, *data.draw(st.permutations(range(1, p.shape[1])))]
-    assert RULES[rule](p[:, order], weights[:, order]) == pytest.approx(RULES[rule](p, weights))
+    assert POOLS[rule](p[:, order], weights[:, order]) == pytest.approx(POOLS[rule](p, weights))
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
 def test_many_decisions_at_once_are_each_of_them_alone(rule: str, case: Any):
     p, weights = case
-    batched = RULES[rule](p, weights)
+    batched = POOLS[rule](p, weights)
     for one, q, w in zip(batched, p, weights, strict=True):
-        assert RULES[rule](q, w) == pytest.approx(one)
+        assert POOLS[rule](q, w) == pytest.approx(one)

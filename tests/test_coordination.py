@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from harness.coordination.channel import Draws
-from harness.coordination.coordinate import Coordination, coordinate
+from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
 
@@ -40,7 +40,7 @@ def play(
         np.full(len(valid), 1000.0),
         np.array(inference_s),
     )
-    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), fusion_call)
+    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), Fusion(fusion_call))
 
 
 def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
@@ -306,6 +306,6 @@ def test_every_array_of_a_batch_has_the_batch_in_front():
         Draws(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
     )
     per_helper = {"asked", "delivered", "arrival_s", "on_time"}
-    inner = {"own": (3,), "fused": (3,), "weights": (5,)} | dict.fromkeys(per_helper, (4,))
+    inner = {"own": (3,), "fused": (3,), "weights": (5,), "state": (0,)} | dict.fromkeys(per_helper, (4,))
     for field in fields(decisions):
         assert getattr(decisions, field.name).shape == (5, 2, *inner.get(field.name, ())), field.name

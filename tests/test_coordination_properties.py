@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.coordination.channel import Draws
-from harness.coordination.consensus import RULES
+from harness.coordination.consensus import POOLS
 from harness.coordination.coordinate import Coordination, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
@@ -45,7 +45,7 @@ points = st.builds(
     max_helpers=st.integers(0, 5),
     roadside_edge=st.booleans(),
     on_demand=st.booleans(),
-    consensus=st.sampled_from(sorted(RULES)),
+    consensus=st.sampled_from(sorted(POOLS)),
 )
 
 
@@ -109,7 +109,7 @@ def test_the_order_of_helpers_changes_nothing(point, case, data):
 
 
 @given(st.sampled_from(COOPERATIVE[:2]), cases(), st.floats(0, 1), st.floats(0, 1))
-def test_more_loss_never_hears_more_helpers_with_the_same_luck(point, case, one, other):
+def test_more_loss_never_hears_more_helpers_with_the_same_draws(point, case, one, other):
     low, high = sorted((one, other))
     less, more = (coordinate(replace(point, loss=loss), *case) for loss in (low, high))
     assert np.all(more.on_time <= less.on_time)

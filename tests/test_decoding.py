@@ -207,7 +207,7 @@ def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
 def same(one: Sequence[Completion], other: Sequence[Completion]) -> None:
     """Equal but for company: a read-out's numbers may differ by what float32 rounds."""
     for a, b in zip(one, other, strict=True):
-        alone = {"batch_size": 1, "seconds": None, "text": "", "label_mass": None}
+        alone: Any = {"batch_size": 1, "seconds": None, "text": "", "label_mass": None}
         assert replace(a, **alone) == replace(b, **alone)
         if a.label_mass is None:
             assert a.text == b.text

@@ -22,12 +22,11 @@ from harness.dataset.load import Dataset, load, shared
 from harness.parsing.parse import parse
 from harness.prompts import readout
 from harness.prompts import versions as prompts
-from harness.training import teacher
 from harness.training.answers import answer, message
 from harness.training.distill import distill
-from harness.training.examples import alone, excerpts, kl_nats, split, with_messages
+from harness.training.examples import alone, excerpts, kl_nats, labels, split, with_messages
+from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
-from harness.training.text import chat
 from harness.training.train import STAGES, Plan
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
@@ -70,7 +69,7 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late(few: Dataset) -> 
     scenes = tuple(
         replace(s, record={**s.record, "outcomes": t}) for s, t in zip(few.scenes, tables, strict=False)
     )
-    free, danger, lost = teacher.labels(replace(few, scenes=scenes))
+    free, danger, lost = labels(replace(few, scenes=scenes))
     total = np.exp(-2.0) + 1.3
     assert free == pytest.approx([np.exp(-2.0) / total, 1 / total, 0.3 / total])
     assert danger.tolist() == [1.0, 0.0, 0.0]

@@ -36,6 +36,9 @@ class Words:
     def decode(self, ids: Sequence[int]) -> str:
         return bytes(ids).decode()
 
+    def pieces(self, ids: Sequence[int]) -> list[str]:
+        return [chr(byte) for byte in ids]
+
 
 @pytest.fixture(scope="module")
 def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:

@@ -21,13 +21,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 
+from harness.backends import registry
 from harness.backends.base import Request
 from harness.backends.cards import Card, Latency
-from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.llama_cpp.engine import LlamaEngine, LlamaSession
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.registry import missing, open_backend
+from harness.backends.weights import find_gguf
 from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
@@ -356,7 +357,7 @@ def test_an_option_that_cannot_be_names_what_can(tiny: Path, options: Any, messa
 
 
 def test_without_the_package_it_says_how_to_get_it(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llama_backend, "find_spec", lambda name: None)
+    monkeypatch.setattr(registry, "find_spec", lambda name: None)
     card = card_of(tiny / "F32.gguf")
     assert missing(card) == "llama-cpp-python"
     with pytest.raises(UserError, match=r"pip install 'swarmdrive-harness\[llama-cpp\]'"):
@@ -375,7 +376,7 @@ def test_a_file_is_found_by_its_path_beside_the_cards_or_in_a_folder(
         card_of(Path("tiny-qwen3/F32.gguf")),
         card_of(Path("tiny-qwen3"), file="F32.gguf"),
     ):
-        assert llama_backend.find(card) == tiny / "F32.gguf"
+        assert find_gguf(card) == tiny / "F32.gguf"
         assert missing(card) is None
 
 
@@ -394,9 +395,7 @@ def test_a_file_that_is_nowhere_says_what_to_give_or_to_run(tmp_path: Path) -> N
 def test_a_file_in_the_hubs_cache_is_known_by_its_commit(
     tiny: Path, backend: LlamaBackend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     repository = tmp_path / "models--tiny--qwen3-GGUF"
     (repository / "snapshots" / COMMIT).mkdir(parents=True)
     shutil.copy(tiny / "F32.gguf", repository / "snapshots" / COMMIT)

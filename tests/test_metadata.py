@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from harness import cards
+from harness.backends import cards
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

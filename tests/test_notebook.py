@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
-import nbformat
 import pytest
+
+pytest.importorskip("nbclient", reason="needs the dev extra")
+pytest.importorskip("ipykernel", reason="needs the dev extra")
+
+import nbformat
 from nbclient import NotebookClient
 
 NOTEBOOK = Path(__file__).parent.parent / "examples/run-as-tables.ipynb"

@@ -565,7 +565,7 @@ def test_after_a_run_the_key_is_nowhere(
     printed = capfd.readouterr()
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     texts = [path.read_bytes().decode("utf-8", "replace") for path in files]
-    assert {"run.json", "rows.jsonl"} <= {path.name for path in files}
+    assert {"run.json", "answers.jsonl", "decisions.parquet"} <= {path.name for path in files}
     for text in (printed.out, printed.err, *texts):
         assert "5ecret" not in text
     assert any("[key]" in text for text in texts)

@@ -12,7 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from evaluating import rows_of, run, spec_of
+from evaluating import run, spec_of
+from run_on_disk import answers_of
 
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Completion, Request
@@ -162,14 +163,14 @@ def test_a_constrained_answer_of_a_server_keeps_to_the_form(prompt: str, card: C
 def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset, tmp_path: Path) -> None:
     spec = replace(spec_of(data), card=replace(card, max_new_tokens=120), answer="constrained", batch_size=1)
     done = run(spec, tmp_path / "run")
-    answers = [a for row in rows_of(tmp_path / "run") for a in row["answers"].values()]
-    assert {a["error"] for a in answers} == {None}
-    assert {a["status"] for a in answers} <= {"strict", "bad_sum"}
-    assert all(a["seconds"] > 0 and a["prompt_tokens"] > 0 and a["completion_tokens"] > 0 for a in answers)
-    assert done.manifest["latency"]["source"] == "measured"
-    assert done.manifest["identity"]["listed"] == {"id": "tiny", "owned_by": "me"}
+    answers = answers_of(tmp_path / "run")
+    assert {a.error for a in answers} == {None}
+    assert {a.status for a in answers} <= {"strict", "bad_sum"}
+    assert all(a.seconds > 0 and a.prompt_tokens > 0 and a.completion_tokens > 0 for a in answers)
+    assert done.manifest.latency.source == "measured"
+    assert done.manifest.identity["listed"] == {"id": "tiny", "owned_by": "me"}
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
-    assert len(files) == 4
+    assert len(files) == 5
     assert not any(KEY.encode() in path.read_bytes() for path in files)
 
 

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from harness.coordination.channel import CHANNELS
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError
 
@@ -78,6 +79,18 @@ def test_an_unknown_point_is_told_the_nearest():
     assert named_point("6g") is POINTS["6g"]
     with pytest.raises(UserError, match="did you mean 'v2x'"):
         named_point("v2xx")
+
+
+def test_every_other_channel_profile_is_a_point_of_its_own_name(monkeypatch):
+    fog = replace(CHANNELS["6g"], loss=0.5)
+    monkeypatch.setitem(CHANNELS._loaded, "fog", fog)
+    assert named_point("fog") == OperatingPoint("fog", "fog")
+    assert named_point("fog:loss=0.2") == OperatingPoint("fog:loss=0.2", "fog", loss=0.2)
+    assert named_point("fog:window_s=0.3").channel() == fog
+    with pytest.raises(
+        UserError, match="setting of operating point fog 'windows_s'; did you mean 'window_s'"
+    ):
+        named_point("fog:windows_s=0.3")
 
 
 def test_a_change_of_a_point_is_called_by_its_text():

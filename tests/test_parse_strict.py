@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judging import ROLES, hundredths, judged_strict, unhurried
 
-from harness.parsing.parse import Status, parse
+from harness.parsing.parse import Status, _unmended, parse
+from harness.parsing.strict import fitting
 
 NAMES = st.lists(
     st.from_regex(r"[A-Z]{2,6}(_[A-Z]{2,6})?", fullmatch=True), min_size=2, max_size=6, unique=True
@@ -70,6 +71,39 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case:
         return  # not judged by its text
     text = case.text.removeprefix("<think>\n\n</think>")
     assert (case.status is Status.STRICT) == judged_strict(text, case.asked["role"])
+
+
+@unhurried
+@given(ANSWERS, ROLES, st.data())
+def test_the_quick_reading_is_the_slow_one_or_none(value: Any, role: str, data: st.DataObject) -> None:
+    text = json.dumps(value, ensure_ascii=data.draw(st.booleans()))
+    at = data.draw(st.integers(0, len(text)))
+    added = data.draw(
+        st.sampled_from(["", " ", ",", '"risk":"low",', "\\u003a", ":", "0", "1e0", "\n", "\ufeff"])
+    )
+    check_readings_agree(text[:at] + added + text[at:], role)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+def test_the_quick_reading_of_the_corpus_is_the_slow_one_or_none(case: Any) -> None:
+    for role in ("ego", "helper"):
+        check_readings_agree(case.text, role)
+
+
+@pytest.mark.parametrize(
+    "evidence", ["", "v6: left", "a\\u003ab", "\t", "\x7f", "\x00", "\ud83d", "é" * 200, "é" * 201]
+)
+@pytest.mark.parametrize("again", ["", '"evidence":"b",', '"evidence":"b:c",', '"risk":"low",'])
+def test_the_quick_reading_is_not_deceived_by_a_key_given_twice(evidence: str, again: str) -> None:
+    text = f'{{{again}"evidence":"{evidence}","risk":"high","recommended_maneuver":"IDLE","confidence":1}}'
+    check_readings_agree(text, "helper")
+    quick = fitting(text, "helper", ACTIONS)
+    assert (quick is not None) == (again == "" and evidence in ("", "v6: left", "\x7f", "é" * 200))
+
+
+def check_readings_agree(text: str, role: str) -> None:
+    quick = fitting(text, role, ACTIONS)
+    assert quick is None or quick == _unmended(text, role, ACTIONS)
 
 
 @unhurried

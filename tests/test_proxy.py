@@ -16,9 +16,9 @@ from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
 from harness.prompts.versions import load
 from harness.world.perception.graph import truth_graph
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
-ACTIONS = ("SLOWER", "IDLE", "FASTER")
+ACTIONS = SCENARIO.actions
 TAU_NATS = 0.7  # the paper's threshold
 
 tenths = st.floats(-60, 60).map(lambda x: round(x, 1))
@@ -47,7 +47,7 @@ def graphs(draw: st.DrawFn, role: str | None = None) -> dict[str, Any]:
     return {
         "viewer": "v1",
         "role": role or draw(st.sampled_from(["ego", "helper"])),
-        "step": draw(st.integers(0, Parameters().decisions - 1)),
+        "step": draw(st.integers(0, SCENARIO.parameters.decisions - 1)),
         "self": {"speed_mps": draw(speeds), "lane": "approach-own", "zone_m": 40.0},
         "ego": {
             "id": "v1", "speed_mps": draw(speeds), "zone_m": draw(tenths), "forward_m": 0.0, "left_m": 0.0,
@@ -63,13 +63,13 @@ def graphs(draw: st.DrawFn, role: str | None = None) -> dict[str, Any]:
 
 
 def request(graph: dict[str, Any], form: str = "distribution") -> Request:
-    return Request("s/v1", graph["role"], (), ACTIONS, 64, form, view=graph)
+    return Request("s/v1", graph["role"], (), ACTIONS, 64, form, view=graph, scenario=SCENARIO)
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(graphs())
 def test_it_gives_a_distribution_in_hundredths_that_sums_to_one(graph: dict[str, Any]) -> None:
-    p = distribution(graph, ACTIONS)
+    p = distribution(SCENARIO, graph)
     assert tuple(p) == ACTIONS
     assert all(0 <= x <= 1 and round(x * 100) / 100 == x for x in p.values())
     assert sum(round(x * 100) for x in p.values()) == 100
@@ -84,7 +84,7 @@ def test_every_answer_is_what_its_prompt_asks_for(graph: dict[str, Any], form: s
     assert parsed.verdict == ("strict" if form == "distribution" else "recovered"), parsed.detail
     assert [str(r) for r in parsed.repairs] == ([] if form == "distribution" else ["prose_around"])
     assert (parsed.message is None) == (graph["role"] == "ego")
-    p = distribution(graph, ACTIONS)
+    p = distribution(SCENARIO, graph)
     if graph["role"] == "ego" or form == "distribution":
         assert parsed.intent == pytest.approx(tuple(p.values()))
     else:
@@ -100,10 +100,10 @@ def test_it_is_unsure_where_a_sector_is_hidden_and_nothing_calls_for_braking(
     sectors = [
         {**s, "seen_share": seen, "occluded": True} if s["sector"] == sector else s for s in graph["sectors"]
     ]
-    p = np.array(list(distribution({**graph, "sectors": sectors}, ACTIONS).values()))
+    p = np.array(list(distribution(SCENARIO, {**graph, "sectors": sectors}).values()))
     assert p[0] == 0.9 or entropy_nats(p) > TAU_NATS
     free = {**graph, "conflicts": [], "ego": {**graph["ego"], "speed_mps": 14.0, "zone_m": 40.0}}
-    p = np.array(list(distribution({**free, "sectors": sectors}, ACTIONS).values()))
+    p = np.array(list(distribution(SCENARIO, {**free, "sectors": sectors}).values()))
     assert entropy_nats(p) > TAU_NATS
 
 
@@ -111,7 +111,7 @@ def test_it_is_unsure_where_a_sector_is_hidden_and_nothing_calls_for_braking(
 @given(graphs(role="ego"))
 def test_it_is_sure_where_everything_is_in_sight(graph: dict[str, Any]) -> None:
     sectors = [{**s, "seen_share": 1.0, "occluded": False} for s in graph["sectors"]]
-    p = np.array(list(distribution({**graph, "sectors": sectors}, ACTIONS).values()))
+    p = np.array(list(distribution(SCENARIO, {**graph, "sectors": sectors}).values()))
     assert entropy_nats(p) < TAU_NATS
 
 
@@ -144,9 +144,12 @@ def test_it_reads_its_own_view_and_neither_messages_nor_truth(small: Dataset) ->
     for scene in small.scenes[:6]:
         for viewer in scene.viewers:
             graph = scene.record["graphs"][viewer]
-            bare = Request("a", graph["role"], (), ACTIONS, 64, view=graph)
+            bare = Request("a", graph["role"], (), ACTIONS, 64, view=graph, scenario=SCENARIO)
             full = replace(
-                bare, messages=prompt.render(graph, ACTIONS), truth=truth_graph(scene.state), thinking=True
+                bare,
+                messages=prompt.render(graph, ACTIONS),
+                truth=truth_graph(SCENARIO, scene.state),
+                thinking=True,
             )
             assert answer(bare) == answer(full)
 
@@ -162,6 +165,6 @@ def test_a_quarter_of_a_sector_hidden_leaves_it_just_sure_enough() -> None:
         "step": 0, "ego": {"speed_mps": 14.0, "target_speed_mps": 14.0, "zone_m": 60.0}, "conflicts": [],
         "sectors": [{"sector": "left", "seen_share": 0.75, "occluded": False, "by": ["b1"]}],
     }  # fmt: skip
-    p = distribution(graph, ACTIONS)
+    p = distribution(SCENARIO, graph)
     assert p == {"SLOWER": 0.13, "IDLE": 0.77, "FASTER": 0.1}
     assert entropy_nats(np.array(list(p.values()))) == pytest.approx(0.697, abs=5e-4)

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import FILES, decisions, figure, rows_of, run, spec_of
+from evaluating import decisions, figure, run, same_decisions, spec_of
+from run_on_disk import answers_of
 from scipy.stats import binom
 
 from harness.backends import cards
 from harness.backends.base import Request
-from harness.backends.failures import Failures
+from harness.backends.failures import Failures, drawn, spoilt
 from harness.backends.proxy import answer
 from harness.backends.registry import open_backend
-from harness.backends.spoiling import drawn, spoilt
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
@@ -38,7 +38,16 @@ def made_up(n: int, start: int = 0) -> list[str]:
 
 def questions(dataset: Dataset, form: str) -> list[Request]:
     return [
-        Request(f"{scene.id}/{viewer}", graph["role"], (), dataset.actions, 64, form, view=graph)
+        Request(
+            f"{scene.id}/{viewer}",
+            graph["role"],
+            (),
+            dataset.actions,
+            64,
+            form,
+            view=graph,
+            scenario=dataset.scenario,
+        )
         for scene in dataset.scenes
         for viewer, graph in scene.record["graphs"].items()
     ]
@@ -82,7 +91,7 @@ def test_failures_come_as_often_as_declared() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_never_is_never_and_always_is_always(share: float) -> None:
-    failures = Failures(nan=share, slow_tail=share, slow_s=0.4)
+    failures = Failures(nan=share, slow_tail=share, slow_s=0.4 * share)
     expected = ("nan", 0.4) if share else (None, 0.0)
     assert {drawn(failures, name) for name in made_up(2000)} == {expected}
 
@@ -101,11 +110,10 @@ def test_the_intervals_cover_the_declared_rate_as_often_as_they_say() -> None:
 def test_a_run_counts_what_was_drawn_exactly(small: Dataset, tmp_path: Path) -> None:
     done = run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     verdicts: dict[str, list[str]] = {"ego": [], "helper": []}
-    for row in rows_of(tmp_path / "run"):
-        for viewer, given in row["answers"].items():
-            how, slow_s = drawn(FAULTY, f"{row['scene']}/{viewer}")
-            assert (given["status"], given["slow_s"]) == (STATUS[how], slow_s)
-            verdicts[given["role"]].append("failed" if how in FAILED else STATUS[how])
+    for given in answers_of(tmp_path / "run"):
+        how, slow_s = drawn(FAULTY, given.id)
+        assert (given.status, given.slow_s) == (STATUS[how], slow_s)
+        verdicts[given.role].append("failed" if how in FAILED else STATUS[how])
     for role, each in verdicts.items():
         assert len(set(each)) == 3, "a dataset in which nothing fails would show nothing"
         for verdict in ("strict", "recovered", "failed"):
@@ -114,19 +122,20 @@ def test_a_run_counts_what_was_drawn_exactly(small: Dataset, tmp_path: Path) -> 
                 len(each),
                 pytest.approx(each.count(verdict) / len(each), abs=1e-12),
             )
-            assert row.ci_low <= row.value <= row.ci_high
-    assert done.manifest["identity"]["failures"] == asdict(FAULTY)
+            assert row.low <= row.value <= row.high
+    assert done.manifest.identity["failures"] == asdict(FAULTY)
 
 
 def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Path) -> None:
     """Alone, an ego decides after 145 ms, or 545 ms where its answer was drawn slow."""
     run(spec_of(small, "proxy-faulty"), tmp_path / "run")
-    rows = rows_of(tmp_path / "run")
-    expected = [145.0 + 1000 * drawn(FAULTY, f"{row['scene']}/v1")[1] for row in rows for _ in (0, 1)]
-    found = [d["latency_ms"] for d in decisions(rows, "single-local")]
+    alone = decisions(tmp_path / "run", "single-local")
+    expected = [145.0 + 1000 * drawn(FAULTY, f"{scene.id}/v1")[1] for scene in small.scenes for _ in (0, 1)]
+    found = [d.latency_ms for d in alone]
     assert found == pytest.approx(expected)
     assert set(found) == {145.0, 545.0}
-    arrivals = [m["arrival_ms"] for d in decisions(rows, "6g") for m in d["messages"] if m["delivered"]]
+    heard = decisions(tmp_path / "run", "6g")
+    arrivals = [m.arrival_ms for d in heard for m in d.messages if m.delivered]
     assert min(arrivals) < 400 < max(arrivals), "a slow helper is heard late"
 
 
@@ -134,10 +143,10 @@ def test_neither_batches_nor_a_replay_nor_company_change_a_failure(small: Datase
     run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     run(spec_of(small, "proxy-faulty", batch_size=1), tmp_path / "single")
     run(spec_of(small, f"replay:{tmp_path / 'run'}"), tmp_path / "again")
-    for file in FILES[:1]:
-        first = (tmp_path / "run" / file).read_bytes()
-        assert first == (tmp_path / "single" / file).read_bytes()
-        assert first == (tmp_path / "again" / file).read_bytes()
+    first = (tmp_path / "run" / "answers.jsonl").read_bytes()
+    for twin in ("single", "again"):
+        assert first == (tmp_path / twin / "answers.jsonl").read_bytes()
+        assert same_decisions(tmp_path / twin, tmp_path / "run")
     backend = open_backend(cards.load("proxy-faulty"))
     asked = questions(small, "distribution")
     together = {c.request_id: c for c in backend.complete(asked)}

@@ -11,7 +11,7 @@ import pytest
 from small_hub import COMMIT, serving
 
 from harness.backends.cards import Card, Latency
-from harness.backends.transformers import checkpoint
+from harness.backends.weights import held_to_digest
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes
 
@@ -45,7 +45,13 @@ def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) 
     assert sorted(hub.asked) == ["chat_template.jinja", "config.json", "model.safetensors", "tokenizer.json"]
     fetched = snapshot(tmp_path, "some/model") / "model.safetensors"
     assert fetched.read_bytes() == CHECKPOINT["model.safetensors"]
-    # With the hub gone, what was fetched is found.
+
+
+def test_with_the_hub_gone_what_was_fetched_is_found(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("transformers", reason="needs the transformers extra")
+    with serving({"some/model": CHECKPOINT}) as hub:
+        harness(tmp_path, hub.url, "pull", "some/model")
     again = harness(tmp_path, hub.url, "check", "some/model")
     assert "does not load" in again.stderr, "these weights are none; but they are found"
 
@@ -67,10 +73,10 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
     file.write_bytes(b"GGUF")
     latency = Latency("measured", None, "b")
     card = Card("mine", "llama-cpp", "d", latency, weights=str(file), sha256=sha256_bytes(b"GGUF"))
-    assert checkpoint.held_to_digest(card, file) == file
+    assert held_to_digest(card, file) == file
     file.write_bytes(b"GGUX")
     with pytest.raises(UserError, match=r"is not what its card says: sha256 [0-9a-f]{64}, and the card has"):
-        checkpoint.held_to_digest(card, file)
+        held_to_digest(card, file)
 
 
 @pytest.mark.parametrize(

@@ -8,19 +8,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from evaluating import FILES, decisions, figure, rows_of, run, spec_of
+from evaluating import FILES, decisions, figure, run, same_decisions, same_files, same_scores, spec_of
+from run_on_disk import answers_of, rows_of
 
 from harness.backends import cards
 from harness.backends.cards import Latency
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.evaluate.success import driver_choices
 from harness.prompts import versions as prompts
+from harness.runs.records import Answer, FrozenScenes
 from harness.world.drivers import DRIVERS
 
 ALL = tuple(POINTS)
@@ -33,12 +37,9 @@ def proxy_run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def without_company(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows less what may differ with the batch: its size, and the seconds of an answer asked alone."""
-    for row in rows:
-        for answer in row["answers"].values():
-            del answer["batch_size"], answer["seconds"]
-    return rows
+def without_company(answers: list[Answer]) -> list[Answer]:
+    """Answers less what may differ with the batch: its size, and the seconds of an answer asked alone."""
+    return [msgspec.structs.replace(answer, batch_size=0, seconds=None) for answer in answers]
 
 
 # -- twins ----------------------------------------------------------------------------------------------
@@ -49,8 +50,7 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     batch_size: int, proxy_run: Path, small: Dataset, tmp_path: Path
 ) -> None:
     run(spec_of(small, batch_size=batch_size), tmp_path / "run")
-    for file in FILES:
-        assert (tmp_path / "run" / file).read_bytes() == (proxy_run / file).read_bytes()
+    assert same_files(tmp_path / "run", proxy_run)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,8 @@ def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
         cards.resolve(str(tiny)), max_new_tokens=6, latency=Latency("card", 0.1, "declared: for this test")
     )
     points = tuple(POINTS.values())
-    return Spec(card, prompts.load("v2"), data, points, (0,), device="cpu", dtype="float32", **options)
+    source = FrozenSource(data)
+    return Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
 
 
 def test_the_batch_size_changes_no_answer_of_a_language_model(
@@ -78,11 +79,11 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     runs = {}
     for batch_size in (1, 3, 64):
         run(tiny_spec(tiny, data, batch_size=batch_size), tmp_path / str(batch_size))
-        runs[batch_size] = without_company(rows_of(tmp_path / str(batch_size)))
+        runs[batch_size] = without_company(answers_of(tmp_path / str(batch_size)))
+        assert same_decisions(tmp_path / str(batch_size), tmp_path / "1")
     assert runs[1] == runs[3] == runs[64]
-    answers = [a for row in runs[1] for a in row["answers"].values()]
-    assert {a["finish_reason"] for a in answers} >= {"length", "error"}
-    assert len({a["raw"] for a in answers}) > 5, "answers that are all alike would show no order"
+    assert {a.finish_reason for a in runs[1]} >= {"length", "error"}
+    assert len({a.raw for a in runs[1]}) > 5, "answers that are all alike would show no order"
 
 
 def test_prompts_too_long_for_the_model_are_counted_as_engine_errors(
@@ -90,10 +91,10 @@ def test_prompts_too_long_for_the_model_are_counted_as_engine_errors(
 ) -> None:
     data = load(small_path, limit=1)
     done = run(tiny_spec(tiny, data), tmp_path / "run")
-    answers = [a for row in rows_of(tmp_path / "run") for a in row["answers"].values()]
-    errors = [a for a in answers if a["status"] == "engine_error"]
+    answers = answers_of(tmp_path / "run")
+    errors = [a for a in answers if a.status == "engine_error"]
     assert 0 < len(errors) < len(answers)
-    assert all(a["error"].startswith("context overflow: ") and a["intent"] is None for a in errors)
+    assert all(a.error.startswith("context overflow: ") and a.intent is None for a in errors)
     assert figure(done, "all", "failed_rate_ego", "answers").value == 1.0, "random weights write no JSON"
     assert figure(done, "6g", "fallback_rate").value == 1.0
 
@@ -102,44 +103,51 @@ def test_prompts_too_long_for_the_model_are_counted_as_engine_errors(
 def test_a_model_without_declared_latency_is_timed_alone(
     batch_size: int, tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:
-    spec = tiny_spec(tiny, load(small_path, limit=1), batch_size=batch_size)
+    data = load(small_path, limit=1)
+    spec = tiny_spec(tiny, data, batch_size=batch_size)
     card = replace(spec.card, latency=Latency("measured", None, "this machine"), context_tokens=560)
     done = run(replace(spec, card=card), tmp_path / "run")
-    latency = done.manifest["latency"]
-    assert latency["source"] == "measured"
-    rows = rows_of(tmp_path / "run")
-    found = [d["latency_ms"] for d in decisions(rows, "single-local")]
+    latency = done.manifest.latency
+    assert latency.source == "measured"
+    found = [d.latency_ms for d in decisions(tmp_path / "run", "single-local")]
     if batch_size == 1:
-        own = [row["answers"]["v1"]["seconds"] for row in rows]
+        own = [a.seconds for a in answers_of(tmp_path / "run") if a.viewer == "v1"]
         typical = float(np.median([s for s in own if s is not None]))
         assert None in own, "an answer that failed has no time of its own"
         expected = [1000 * (typical if s is None else s) for s in own]
-        assert latency["inference_s"] is None
+        assert (latency.ego_s, latency.helper_s) == (None, None)
     else:
-        assert latency["n"]["ego"] > 0
-        expected = [1000 * latency["inference_s"]["ego"]] * len(rows)
+        assert latency.n["ego"] > 0
+        expected = [1000 * latency.ego_s] * len(data.scenes)
     assert found == pytest.approx(expected, abs=1e-3)
-    replayed = run(spec_of(spec.dataset, f"replay:{tmp_path / 'run'}", seeds=(0,)), tmp_path / "again")
-    assert (tmp_path / "again" / "rows.jsonl").read_bytes() == (tmp_path / "run" / "rows.jsonl").read_bytes()
-    assert replayed.manifest["latency"] == latency
+    replayed = run(spec_of(data, f"replay:{tmp_path / 'run'}", seeds=(0,)), tmp_path / "again")
+    assert answers_of(tmp_path / "again") == answers_of(tmp_path / "run")
+    assert same_decisions(tmp_path / "again", tmp_path / "run")
+    assert replayed.manifest.latency == latency
 
 
 # -- replay ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
-def test_a_replay_makes_the_rows_of_the_run_it_replays(prompt: str, small: Dataset, tmp_path: Path) -> None:
+def test_a_replay_makes_the_tables_of_the_run_it_replays(prompt: str, small: Dataset, tmp_path: Path) -> None:
     first = run(spec_of(small, prompt=prompt), tmp_path / "run")
     again = run(spec_of(small, f"replay:{tmp_path / 'run'}", prompt), tmp_path / "again")
-    assert (tmp_path / "again" / "rows.jsonl").read_bytes() == (tmp_path / "run" / "rows.jsonl").read_bytes()
-    assert first.summary.drop(columns="model").equals(again.summary.drop(columns="model"))
-    assert again.manifest["identity"]["of"]["model"]["name"] == "proxy"
+    assert same_record(tmp_path / "again", tmp_path / "run")
+    assert same_scores(first, again)
+    assert again.manifest.identity["of"]["model"]["name"] == "proxy"
+
+
+def same_record(one: Path, other: Path) -> bool:
+    """Whether two runs have the same answers and decisions, whoever their model was."""
+    answers = [(run / "answers.jsonl").read_bytes() for run in (one, other)]
+    return answers[0] == answers[1] and same_decisions(one, other)
 
 
 def test_a_replay_is_replayed(proxy_run: Path, small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small, f"replay:{proxy_run}"), tmp_path / "a")
     run(spec_of(small, f"replay:{tmp_path / 'a'}"), tmp_path / "b")
-    assert (tmp_path / "b" / "rows.jsonl").read_bytes() == (proxy_run / "rows.jsonl").read_bytes()
+    assert same_record(tmp_path / "b", proxy_run)
 
 
 def refused(spec: Spec, out: Path) -> str:
@@ -185,12 +193,12 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
 @pytest.mark.parametrize(
     ("file", "content", "said"),
     [
-        ("rows.jsonl", None, "is no finished run: it lacks rows.jsonl or run.json"),
-        ("run.json", None, "is no finished run: it lacks rows.jsonl or run.json"),
-        ("run.json", "{}", "run.json is not of a run"),
-        ("run.json", "[", "run.json is not of a run"),
-        ("rows.jsonl", "{}\n", "rows.jsonl line 1 is not of a run"),
-        ("rows.jsonl", '{"scene": "00000-0", "answers": {}}\n[]\n', "rows.jsonl line 2 is not of a run"),
+        ("answers.jsonl", None, "answers.jsonl is broken (No such file or directory); make the run again"),
+        ("run.json", None, "is no finished run: it has no run.json; give a folder made by `harness eval`"),
+        ("run.json", "{}", "run.json has format 'None', not 'swarmdrive-run/2'; give a folder made by"),
+        ("run.json", "[", "run.json is broken ("),
+        ("answers.jsonl", "{}\n", "answers.jsonl is broken (Object missing required field"),
+        ("answers.jsonl", "[]\n", "answers.jsonl is broken ("),
     ],
 )
 def test_a_replay_of_something_else_is_refused(
@@ -242,7 +250,8 @@ def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None
 
 
 def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
-    pytest.importorskip("huggingface_hub", reason="needs the transformers extra")
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    pytest.importorskip("transformers", reason="needs the transformers extra")
     assert "no-such-model" in refused(spec_of(small, "nobody/no-such-model"), tmp_path / "out")
     (tmp_path / "hollow").mkdir()
     (tmp_path / "hollow" / "config.json").write_text("{}")
@@ -282,25 +291,27 @@ def test_settings_that_mean_nothing_are_refused(options: dict[str, Any], said: s
 
 
 def test_a_served_model_thinks_where_its_card_says_so(small: Dataset) -> None:
-    card = cards.load("openai-example")
-    assert Spec(card, prompts.load("v2"), small, (), (0,), thinking=True).thinking is True
+    card, source = cards.load("openai-example"), FrozenSource(small)
+    assert Spec(card, prompts.load("v2"), source, (), (0,), thinking=True).thinking is True
     with pytest.raises(UserError, match="--thinking: openai-example cannot think; leave it out"):
-        Spec(replace(card, thinking="none"), prompts.load("v2"), small, (), (0,), thinking=True)
+        Spec(replace(card, thinking="none"), prompts.load("v2"), source, (), (0,), thinking=True)
 
 
 def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to(small: Dataset) -> None:
-    card = replace(cards.load("qwen3-4b"), thinking="always")
-    assert Spec(card, prompts.load("v2"), small, (), (0,)).thinking is True
-    assert Spec(cards.load("qwen3-4b"), prompts.load("v2"), small, (), (0,)).thinking is False
+    card, source = replace(cards.load("qwen3-4b"), thinking="always"), FrozenSource(small)
+    assert Spec(card, prompts.load("v2"), source, (), (0,)).thinking is True
+    assert Spec(cards.load("qwen3-4b"), prompts.load("v2"), source, (), (0,)).thinking is False
 
 
 # -- conditions -------------------------------------------------------------------------------------------
 
 
 def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
-    for d in decisions(rows_of(proxy_run), "single-local"):
-        assert (d["triggered"], d["messages"], d["own_weight"]) == (False, [], 1.0)
-        assert d["latency_ms"] == 145.0
+    alone = decisions(proxy_run, "single-local")
+    assert len(alone) == 24 * 2
+    for d in alone:
+        assert (d.triggered, d.messages, d.own_weight) == (False, (), 1.0)
+        assert d.latency_ms == 145.0
 
 
 def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
@@ -311,12 +322,9 @@ def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
     run(spec_of(small, points=points, seeds=(0, 1, 2)), tmp_path / "run")
     heard = []
     for point in points:
-        by_name = [
-            {m["from"] for m in d["messages"] if m["delivered"]}
-            for d in decisions(rows_of(tmp_path / "run"), point.name)
-        ]
-        assert all(len(d["messages"]) == 3 for d in decisions(rows_of(tmp_path / "run"), point.name))
-        heard.append(by_name)
+        made = decisions(tmp_path / "run", point.name)
+        assert all(len(d.messages) == 3 for d in made)
+        heard.append([{m.sender for m in d.messages if m.delivered} for d in made])
     for clearer, worse in pairwise(heard):
         assert all(w <= c for c, w in zip(clearer, worse, strict=True))
     counts = [sum(map(len, by_name)) for by_name in heard]
@@ -330,10 +338,9 @@ def test_a_blocked_link_stays_blocked_for_its_episode_and_for_no_other(
     point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
     run(spec_of(small, points=(point,), seeds=tuple(range(5))), tmp_path / "run")
     up: dict[tuple[int, int, str], set[bool]] = {}
-    for row in rows_of(tmp_path / "run"):
-        for d in row["decisions"]:
-            for m in d["messages"]:
-                up.setdefault((row["episode"], d["seed"], m["from"]), set()).add(m["delivered"])
+    for d in decisions(tmp_path / "run"):
+        for m in d.messages:
+            up.setdefault((d.episode, d.seed, m.sender), set()).add(m.delivered)
     assert all(len(states) == 1 for states in up.values())
     links = {key: states.pop() for key, states in up.items()}
     for kind in range(3):  # episodes, seeds and helpers each have luck of their own
@@ -349,10 +356,7 @@ def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_pat
     for prompt in ("v1", "v2"):
         run(spec_of(small, prompt=prompt, points=(point,)), tmp_path / prompt)
         links.append(
-            [
-                [(m["from"], m["delivered"]) for m in d["messages"]]
-                for d in decisions(rows_of(tmp_path / prompt), "half")
-            ]
+            [[(m.sender, m.delivered) for m in d.messages] for d in decisions(tmp_path / prompt, "half")]
         )
     assert links[0] == links[1]
 
@@ -362,15 +366,14 @@ def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
     driver: str, small: Dataset, tmp_path: Path
 ) -> None:
     done = run(spec_of(small, driver), tmp_path / "run")
-    rows = rows_of(tmp_path / "run")
     chosen = [small.actions[i] for i in driver_choices(small, driver)]
     for condition in ALL:
         for seed in (0, 1):
-            made = [d for d in decisions(rows, condition) if d["seed"] == seed]
-            assert [d["action"] for d in made] == chosen
-            assert all((d["messages"], d["latency_ms"]) == ([], 0.0) for d in made)
+            made = [d for d in decisions(tmp_path / "run", condition) if d.seed == seed]
+            assert [d.action for d in made] == chosen
+            assert all((d.messages, d.latency_ms) == ((), 0.0) for d in made)
         assert figure(done, condition, "messages_per_episode").value == 0
-    assert all(list(row["answers"]) == ["v1"] for row in rows)
+    assert [a.id for a in answers_of(tmp_path / "run")] == [f"{scene.id}/v1" for scene in small.scenes]
     for metric in ("success_rate", "brier", "entropy_nats"):
         assert len({figure(done, condition, metric).value for condition in ALL}) == 1
     assert figure(done, "6g", "success_gain_over_single-local").value == 0
@@ -386,15 +389,14 @@ def test_the_driver_that_sees_everything_is_the_upper_reference(small: Dataset, 
 # -- the record -------------------------------------------------------------------------------------------
 
 
-def test_the_summary_can_be_made_again_from_the_rows(proxy_run: Path) -> None:
-    """Recounted with pandas, from nothing but `rows.jsonl`."""
-    rows = rows_of(proxy_run)
+def test_the_summary_can_be_made_again_from_the_decisions(proxy_run: Path) -> None:
+    """Recounted with pandas, from nothing but `decisions.parquet`."""
     table = pd.DataFrame([
-        {"episode": r["episode"], "condition": d["condition"], "seed": d["seed"], "sent": len(d["messages"]),
+        {"episode": d["episode"], "condition": d["condition"], "seed": d["seed"], "sent": d["messages"],
          "triggered": d["triggered"], "ms": d["latency_ms"], "missed": d["deadline_missed"],
          "entropy": d["entropy_nats"],
-         "unsafe": not d["safe"] and any(r["safe"]), "delay": d["delay_s"] if d["safe"] else 0.0}
-        for r in rows for d in r["decisions"]
+         "unsafe": not d["safe"] and avoidable(d), "delay": d["delay_s"] if d["safe"] else 0.0}
+        for d in rows_of(proxy_run)
     ])  # fmt: skip
     episodes = table.groupby(["condition", "seed", "episode"]).agg(
         sent=("sent", "sum"), triggered=("triggered", "mean"), ms=("ms", "mean"), missed=("missed", "mean"),
@@ -410,21 +412,26 @@ def test_the_summary_can_be_made_again_from_the_rows(proxy_run: Path) -> None:
             "ms": "latency_proxy_ms", "missed": "deadline_miss_rate", "entropy": "entropy_nats",
             "unsafe": "unsafe_rate",
         }.items():  # fmt: skip
-            assert figures[condition, metric] == pytest.approx(float(means.loc[condition, column]), abs=1e-3)
+            assert figures[condition, metric] == pytest.approx(means[column][condition], abs=1e-3)
 
 
-def test_the_episodes_table_agrees_with_the_rows(proxy_run: Path) -> None:
+def avoidable(row: dict[str, Any]) -> bool:
+    """Whether some action was safe."""
+    return any(row[f"safe_{action}"] for action in ("SLOWER", "IDLE", "FASTER"))
+
+
+def test_the_episodes_table_agrees_with_the_decisions(proxy_run: Path) -> None:
     table = pd.read_csv(proxy_run / "episodes.csv", keep_default_na=False)
     assert len(table) == 4 * 3 * 2
     rows = rows_of(proxy_run)
+    e: Any
     for e in table.itertuples():
-        mine = [r for r in rows if r["episode"] == e.episode]
-        made = [
-            d for r in mine for d in r["decisions"] if (d["condition"], d["seed"]) == (e.condition, e.seed)
-        ]
-        assert e.messages == sum(len(d["messages"]) for d in made)
-        assert e.deadline_misses == sum(d["deadline_missed"] for d in made)
-        unsafe = [any(r["safe"]) and not d["safe"] for r, d in zip(mine, made, strict=True)]
+        wanted = (e.episode, e.condition, e.seed)
+        mine = [d for d in rows if (d["episode"], d["condition"], d["seed"]) == wanted]
+        assert len(mine) == e.decisions
+        assert e.messages == sum(d["messages"] for d in mine)
+        assert e.deadline_misses == sum(d["deadline_missed"] for d in mine)
+        unsafe = [avoidable(d) and not d["safe"] for d in mine]
         assert e.success == (not any(unsafe) and e.delay_s <= 1.01)
         assert (e.failure == "") == e.success
         assert (e.failure in ("collision", "time_out", "off_road")) == any(unsafe)
@@ -434,12 +441,13 @@ def test_the_manifest_says_how_to_run_it_again(small_path: Path, tmp_path: Path)
     """Whatever the folder is called, a shell reads the command as it was meant."""
     out = tmp_path / "a run; rm -rf $HOME 'quoted'"
     done = run(spec_of(load(small_path, limit=2), limit=2), out)
-    words = shlex.split(done.manifest["command"])
+    words = shlex.split(done.manifest.command)
     assert words[:2] == ["harness", "eval"]
     options = dict(zip(words[2::2], words[3::2], strict=True))
     assert options["--out"] == str(out)
     assert options["--limit"] == "2"
-    assert (done.manifest["limit"], done.manifest["dataset"]["episodes"]) == (2, 2)
+    assert isinstance(done.manifest.world, FrozenScenes)
+    assert (done.manifest.world.limit, done.manifest.world.episodes) == (2, 2)
 
 
 def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(small: Dataset, tmp_path: Path) -> None:

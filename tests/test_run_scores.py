@@ -2,28 +2,39 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
-import pandas as pd
 import pytest
-from evaluating import Scripted, ask, failed, says, scored, spec_of, sure, with_outcomes
+from evaluating import (
+    Scripted,
+    Walked,
+    asker_of,
+    failed,
+    figure,
+    says,
+    scenes_of,
+    spec_of,
+    sure,
+    walked,
+    with_outcomes,
+)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from harness.backends import cards
-from harness.backends.base import Completion, Request
-from harness.backends.cards import Latency
+from harness.backends.base import Completion, Request, Role
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
-from harness.evaluate.scoring import draw, score, statuses
-from harness.evaluate.success import table
-from harness.evaluate.timing import inference_s, measure
-from harness.runs import record
-from harness.runs.summary import COLUMNS, summary
+from harness.evaluate import latency as latencies
+from harness.evaluate.asking import answer_of, requests
+from harness.evaluate.latency import inference_s
+from harness.runs.folder import csv_text
+from harness.runs.records import Answer, Episode, Latency, Score, Variant
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
@@ -58,24 +69,23 @@ def played(small: Dataset) -> Dataset:
 
 
 @pytest.fixture
-def told(played: Dataset, tmp_path: Path) -> pd.DataFrame:
-    """The summary of three conditions, one seed, 0.1 s an answer."""
-    spec = spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,))
-    known = ask(spec, Scripted(SAID), tmp_path)
-    runs = [scored(spec, known, point)[1] for point in spec.points]
-    table = summary(spec, scored(spec, known, ALONE)[0], known, runs)
-    assert tuple(table.columns) == COLUMNS
-    return table.set_index(["condition", "metric", "interval"])
+def told(played: Dataset) -> Walked:
+    """Three conditions, one seed, 0.1 s an answer."""
+    return walked(spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,)), Scripted(SAID))
 
 
-def value(
-    told: pd.DataFrame, condition: str, metric: str, interval: str = "episodes"
-) -> tuple[float, int, int]:
-    row = told.loc[(condition, metric, interval)]
-    return float(row.value), int(row.n), int(row.n_excluded)
+def value(told: Walked, condition: str, metric: str, interval: str = "episodes") -> tuple[Any, int, int]:
+    score = figure(told, condition, metric, interval)
+    return score.value, score.n, score.n_excluded
 
 
-def test_success_unsafe_and_late_by_hand(told: pd.DataFrame) -> None:
+def test_a_summarys_columns(told: Walked) -> None:
+    head, first, *_ = csv_text(Score, told.scores, Variant("proxy", "v2", "json")).splitlines()
+    assert head == "model,prompt,answer,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
+    assert first.startswith("proxy,v2,json,single-local,success_rate,0.5,")
+
+
+def test_success_unsafe_and_late_by_hand(told: Walked) -> None:
     """Episode 0 is just in time, 1 hangs on its helpers, 2 is late, 3 could not be helped."""
     assert value(told, "single-local", "success_rate") == (2 / 4, 4, 0)
     assert value(told, "single-local", "unsafe_rate") == (1 / 4, 4, 0)
@@ -85,16 +95,17 @@ def test_success_unsafe_and_late_by_hand(told: pd.DataFrame) -> None:
     assert value(told, "deaf", "success_rate") == (2 / 4, 4, 0)
 
 
-def test_the_gain_over_single_local_is_paired_by_episode(told: pd.DataFrame) -> None:
+def test_the_gain_over_single_local_is_paired_by_episode(told: Walked) -> None:
     """Differences 0, 1, 0, 0: mean 0.25, standard error 0.25, times t(3) = 3.182."""
-    row = told.loc[("clear", "success_gain_over_single-local", "episodes")]
+    row = figure(told, "clear", "success_gain_over_single-local")
     assert (row.value, row.n) == (0.25, 4)
-    assert (row.ci_low, row.ci_high) == pytest.approx((0.25 - 0.7956, 0.25 + 0.7956), abs=1e-4)
+    assert (row.low, row.high) == pytest.approx((0.25 - 0.7956, 0.25 + 0.7956), abs=1e-4)
     assert value(told, "deaf", "success_gain_over_single-local")[0] == 0.0
-    assert ("single-local", "success_gain_over_single-local", "episodes") not in told.index
+    gains = {s.condition for s in told.scores if s.metric == "success_gain_over_single-local"}
+    assert gains == {"clear", "deaf"}
 
 
-def test_messages_triggers_and_loss_by_hand(told: pd.DataFrame) -> None:
+def test_messages_triggers_and_loss_by_hand(told: Walked) -> None:
     """One decision of seven is unsure; it schedules three replies whether or not they come through."""
     for condition in ("clear", "deaf"):
         assert value(told, condition, "message_count", "seed means")[0] == 3
@@ -105,17 +116,14 @@ def test_messages_triggers_and_loss_by_hand(told: pd.DataFrame) -> None:
     assert value(told, "clear", "observed_reply_loss") == (0.0, 1, 3)
     assert value(told, "deaf", "observed_reply_loss") == (1.0, 1, 3)
     assert value(told, "single-local", "trigger_rate")[0] == 0
-    unknown = told.loc[("single-local", "effective_loss", "episodes")]
-    assert math.isnan(unknown.value)
-    assert (unknown.n, unknown.n_excluded) == (0, 4)
+    assert value(told, "single-local", "effective_loss") == (None, 0, 4)
 
 
-def test_latency_by_hand(told: pd.DataFrame, played: Dataset, tmp_path: Path) -> None:
+def test_latency_by_hand(told: Walked, played: Dataset) -> None:
     """100 ms everywhere; three V2X replies add 25 ms each, and their bits at 10 Mbit/s."""
-    spec = spec_of(played)
-    known = ask(spec, Scripted(SAID), tmp_path)
+    intents = asker_of(spec_of(played), Scripted(SAID))(played.scenes)
     asked = [s.id for s in played.scenes].index("00001-0")
-    consulted = 100 + 3 * 25 + known.payload_bits[asked].sum() / 10e6 * 1000
+    consulted = 100 + 3 * 25 + intents.payload_bits[asked].sum() / 10e6 * 1000
     assert value(told, "single-local", "latency_proxy_ms")[0] == pytest.approx(100)
     for condition in ("clear", "deaf"):  # a lost reply is waited for all the same
         found = value(told, condition, "latency_proxy_ms")[0]
@@ -123,7 +131,7 @@ def test_latency_by_hand(told: pd.DataFrame, played: Dataset, tmp_path: Path) ->
     assert value(told, "clear", "deadline_miss_rate")[0] == 0
 
 
-def test_percentiles_are_over_all_decisions(told: pd.DataFrame) -> None:
+def test_percentiles_are_over_all_decisions(told: Walked) -> None:
     """Seven decisions of 100 ms, one of which consults: the median is 100 ms, the 99th almost the longest."""
     longest = 4 * 2 * value(told, "clear", "latency_proxy_ms")[0] - 700
     assert value(told, "clear", "latency_p50_ms", "seed means") == (pytest.approx(100), 1, 0)
@@ -132,7 +140,7 @@ def test_percentiles_are_over_all_decisions(told: pd.DataFrame) -> None:
     assert value(told, "clear", "fusion_ms")[0] == 0
 
 
-def test_brier_and_likelihood_by_hand(told: pd.DataFrame) -> None:
+def test_brier_and_likelihood_by_hand(told: Walked) -> None:
     """Decisions in which no action is safe have no score, and an episode of such is excluded."""
     # Two safe actions, sure of one: 1/4 + 1/4. Three safe, sure of one: 4/9 + 1/9 + 1/9.
     sure_of_one_of_two, sure_of_one_of_three = 1 / 2, 2 / 3
@@ -147,108 +155,96 @@ def test_brier_and_likelihood_by_hand(told: pd.DataFrame) -> None:
     assert value(told, "clear", "brier")[0] < value(told, "single-local", "brier")[0]
 
 
-def test_entropy_by_hand(told: pd.DataFrame) -> None:
+def test_entropy_by_hand(told: Walked) -> None:
     unsure = -(0.4 * math.log(0.4) + 0.6 * math.log(0.3))
     assert value(told, "deaf", "entropy_nats")[0] == pytest.approx(unsure / 2 / 4)
     assert value(told, "deaf", "normalised_entropy")[0] == pytest.approx(unsure / math.log(3) / 2 / 4)
 
 
-def test_answers_are_counted_by_role_whatever_the_condition(told: pd.DataFrame) -> None:
+def test_answers_are_counted_by_role_whatever_the_condition(told: Walked) -> None:
     assert value(told, "all", "strict_rate_ego", "answers") == (1.0, 7, 0)
     assert value(told, "all", "strict_rate_helper", "answers") == (1.0, 21, 0)
     assert value(told, "all", "failed_rate_helper", "answers") == (0.0, 21, 0)
 
 
-def test_the_episodes_table_says_how_each_ended(played: Dataset, tmp_path: Path) -> None:
-    spec = spec_of(played, points=(ALONE,), seeds=(0,))
-    laid, result = scored(spec, ask(spec, Scripted(SAID), tmp_path), ALONE)
-    table = record.episodes(spec, laid, [result])
-    assert list(table.success) == [True, False, False, True]
-    assert list(table.failure) == ["", "time_out", "late", ""]
-    assert list(table.delay_s) == pytest.approx([1.0, 0.0, 1.2, 0.0])
-    assert list(table.messages) == [0, 0, 0, 0]
+def test_the_episodes_table_says_how_each_ended(played: Dataset) -> None:
+    episodes = walked(spec_of(played, points=(ALONE,), seeds=(0,)), Scripted(SAID)).episodes
+    assert [e.success for e in episodes] == [True, False, False, True]
+    assert [e.failure for e in episodes] == ["", "time_out", "late", ""]
+    assert [e.delay_s for e in episodes] == pytest.approx([1.0, 0.0, 1.2, 0.0])
+    assert [e.messages for e in episodes] == [0, 0, 0, 0]
 
 
-def test_a_consensus_weighs_those_heard_by_their_distance(played: Dataset, tmp_path: Path) -> None:
+def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: Dataset) -> None:
     """Paper Eq. 1 and 2: closeness 1/d, the sum of all is one; alone the ego has it all."""
-    spec = spec_of(played)
-    known = ask(spec, Scripted(SAID), tmp_path)
     at = [s.id for s in played.scenes].index("00001-0")
     distance = played.scenes[at].record["distance_m"]
     closeness = np.array([1 / max(distance[v], 1.0) for v in ("v1", "v2", "v3", "v4")])
     w = closeness / closeness.sum()
-    clear, deaf = (scored(spec, known, point)[1].coordination for point in (CLEAR, DEAF))
-    assert clear.fused[at] == pytest.approx([w[0] * 0.3 + 1 - w[0], w[0] * 0.4, w[0] * 0.3])
-    assert list(deaf.weights[at]) == [1.0, 0.0, 0.0, 0.0]
-    assert deaf.fused[at] == pytest.approx([0.3, 0.4, 0.3])
+    expected = [w[0] * 0.3 + 1 - w[0], w[0] * 0.4, w[0] * 0.3]
+    assert told.result(CLEAR, "fused")[at] == pytest.approx(expected)
+    assert list(told.result(DEAF, "weights")[at]) == [1.0, 0.0, 0.0, 0.0]
+    assert told.result(DEAF, "fused")[at] == pytest.approx([0.3, 0.4, 0.3])
 
 
 # -- seeds ------------------------------------------------------------------------------------------------
 
 
-def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset, tmp_path: Path) -> None:
+def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset) -> None:
     lossy = OperatingPoint("lossy", "6g", loss=0.4, tau_nats=0.0)
     seeds = (0, 1, 2, 3, 4)
     lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in small.scenes}
     lines |= {f"{s.id}/v{n}": sure("SLOWER", "helper") for s in small.scenes for n in (2, 3, 4)}
-    spec = spec_of(small, points=(lossy,), seeds=seeds)
-    known = ask(spec, Scripted(lines), tmp_path)
-    runs = [scored(spec, known, lossy, seed)[1] for seed in seeds]
-    laid = scored(spec, known, lossy)[0]
-    told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
-    table = record.episodes(spec, laid, runs)
-    by_seed = table.groupby("seed").success.mean().to_numpy()
+    told = walked(spec_of(small, points=(lossy,), seeds=seeds), Scripted(lines))
+    by_seed = [np.mean([e.success for e in told.episodes if e.seed == seed]) for seed in seeds]
     assert len(set(by_seed)) > 1, "seeds that all agree would not show the interval"
-    row = told.loc[("lossy", "success_rate", "seed means")]
-    low, high = stats.t.interval(0.95, len(seeds) - 1, loc=by_seed.mean(), scale=stats.sem(by_seed))
+    row = figure(told, "lossy", "success_rate", "seed means")
+    low, high = stats.t.interval(0.95, len(seeds) - 1, loc=np.mean(by_seed), scale=stats.sem(by_seed))
     assert low < 0 < high < 1  # a share ends at 0, which t does not know
-    assert (row.value, row.ci_low, row.ci_high) == pytest.approx((by_seed.mean(), 0.0, high))
+    assert (row.value, row.low, row.high) == pytest.approx((np.mean(by_seed), 0.0, high))
     assert (row.n, row.n_excluded) == (5, 0)
 
-    by_episode = table.groupby("episode").success.mean().to_numpy()
-    row = told.loc[("lossy", "success_rate", "episodes")]
-    low, high = stats.t.interval(0.95, 3, loc=by_episode.mean(), scale=stats.sem(by_episode))
+    numbers = sorted({e.episode for e in told.episodes})
+    by_episode = [np.mean([e.success for e in told.episodes if e.episode == n]) for n in numbers]
+    row = figure(told, "lossy", "success_rate")
+    low, high = stats.t.interval(0.95, 3, loc=np.mean(by_episode), scale=stats.sem(by_episode))
     assert low < 0, "a share of episodes ends at 0, whatever Student says"
-    assert (row.ci_low, row.ci_high, row.n) == (0.0, pytest.approx(high), 4)
+    assert (row.low, row.high, row.n) == (0.0, pytest.approx(high), 4)
 
 
-def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: pd.DataFrame) -> None:
+def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: Walked) -> None:
     """2 of 4: centre 1/2, half-width z sqrt(1/16 + z^2/64) / (1 + z^2/4)."""
-    row = told.loc[("single-local", "success_rate", "episodes")]
+    row = figure(told, "single-local", "success_rate")
     z = stats.norm.ppf(0.975)
     half = z * math.sqrt(1 / 16 + z**2 / 64) / (1 + z**2 / 4)
-    assert (row.ci_low, row.ci_high) == pytest.approx((0.5 - half, 0.5 + half))
+    assert (row.low, row.high) == pytest.approx((0.5 - half, 0.5 + half))
 
 
 # -- failed answers ---------------------------------------------------------------------------------------
 
 
-def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset, tmp_path: Path) -> None:
+def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:
     """Uniform over three actions: ln 3 = 1.099 nats, above the threshold of 0.7."""
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
-    known = ask(spec, Scripted({**SAID, "00000-0/v1": "no idea", "00001-0/v1": ""}), tmp_path)
-    laid, result = scored(spec, known, CLEAR)
-    c = result.coordination
+    lines = {**SAID, "00000-0/v1": "no idea", "00001-0/v1": ""}
+    told, intents = walked(spec, Scripted(lines)), asker_of(spec, Scripted(lines))(played.scenes)
     failing = [0, 2]
-    assert np.isnan(known.own[failing]).all()
-    assert c.own_failed.tolist() == [i in failing for i in range(7)]
-    assert c.own[failing] == pytest.approx(1 / 3)
-    assert c.entropy_nats[failing] == pytest.approx(math.log(3))
-    assert c.triggered.tolist() == [i in failing for i in range(7)]
-    told = summary(spec, laid, known, [result]).set_index(["condition", "metric", "interval"])
+    assert np.isnan(intents.own[failing]).all()
+    assert told.result(CLEAR, "own_failed") == [i in failing for i in range(7)]
+    assert [told.result(CLEAR, "own")[i] for i in failing] == [pytest.approx([1 / 3] * 3)] * 2
+    assert [told.result(CLEAR, "entropy_nats")[i] for i in failing] == pytest.approx([math.log(3)] * 2)
+    assert told.result(CLEAR, "triggered") == [i in failing for i in range(7)]
     assert value(told, "clear", "fallback_rate")[0] == (1 / 2 + 1 / 2) / 4
     assert value(told, "all", "failed_rate_ego", "answers") == (2 / 7, 7, 0)
     assert value(told, "all", "strict_rate_ego", "answers") == (5 / 7, 7, 0)
 
 
-def test_alone_an_undecided_ego_takes_the_most_conservative_action(played: Dataset, tmp_path: Path) -> None:
-    spec = spec_of(played)
-    known = ask(spec, Scripted({"00001-0/v1": "{}"}), tmp_path)
+def test_alone_an_undecided_ego_takes_the_most_conservative_action(played: Dataset) -> None:
     brake = OperatingPoint("brake", None, fallback="brake")
+    told = walked(spec_of(played, points=(ALONE, brake), seeds=(0,)), Scripted({"00001-0/v1": "{}"}))
     for point, p in ((ALONE, [1 / 3, 1 / 3, 1 / 3]), (brake, [1.0, 0.0, 0.0])):
-        c = scored(spec, known, point)[1].coordination
-        assert c.fused[2] == pytest.approx(p)
-        assert c.action[2] == 0
+        assert told.result(point, "fused")[2] == pytest.approx(p)
+        assert told.result(point, "action")[2] == 0
 
 
 @pytest.mark.parametrize(
@@ -261,64 +257,69 @@ def test_alone_an_undecided_ego_takes_the_most_conservative_action(played: Datas
     ],
 )
 def test_a_helper_whose_answer_failed_sends_nothing(
-    line: str | Completion, status: str, played: Dataset, tmp_path: Path
+    line: str | Completion, status: str, played: Dataset
 ) -> None:
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
-    known = ask(spec, Scripted({**SAID, "00001-0/v3": line}), tmp_path)
-    laid, result = scored(spec, known, CLEAR)
-    assert known.valid[2].tolist() == [True, False, True]
-    assert result.coordination.asked[2].tolist() == [True, False, True]
-    [row] = [r for r in map(row_of, record.rows(spec, laid, known, [result])) if r["scene"] == "00001-0"]
-    assert row["answers"]["v3"]["status"] == status
-    assert [m["from"] for m in row["decisions"][0]["messages"]] == ["v2", "v4"]
-    assert statuses(known)["helper"].count("failed") == 1
+    backend = Scripted({**SAID, "00001-0/v3": line})
+    told, intents = walked(spec, backend), asker_of(spec, backend)(played.scenes)
+    assert intents.valid[2].tolist() == [True, False, True]
+    assert told.result(CLEAR, "asked")[2].tolist() == [True, False, True]
+    [v3] = [a for a in told.answers if a.id == "00001-0/v3"]
+    assert (v3.status, v3.verdict) == (status, "failed")
+    [decision] = [d for d in told.records("clear") if d.scene == "00001-0"]
+    assert [m.sender for m in decision.messages] == ["v2", "v4"]
+    assert value(told, "all", "failed_rate_helper", "answers") == (1 / 21, 21, 0)
 
 
-def row_of(line: str | bytes) -> dict[str, Any]:
-    """A row as any JSON reader has it: NaN and Infinity, which Python lets pass, fail here."""
-    row: dict[str, Any] = json.loads(line, parse_constant=pytest.fail)
-    return row
-
-
-def test_an_unknown_time_is_null_and_never_zero(played: Dataset, tmp_path: Path) -> None:
+def test_an_unknown_time_is_unknown_and_never_zero(played: Dataset) -> None:
     """Every ego answer failed before anything could be timed."""
     spec = spec_of(played, points=(ALONE, CLEAR), seeds=(0,))
     lines = {f"{s.id}/v1": failed(f"{s.id}/v1", "context overflow") for s in played.scenes}
-    known = ask(spec, Scripted({**SAID, **lines}), tmp_path)
-    known = replace(known, inference_s=inference_s({"inference_s": None}, known.answers))
-    assert np.isnan(known.inference_s[:, 0]).all()
-    laid = table(spec.dataset)
-    drawn = draw(laid, 0, known.valid.shape)
-    runs = [score(laid, known, point, 0, drawn) for point in spec.points]
-    told = summary(spec, laid, known, runs).set_index(["condition", "metric", "interval"])
+    backend = Scripted({**SAID, **lines})
+    assert np.isnan(asker_of(spec, backend, EACH_ITS_OWN)(played.scenes).inference_s[:, 0]).all()
+    told = walked(spec, backend, EACH_ITS_OWN)
     for metric in ("latency_proxy_ms", "deadline_miss_rate"):
-        row = told.loc[("single-local", metric, "episodes")]
-        assert math.isnan(row.value)
-        assert (row.n, row.n_excluded) == (0, 4)
-    for row in map(row_of, record.rows(spec, laid, known, runs)):
-        assert all(d["latency_ms"] is None and d["deadline_missed"] is None for d in row["decisions"])
-    assert record.episodes(spec, laid, runs).latency_ms.isna().all()
+        assert value(told, "single-local", metric) == (None, 0, 4)
+    for decision in told.records("single-local") + told.records("clear"):
+        assert (decision.latency_ms, decision.deadline_missed) == (None, None)
+    assert {e.latency_ms for e in told.episodes} == {None}
+    assert json.loads(msgspec.json.encode(told.episodes[0]))["latency_ms"] is None
+    head, first, *_ = csv_text(Episode, told.episodes).splitlines()
+    assert dict(zip(head.split(","), first.split(","), strict=True))["latency_ms"] == ""
 
 
-def test_an_answer_without_a_time_takes_its_roles_median() -> None:
-    def took(seconds: float | None, slow_s: float = 0.0) -> dict[str, float | None]:
-        return {"seconds": seconds, "slow_s": slow_s}
+EACH_ITS_OWN = Latency("measured", "each answer alone, batch 1", None, None)
 
-    answers = [
-        [took(0.1), took(0.5), None],
-        [took(None), took(0.7), None],
-        [took(0.3), took(None), took(0.6)],
+
+def test_an_answer_without_a_time_takes_its_roles_median(small: Dataset) -> None:
+    asked = {r.role: r for r in requests(spec_of(small), small.scenes[:1])}
+
+    def took(role: Role, seconds: float | None, slow_s: float = 0.0) -> Answer:
+        completion = Completion(
+            asked[role].id, sure("IDLE", role), None, None, "stop", seconds, 1, slow_s=slow_s
+        )
+        return answer_of(asked[role], completion)
+
+    def every(rows: Sequence[Sequence[Answer | None]]) -> dict[str, Answer]:
+        return {f"{i}/{j}": a for i, row in enumerate(rows) for j, a in enumerate(row) if a}
+
+    answers: list[list[Answer | None]] = [
+        [took("ego", 0.1), took("helper", 0.5), None],
+        [took("ego", None), took("helper", 0.7), None],
+        [took("ego", 0.3), took("helper", None), took("helper", 0.6)],
     ]
-    seconds = inference_s({"inference_s": None}, answers)
+    seconds = inference_s(EACH_ITS_OWN, answers, every(answers))
     expected = [[0.1, 0.5, np.nan], [0.2, 0.7, np.nan], [0.3, 0.6, 0.6]]
     assert seconds == pytest.approx(np.array(expected), nan_ok=True)
-    answers[0][1] = took(0.5, slow_s=0.4)
-    declared = inference_s({"inference_s": {"ego": 0.1, "helper": 0.2}}, answers)
+    step = inference_s(EACH_ITS_OWN, answers[2:], every(answers))
+    assert step == pytest.approx(seconds[2:]), "the median is the run's, not a step's"
+    answers[0][1] = took("helper", 0.5, slow_s=0.4)
+    declared = inference_s(Latency("card", "b", 0.1, 0.2), answers, every(answers))
     expected = [[0.1, 0.6, np.nan], [0.1, 0.2, np.nan], [0.1, 0.2, 0.2]]
     assert declared == pytest.approx(np.array(expected), nan_ok=True)
 
 
-def test_an_answer_that_failed_is_no_sample_of_a_models_latency(small: Dataset, tmp_path: Path) -> None:
+def test_an_answer_that_failed_is_no_sample_of_a_models_latency(small: Dataset) -> None:
     """A server that refuses at once would look fast: of five egos' answers, one fails after no time."""
 
     class Timed(Scripted):
@@ -326,10 +327,13 @@ def test_an_answer_that_failed_is_no_sample_of_a_models_latency(small: Dataset, 
             first = request.id == "00000-0/v1"
             return replace(super()._say(request), seconds=0.0 if first else 0.3, error="x" if first else None)
 
-    card = replace(cards.load("proxy"), latency=Latency("measured", None, "this test"))
-    latency = measure(replace(spec_of(small), card=card), Timed({}), tmp_path / "latency.json")
-    assert latency["inference_s"] == {"ego": 0.3, "helper": 0.3}
-    assert latency["n"]["ego"] == 4
+    card = replace(cards.load("proxy"), latency=cards.Latency("measured", None, "this test"))
+    spec, backend = replace(spec_of(small), card=card), Timed({})
+    assert latencies.declared(spec, backend) is None
+    sample = list(requests(spec, latencies.sample(scenes_of(spec))))
+    latency = latencies.measured(spec, backend, sample)
+    assert (latency.ego_s, latency.helper_s) == (0.3, 0.3)
+    assert latency.n["ego"] == 4
 
 
 NASTY = st.text(max_size=40) | st.sampled_from(
@@ -348,14 +352,21 @@ def test_whatever_is_said_the_record_is_one_json_object_a_line(
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
     said: dict[str, str | Completion] = {f"00001-0/v{n}": line for n, line in enumerate(lines, 1)}
     said["00000-0/v2"] = failed("00000-0/v2", error)
-    folder = tmp_path_factory.mktemp("nasty")
-    known = ask(spec, Scripted(said), folder)
-    laid, result = scored(spec, known, CLEAR)
-    written = "".join(record.rows(spec, laid, known, [result])).encode()
+    kept = tmp_path_factory.mktemp("nasty") / "answers.jsonl"
+    told = walked(spec, Scripted(said), kept=kept)
+    written = msgspec.json.Encoder().encode_lines(told.answers)
     rows = [row_of(line) for line in written.split(b"\n")[:-1]]
-    assert [r["scene"] for r in rows] == list(OUTCOMES)
+    assert list(dict.fromkeys(row["scene"] for row in rows)) == list(OUTCOMES)
+    raw = {f"{row['scene']}/{row['viewer']}": row["raw"] for row in rows}
     for n, line in enumerate(lines, 1):
-        assert rows[2]["answers"][f"v{n}"]["raw"] == line.encode("utf-8", "replace").decode()
-    kept = Scripted({})
-    assert ask(spec, kept, folder).own == pytest.approx(known.own, nan_ok=True)
-    assert kept.asked == [], "every answer was kept, and read back as it was"
+        assert raw[f"00001-0/v{n}"] == line.encode("utf-8", "replace").decode()
+    silent = Scripted({})
+    again = walked(spec, silent, kept=kept)
+    assert again.decisions.table.equals(told.decisions.table)
+    assert silent.asked == [], "every answer was kept, and read back as it was"
+
+
+def row_of(line: str | bytes) -> dict[str, Any]:
+    """A row as any JSON reader has it: NaN and Infinity, which Python lets pass, fail here."""
+    row: dict[str, Any] = json.loads(line, parse_constant=pytest.fail)
+    return row

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import decisions, figure, rows_of, run, spec_of
+from evaluating import decisions, figure, run, spec_of
+from run_on_disk import answers_of
 
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.evaluate import Evaluated
+from harness.evaluate.run import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 
@@ -29,7 +30,7 @@ def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluate
 
 
 def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
-    said = [answer["verdict"] for row in rows_of(done.out) for answer in row["answers"].values()]
+    said = [answer.verdict for answer in answers_of(done.out)]
     assert len(said) > 1000
     assert said.count("strict") >= 0.98 * len(said)
 
@@ -38,15 +39,15 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
     """Hidden: some action crashes into a vehicle that the ego does not see. Clear: nothing is hidden, and
     no action crashes."""
     hidden, clear = [], []
-    said = decisions(rows_of(done.out), "single-local")[::5]  # one seed: nothing of it depends on luck
+    said = decisions(done.out, "single-local")[::5]  # one seed: nothing of it depends on luck
     for scene, decision in zip(shipped.scenes, said, strict=True):
         graph = scene.record["graphs"][scene.state.ego.id]
         crashes = [o["result"] == "collision" for o in scene.record["outcomes"].values()]
         seen = scene.record["danger"]["vehicle"] in {node["id"] for node in graph["nodes"]}
         if scene.record["danger"]["vehicle"] and any(crashes) and not seen:
-            hidden.append(decision["entropy_nats"])
+            hidden.append(decision.entropy_nats)
         elif not any(crashes) and not any(sector["occluded"] for sector in graph["sectors"]):
-            clear.append(decision["entropy_nats"])
+            clear.append(decision.entropy_nats)
     assert len(hidden) >= 10
     assert len(clear) >= 20
     assert np.mean(hidden) > np.mean(clear) + 0.05

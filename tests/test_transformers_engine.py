@@ -5,6 +5,7 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.cards import Card, Latency, load, resolve
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
-from harness.backends.transformers import checkpoint
+from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -194,7 +195,8 @@ def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
         raise KeyboardInterrupt
 
     opened = open_tiny(tiny)
-    opened.engine.model.register_forward_pre_hook(press)
+    engine: Any = opened.engine
+    engine.model.register_forward_pre_hook(press)
     with pytest.raises(KeyboardInterrupt):
         opened.complete([ask(0)])
 
@@ -321,16 +323,14 @@ def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them
 def test_a_hub_checkpoint_is_found_in_the_cache_and_known_by_its_commit(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     repository = tmp_path / "models--tiny--qwen3"
     shutil.copytree(tiny, repository / "snapshots" / COMMIT)
     (repository / "refs").mkdir()
     (repository / "refs" / "main").write_text(COMMIT)
     card = resolve("tiny/qwen3")
     assert missing(card) is None
-    assert checkpoint.find(card) == repository / "snapshots" / COMMIT
+    assert find_checkpoint(card) == repository / "snapshots" / COMMIT
     opened = open_backend(card, device="cpu")
     assert opened.identity()["revision"] == COMMIT
     assert opened.identity()["files_sha256"] is None

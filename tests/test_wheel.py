@@ -28,10 +28,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         *("--quiet", "--no-compile", "--constraint", str(ROOT / "requirements.lock"), str(wheel)),
     ]
     done = subprocess.run(install, capture_output=True, text=True, check=False)
-    if (
-        re.search(r"NewConnectionError|NameResolutionError|ConnectTimeout", done.stderr)
-        and "CI" not in os.environ
-    ):
+    offline = re.search(r"NewConnectionError|NameResolutionError|ConnectTimeout", done.stderr)
+    if offline and "CI" not in os.environ:
         pytest.skip("no package index is reached")
     assert done.returncode == 0, done.stderr
     yield bare
@@ -57,9 +55,9 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     assert (lacks["proxy"], lacks["qwen3-4b"]) == (None, "torch")
 
     told = json.loads(harness("eval", "--model", "proxy", "--limit", "2", "--json"))
-    assert str(site) in told["manifest"]["dataset"]["path"]
+    assert str(site) in told["manifest"]["world"]["path"]
     run = tmp_path / told["run"]
-    files = {"run.json", "rows.jsonl", "episodes.csv", "summary.csv", "report.html"}
+    files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
     assert {p.name for p in run.iterdir()} == files
     [metadata] = site.glob("lib/*/site-packages/swarmdrive_harness-*.dist-info")
     assert (metadata / "licenses/LICENSE").read_text() == (ROOT / "LICENSE").read_text()

@@ -5,7 +5,11 @@ A backend batches, threads or loops inside as suits its engine; nothing else in 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+if TYPE_CHECKING:
+    from harness.runs.records import Latency
+    from harness.world.scenario import Scenario
 
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
@@ -23,7 +27,7 @@ class Request:
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
         form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
-        answer: how the answer is had. `json`: the model writes freely. `constrained`: it fills in numbers and
+        answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), whose probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
@@ -31,6 +35,7 @@ class Request:
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
+        scenario: what the view is of; only backends that read the view read it.
     """
 
     id: str
@@ -44,6 +49,7 @@ class Request:
     sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
+    scenario: "Scenario | None" = None
 
 
 @dataclass(frozen=True)
@@ -56,8 +62,8 @@ class Completion:
         prompt_tokens: tokens in; None if the engine has no tokenizer.
         completion_tokens: tokens out; None if the engine has no tokenizer.
         finish_reason: `stop`, `length` (cut off by max_tokens) or `error`.
-        seconds: time of this answer, only where it was asked alone (batch_size 1), else None:
-            a batch's wall time is nobody's latency.
+        seconds: time of this answer, only where its request was alone (batch_size 1), else None:
+            a batch's wall time is no answer's latency.
         batch_size: how many requests went through the engine together.
         error: the engine's message when finish_reason is `error`.
         label_mass: probability on the letters together, of a `readout`; None otherwise.
@@ -92,7 +98,6 @@ class Backend(Protocol):
         ...
 
 
-@runtime_checkable
 class Rendering(Backend, Protocol):
     """A backend of a language model, which can say what its model is sent."""
 
@@ -102,4 +107,12 @@ class Rendering(Backend, Protocol):
         Raises:
             UserError: the chat template refuses the messages.
         """
+        ...
+
+
+class Timed(Backend, Protocol):
+    """A backend whose answers were timed before, so that they are not timed again."""
+
+    def latency(self) -> "Latency":
+        """What the decisions of the replayed run were made with."""
         ...

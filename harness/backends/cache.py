@@ -1,23 +1,24 @@
-"""Completions kept between runs: a question that was answered is not asked again.
+"""Completions kept between runs: a model answers the same question once.
 
-The cache is a help and nothing else. A run's rows hold its answers, and where the file gives trouble the run
-goes on without it.
+The cache only saves time. A run's rows hold its answers, and if the file does not work the run continues
+without it.
 """
 
-import os
+import json
 import sqlite3
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import fields, replace
-from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from harness import __version__
-from harness.backends.base import Completion, Rendering, Request
-from harness.backends.completion_file import CompletionFile
+from harness.backends.base import Backend, Completion, Rendering, Request
+from harness.backends.cards import Card
+from harness.backends.registry import capabilities
+from harness.core import kept
 from harness.core.errors import printable
-from harness.core.files import digest, sha256_bytes
+from harness.core.files import digest
 
 T = TypeVar("T")
 
@@ -27,17 +28,21 @@ NOT_IN_KEY = {
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
     "view": "no language model reads it",
     "truth": "no language model reads it",
+    "scenario": "no language model reads it; its actions are a field of their own",
 }
-# The program's own part in an answer: how it is asked for and put into text.
+# What a completion has of its own asking, and not of its answer.
+_NOT_KEPT = ("request_id", "seconds", "error", "retries", "cached")
+_KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
+_WAIT_S = 30.0  # for another process that is writing
+_AT_ONCE = 500  # keys of one look-up; SQLite has a limit
+_TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
+# The program's own part in an answer, how it is asked for and put into text: other code finds no old answers.
 _CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
 
 def default_file() -> Path:
-    """`completions.sqlite` in `$SWARMDRIVE_CACHE`, else in the user's cache folder."""
-    if moved := os.environ.get("SWARMDRIVE_CACHE"):
-        return Path(moved) / "completions.sqlite"
-    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(caches) / "swarmdrive-harness" / "completions.sqlite"
+    """Where completions are kept unless another file is named."""
+    return kept.folder() / "completions.sqlite"
 
 
 def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
@@ -47,32 +52,80 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
     16 bits it may move one by rounding, with a cache or without; the identity holds the number format.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
-    return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": _code_sha256()})
+    return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)})
 
 
-@cache
-def _code_sha256() -> str:
-    """So that a program that asks otherwise finds no old answers."""
-    package = Path(__file__).parent.parent
-    files = sorted(file for pattern in _CODE for file in package.glob(pattern))
-    return digest([__version__, *(sha256_bytes(file.read_bytes()) for file in files)])
+class CompletionFile:
+    """The file. It is opened anew for every call, so that one that was deleted is simply empty again.
+
+    Both methods raise sqlite3.Error or OSError where it cannot be read or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def find(self, keys: Sequence[str]) -> dict[str, Completion]:
+        """The completions that are there, by key. They have no seconds, and their request's id is empty."""
+        rows: list[tuple[str, str]] = []
+        with self._open() as file:
+            for start in range(0, len(keys), _AT_ONCE):
+                some = keys[start : start + _AT_ONCE]
+                marks = ",".join("?" * len(some))
+                rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", some)
+        try:
+            return {key: _completion(json.loads(answer)) for key, answer in rows}
+        except (ValueError, TypeError) as error:
+            raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
+
+    def add(self, completions: Mapping[str, Completion]) -> None:
+        """Keep completions by key; one that is there already stays."""
+        # ASCII, since a completion may hold a lone surrogate, which no file takes.
+        rows = [(key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()]
+        with self._open() as file:
+            file.execute("BEGIN IMMEDIATE")
+            file.executemany("INSERT OR IGNORE INTO completions VALUES (?, ?)", rows)
+            file.execute("COMMIT")
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(sqlite3.connect(self.path, timeout=_WAIT_S, isolation_level=None)) as file:
+            file.execute("PRAGMA journal_mode = WAL")
+            file.execute("PRAGMA synchronous = NORMAL")
+            file.execute(_TABLE)
+            yield file
+
+
+def _completion(kept: dict[str, Any]) -> Completion:
+    return Completion(request_id="", seconds=None, cached=True, **kept)
+
+
+def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
+    """A card's backend with a cache before it, if there is a file and its prompts are known."""
+    if file is None or not capabilities(card.engine).renders:
+        return backend
+    return Cached(cast("Rendering", backend), file)
 
 
 class Cached:
-    """A backend whose answers are kept, but for errors. One that was kept has no seconds."""
+    """A backend whose answers are kept, except errors. A kept answer has no seconds.
+
+    Attributes:
+        backend: answers what is not kept.
+    """
 
     def __init__(self, backend: Rendering, file: Path) -> None:
-        self._backend = backend
+        self.backend = backend
         self._identity = backend.identity()
         self._file: CompletionFile | None = CompletionFile(file)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order; the backend is asked for those that are not kept."""
-        prompts = self._backend.rendered(requests)
+        """One completion per request, in the same order; the backend answers those that are not kept."""
+        prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
         kept = self._try(lambda file: file.find(keys)) or {}
         owed = [r for k, r in zip(keys, requests, strict=True) if k not in kept]
-        asked = iter(self._backend.complete(owed) if owed else [])
+        asked = iter(self.backend.complete(owed) if owed else [])
         done = [
             replace(kept[k], request_id=r.id) if k in kept else next(asked)
             for k, r in zip(keys, requests, strict=True)
@@ -83,11 +136,10 @@ class Cached:
         return done
 
     def identity(self) -> dict[str, Any]:
-        """The backend's: what was kept was said by the same model."""
         return self._identity
 
     def _try(self, work: Callable[[CompletionFile], T]) -> T | None:
-        """What some work on the file gives; None where the file gives trouble, now or before."""
+        """The result of some work on the file; None once the file has failed."""
         if self._file is None:
             return None
         try:
@@ -95,7 +147,7 @@ class Cached:
         except (sqlite3.Error, OSError) as error:
             print(
                 f"harness: completion cache {printable(self._file.path)}: {printable(error)}; "
-                "this run goes on without it; delete the file, or set SWARMDRIVE_CACHE to another folder",
+                "this run continues without it; delete the file, or set SWARMDRIVE_CACHE to another folder",
                 file=sys.stderr,
             )
             self._file = None

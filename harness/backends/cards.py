@@ -1,4 +1,4 @@
-"""A model card: what a model is, what it may see and where its latency comes from.
+"""The model cards that are found here, and the card that a user names.
 
 A card is one file, `models/<name>.toml`; `<name>:<engine>` is the same model on another engine that the file
 names. A directory, a GGUF file, a hub id and `replay:RUN_DIR` get a card on the spot.
@@ -6,19 +6,15 @@ names. A directory, a GGUF file, a hub id and `replay:RUN_DIR` get a card on the
 
 import os.path
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
-from harness.backends import card_file
-from harness.backends.card_file import WEIGHTED, Dtype, Engine, LatencySource, Thinking
-from harness.backends.failures import Failures
-from harness.backends.servers import Server
+from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking, read
+from harness.backends.registry import engines
 from harness.core.errors import UserError, printable, unknown
 from harness.core.resources import entries, find
 
-__all__ = ["WEIGHTED", "Card", "Dtype", "Engine", "Latency", "LatencySource", "Thinking", "load", "load_all",
-           "names", "resolve"]  # fmt: skip
+__all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
+           "load_all", "names", "resolve"]  # fmt: skip
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
@@ -26,72 +22,8 @@ _SWITCH = b"enable_thinking"  # what a chat template calls its thinking switch
 _GGUF_HEAD = 1 << 25  # bytes of a GGUF file that hold its vocabulary and its template
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Time of one answer.
-
-    Attributes:
-        source: `card` takes `inference_s` as it stands; `measured` takes each run's own batch-1 seconds.
-        inference_s: declared seconds of one answer; None when measured.
-        basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
-    """
-
-    source: LatencySource
-    inference_s: float | None
-    basis: str
-
-
-@dataclass(frozen=True)
-class Card:
-    """One model on one engine.
-
-    Attributes:
-        name: file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or
-            `replay:<run>`.
-        engine: which backend answers.
-        description: one line for people.
-        latency: time of one answer.
-        weights: directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
-            `replay`; the name a server knows the model by for `openai`; None if model-free.
-        file: name of the GGUF file in `weights`; None where `weights` is the file, or needs none.
-        revision: branch, tag or commit on the hub; None is its default branch.
-        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, held against it on loading.
-        gated: the hub gives the weights only to who has accepted their licence there.
-        dtype: number format of a checkpoint's weights; `auto` is its own.
-        quantisation: number format of a GGUF file's weights, for people; the file has the say.
-        context_tokens: most tokens of prompt and answer together; None takes the checkpoint's own.
-        thinking: `switch` if its chat template can turn thinking on and off, `always` if it cannot be off.
-        privileged: sees the truth behind the occlusion: an upper reference, never a contestant.
-        licence: SPDX id of the weights, or their licence's name where it has none.
-        max_new_tokens: most tokens of an answer, where the model needs another bound than its prompt's.
-        thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
-        server: where an `openai` model is asked; None for other engines.
-        failures: how often the proxy fails on purpose; None if it never does.
-    """
-
-    name: str
-    engine: Engine
-    description: str
-    latency: Latency
-    weights: str | None = None
-    file: str | None = None
-    revision: str | None = None
-    sha256: str | None = None
-    gated: bool = False
-    dtype: Dtype = "auto"
-    quantisation: str | None = None
-    context_tokens: int | None = None
-    thinking: Thinking = "none"
-    privileged: bool = False
-    licence: str | None = None
-    max_new_tokens: int | None = None
-    thinking_tokens: int = 2048
-    server: Server | None = None
-    failures: Failures | None = None
-
-
 def names() -> list[str]:
-    """Names of the card files at hand, sorted."""
+    """Names of all card files, sorted."""
     return sorted({path.stem for path in entries("models", "*.toml")})
 
 
@@ -111,32 +43,24 @@ def load(name: str) -> Card:
 
 
 def load_all() -> list[Card]:
-    """Every card at hand, on each of its engines."""
+    """Every card, on each of its engines."""
     return [card for name in names() for card in each_engine(name)]
 
 
 def each_engine(stem: str) -> list[Card]:
     """The card of a file's name on each of its engines. Raises UserError if the file has a mistake."""
-    read = card_file.read(find("models", f"{stem}.toml"))
-    first = next(iter(read))
-    return [
-        Card(
-            name=stem if engine == first else f"{stem}:{engine}",
-            **{**table, "latency": Latency(**{"inference_s": None, **table["latency"]})},
-        )
-        for engine, table in read.items()
-    ]
+    return read(find("models", f"{stem}.toml"))
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """The card that a user means by a name, `replay:RUN_DIR`, a path or a hub id, tried so.
+    """The card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
     Args:
         text: what the user wrote.
         engine: what to run it on, where there is a choice; None for its own.
     """
-    if engine is not None and engine not in get_args(Engine):
-        raise unknown("engine", engine, get_args(Engine))
+    if engine is not None and engine not in engines():
+        raise unknown("engine", engine, engines())
     stem, _, named = text.partition(":")
     if stem in names():
         card = load(f"{stem}:{engine}" if engine and not named else text)
@@ -145,6 +69,13 @@ def resolve(text: str, engine: str | None = None) -> Card:
     if engine not in (None, card.engine):
         raise UserError(f"--engine {engine}: {printable(text)!r} runs on {card.engine}; leave it out")
     return card
+
+
+def argument(card: Card) -> str:
+    """What `--model` was given, or anything that resolves to the same card."""
+    if card.name.partition(":")[0] in names() and load(card.name) == card:
+        return card.name
+    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
 
 
 def _on_the_spot(text: str, engine: str | None) -> Card:
@@ -196,7 +127,7 @@ def _path(text: str) -> Path | None:
     return Path(path).resolve() if os.path.exists(path) else None
 
 
-def _made(name: str, engine: Engine, weights: str, description: str, thinking: Thinking = "none") -> Card:
+def _made(name: str, engine: str, weights: str, description: str, thinking: Thinking = "none") -> Card:
     latency = Latency("measured", None, "batch-1 seconds of the run")
     return Card(name, engine, description, latency, weights=weights, thinking=thinking)
 

@@ -12,7 +12,7 @@ from harness.core.errors import UserError
 
 @dataclass(frozen=True)
 class Checkup:
-    """What was seen.
+    """What a look at a model shows.
 
     Attributes:
         prompt: the first question, just as the model reads it; as a server is sent it.

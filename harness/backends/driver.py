@@ -25,11 +25,12 @@ class DriverBackend:
         self.driver = driver
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:
-        action = choose(self.driver, request.view or {}, request.truth, request.actions)
+        if request.scenario is None:
+            raise ValueError(f"request {request.id} has no scenario; a driver needs its road")
+        action = choose(request.scenario, self.driver, request.view or {}, request.truth)
         text = canonical_json({"action_distribution": {a: float(a == action) for a in request.actions}})
         return Completion(request.id, text, None, None, "stop", None, 1)
 

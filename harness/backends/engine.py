@@ -57,3 +57,9 @@ class Engine(Protocol):
     def identity(self) -> dict[str, Any]:
         """What decides the answers, as JSON: engine, versions, weights, settings."""
         ...
+
+
+def common_length(sequences: Sequence[list[int]]) -> int:
+    """How many tokens some sequences, at least one, begin with in common."""
+    first, last = min(sequences), max(sequences)  # whatever lies between begins with what these two do
+    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))

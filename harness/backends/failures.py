@@ -1,10 +1,16 @@
-"""How often a stand-in for a language model fails on purpose, so that what is counted can be known."""
+"""How a stand-in for a language model fails on purpose, so that a run's counts can be checked."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated
 
-from harness.core.errors import UserError
+from msgspec import Meta
+
+from harness.backends.base import FinishReason
+from harness.core.config import Seconds
+
+Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 
 @dataclass(frozen=True)
@@ -24,14 +30,20 @@ class Failures:
         slow_s: seconds, more than 0 where there is a slow tail.
     """
 
-    fence: float = 0.0
-    prose: float = 0.0
-    truncation: float = 0.0
-    nan: float = 0.0
-    unknown_action: float = 0.0
-    unclosed_think: float = 0.0
-    slow_tail: float = 0.0
-    slow_s: float = 0.0
+    fence: Share = 0.0
+    prose: Share = 0.0
+    truncation: Share = 0.0
+    nan: Share = 0.0
+    unknown_action: Share = 0.0
+    unclosed_think: Share = 0.0
+    slow_tail: Share = 0.0
+    slow_s: Seconds = 0.0
+
+    def __post_init__(self) -> None:
+        if (total := sum(self.texts.values())) > 1 + 1e-9:
+            raise ValueError(f"the shares of spoilt texts sum to {total:.4g}; allowed: 1 at most")
+        if (self.slow_tail > 0) != (self.slow_s > 0):
+            raise ValueError("slow_tail and slow_s go together; give both, or neither")
 
     @property
     def texts(self) -> dict[str, float]:
@@ -39,20 +51,37 @@ class Failures:
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
-KEYS: Mapping[str, type] = dict.fromkeys(asdict(Failures()), float)
+def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:
+    """How a request's text fails, None if it does not, and how many seconds the answer is slow.
+
+    Drawn for the id alone, so neither batch nor order, prompt nor condition changes it.
+    """
+    from harness.core import noise  # NumPy, which a list of cards needs not
+
+    text, slow = noise.uniforms((2,), "proxy failure", request_id).tolist()
+    slow_s = failures.slow_s if slow < failures.slow_tail else 0.0
+    for how, share in failures.texts.items():
+        if text < share:
+            return how, slow_s
+        text -= share
+    return None, slow_s
 
 
-def read(table: Mapping[str, Any], where: str) -> Failures:
-    """A card's table, whose keys and types were checked. Raises UserError for values that cannot be meant."""
-    for name, value in table.items():
-        most = float("inf") if name == "slow_s" else 1.0
-        if not 0 <= value <= most or value == float("inf"):
-            allowed = "seconds, 0 or more" if name == "slow_s" else "a share, 0 to 1"
-            raise UserError(f"{where}: {name} = {value}; allowed: {allowed}")
-    failures = Failures(**table)
-    total = sum(failures.texts.values())
-    if total > 1 + 1e-9:
-        raise UserError(f"{where}: the shares of spoilt texts sum to {total:.4g}; allowed: 1 at most")
-    if (failures.slow_tail > 0) != (failures.slow_s > 0):
-        raise UserError(f"{where}: slow_tail and slow_s go together; give both, or neither")
-    return failures
+def spoilt(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
+    """A good answer, which ends in compact JSON, spoilt in one of the ways of `Failures`."""
+    match how:
+        case "fence":
+            return f"```json\n{text}\n```", "stop"
+        case "prose":
+            return f"Here is what I would do.\n\n{text}\n\nThis keeps a safe distance.", "stop"
+        case "truncation":
+            return text[: text.rindex(":") + 1], "length"
+        case "nan":
+            return re.sub(r":[\d.]+", ":NaN", text, count=1), "stop"
+        case "unknown_action":
+            for action in actions:
+                text = text.replace(f'"{action}"', f'"NOT_{action}"')
+            return text, "stop"
+        case "unclosed_think":
+            return f"<think>\nPerhaps {text}", "length"
+    raise ValueError(f"no failure {how!r}")

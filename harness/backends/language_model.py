@@ -61,7 +61,6 @@ class LanguageModel:
         return [done[position] for position in range(len(requests))]
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """The prompt of each request as the model reads it."""
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, prompts: Sequence[Sequence[int]], vocabulary: int) -> Floats:
@@ -70,7 +69,6 @@ class LanguageModel:
             return session.log_probs(range(vocabulary))
 
     def identity(self) -> dict[str, Any]:
-        """What decides the answers: the engine's."""
         return self.engine.identity()
 
     def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:

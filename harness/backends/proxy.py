@@ -11,11 +11,11 @@ from typing import Any
 
 from harness.backends.base import Completion, FinishReason, Request
 from harness.backends.cards import Card
-from harness.backends.failures import Failures
-from harness.backends.spoiling import drawn, spoilt
+from harness.backends.failures import Failures, drawn, spoilt
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 from harness.world.planner import plan
+from harness.world.scenario import Scenario
 
 VERSION = "proxy/1"
 
@@ -39,7 +39,6 @@ class Proxy:
         self._failures = failures
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in order."""
         return [self._completion(request) for request in requests]
 
     def _completion(self, request: Request) -> Completion:
@@ -64,9 +63,9 @@ class Proxy:
 
 def answer(request: Request) -> str:
     """The text of one answer."""
-    if request.view is None:
-        raise ValueError(f"request {request.id} has no view; the proxy reads nothing else")
-    intent = distribution(request.view, request.actions)
+    if request.view is None or request.scenario is None:
+        raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
+    intent = distribution(request.scenario, request.view)
     if request.role == "ego":
         body: dict[str, Any] = {"action_distribution": intent}
     else:
@@ -76,9 +75,9 @@ def answer(request: Request) -> str:
     return canonical_json(body)
 
 
-def distribution(view: Mapping[str, Any], actions: tuple[str, ...]) -> dict[str, float]:
+def distribution(scenario: Scenario, view: Mapping[str, Any]) -> dict[str, float]:
     """Intent of a viewer: what the planner would do on its graph, hedged by what it cannot see."""
-    planned = plan(view, actions)
+    actions, planned = scenario.actions, plan(scenario, view)
     if planned == "SLOWER":
         braking = SURE_SLOWER
     else:

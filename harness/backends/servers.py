@@ -1,23 +1,15 @@
 """Where a served model is asked. A card is a public file: it names the key's variable and holds no secret."""
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from sys import float_info
+from typing import Annotated, Literal, get_args
 from urllib.parse import urlsplit
 
-from harness.core.errors import UserError, printable
+from msgspec import Meta
 
 Kind = Literal["generic", "vllm", "llama-server", "ollama", "lm-studio", "llama-cpp-python"]
 KINDS = get_args(Kind)
-KEYS: Mapping[str, type] = {
-    "base_url": str,
-    "kind": str,
-    "key_env": str,
-    "timeout_s": float,
-    "retries": int,
-}
-MOST_RETRIES = 10
 _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{0,63}")
 
 
@@ -36,31 +28,23 @@ class Server:
     base_url: str
     kind: Kind = "generic"
     key_env: str = "OPENAI_API_KEY"
-    timeout_s: float = 120.0
-    retries: int = 3
+    timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0
+    retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
+
+    def __post_init__(self) -> None:
+        # What is refused is not shown: it may hold a password.
+        if fault := _fault(self.base_url):
+            raise ValueError(f"base_url {fault}; give one such as http://127.0.0.1:8080/v1")
+        if not _VARIABLE.fullmatch(self.key_env):
+            raise ValueError(
+                "key_env is no name of an environment variable (capitals, digits, _); "
+                "set the key in the environment, never in a card"
+            )
 
     @property
     def tells_thinking(self) -> bool:
         """Whether a request can turn thinking on and off."""
         return self.kind in ("vllm", "llama-server")
-
-
-def read(table: Mapping[str, Any], where: str) -> Server:
-    """A card's table, whose keys and types were checked. Raises UserError for values that cannot be meant."""
-    # What is refused is not shown: it may hold a password.
-    if fault := _fault(table["base_url"]):
-        raise UserError(f"{where}: base_url {fault}; give one such as http://127.0.0.1:8080/v1")
-    if not _VARIABLE.fullmatch(table.get("key_env", "OPENAI_API_KEY")):
-        raise UserError(
-            f"{where}: key_env is no name of an environment variable (capitals, digits, _); "
-            "set the key in the environment, never in a card"
-        )
-    timeout_s, retries = table.get("timeout_s", 1), table.get("retries", 0)
-    if not 0 < timeout_s < float("inf"):
-        raise UserError(f"{where}: timeout_s = {timeout_s}; allowed: seconds, more than 0")
-    if not 0 <= retries <= MOST_RETRIES:
-        raise UserError(f"{where}: retries = {printable(retries, 20)}; allowed: 0 to {MOST_RETRIES}")
-    return Server(**table)
 
 
 def _fault(url: str) -> str | None:

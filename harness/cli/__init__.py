@@ -3,60 +3,39 @@
 Heavy packages load inside the commands, so that `harness --help` answers at once.
 """
 
+import os
 import sys
+from importlib import import_module
 from typing import Any
 
 import typer
+from typer.main import get_command
 
-from harness.cli import (
-    campaign,
-    compare,
-    dataset,
-    distill,
-    doctor,
-    drive,
-    evaluate,
-    fidelity,
-    init,
-    ls,
-    model,
-    parity,
-    parse,
-    prompt,
-    report,
-    scenario,
-    sweep,
-    video,
-    view,
-)
+from harness.cli import shell
 from harness.core.errors import UserError, printable
+
+PANELS = {
+    "Evaluate": ("eval", "drive", "sweep", "compare", "fidelity", "campaign"),
+    "Look": ("ls", "view", "report", "export", "video", "parse"),
+    "Data": ("init", "prompt", "dataset", "scenario"),
+    "Models": ("model", "distill", "parity", "doctor"),
+}
 
 app = typer.Typer(
     name="harness",
+    cls=shell.Map,
     help="Evaluate prompts and parsing in cooperative driving.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.command("eval")(evaluate.evaluate)
-app.command("drive")(drive.drive)
-app.command("init")(init.init)
-app.command("ls")(ls.ls)
-app.command("view")(view.view)
-app.command("video")(video.command)
-app.add_typer(prompt.app, name="prompt")
-app.add_typer(dataset.app, name="dataset")
-app.add_typer(scenario.app, name="scenario")
-app.add_typer(model.app, name="model")
-app.command("report")(report.command)
-app.command("parse")(parse.command)
-app.command("distill")(distill.distill)
-app.command("sweep")(sweep.sweep)
-app.command("fidelity")(fidelity.fidelity)
-app.command("compare")(compare.compare)
-app.command("doctor")(doctor.doctor)
-app.add_typer(campaign.app, name="campaign")
-app.command("parity")(parity.parity)
+for panel, names in PANELS.items():
+    for name in names:
+        module = import_module(f"harness.cli.{name}")
+        if hasattr(module, "app"):
+            app.add_typer(module.app, name=name, rich_help_panel=panel)
+        else:
+            app.command(name, rich_help_panel=panel)(module.command)
 
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]
@@ -64,8 +43,11 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 def main() -> None:
     """Entry point: bad input is one line on stderr and exit code 2."""
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
+    program = get_command(app)
+    shell.hasten(program)
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(program(standalone_mode=False))
     except UserError as error:
         _fail(str(error))
     except typer.Abort:

@@ -1,47 +1,47 @@
-"""`harness dataset`: build frozen scenes, verify them, look at one, hold them against live driving."""
+"""`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.core.errors import UserError, printable
+from harness.cli import options
+from harness.cli.estimates import as_mapping, console, echo_json, shown, table
+from harness.cli.progress import bar
+from harness.cli.scenario import ready_to_drive
+from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
     from harness.studies.rank import Standing
 
 app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
-DATASET = typer.Argument(help="A dataset's folder, or the name of a shipped one.", metavar="DIR")
-AS_JSON = typer.Option(False, "--json", help="Print JSON.")
-WORKERS = typer.Option(2, help="Processes.")
+Dataset = Annotated[
+    str, typer.Argument(help="A dataset's folder, or the name of a shipped one.", metavar="DIR")
+]
 
 
 @app.command()
 def build(
-    name: str = typer.Argument(help="Scenario."),
+    name: options.Scenario,
     episodes: int = typer.Option(200, help="Episodes."),
-    seed: int = typer.Option(0, help="Seed of the first episode."),
-    workers: int = WORKERS,
+    seed: options.FirstSeed = 0,
+    workers: options.Workers = 2,
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
-    """Freeze episodes into a dataset. The same command again goes on where a killed one stopped."""
-    from harness.cli.progress import bar
-    from harness.cli.scenario import ready_to_drive
-
-    ready_to_drive(name, episodes, seed, workers)
+    """Freeze episodes into a dataset. The same command again continues a build that was stopped."""
+    scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.dataset.build import build as build_dataset
 
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(out, episodes, seed, workers, progress)
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} episodes, {manifest['decisions']} decision points"
     )
 
 
 @app.command()
-def check(dataset: str = DATASET, as_json: bool = AS_JSON) -> None:
+def check(dataset: Dataset, as_json: options.Json = False) -> None:
     """Verify every file and every decision point. Exit code 1 if something is wrong."""
     from harness.dataset import load, verify
 
@@ -49,14 +49,14 @@ def check(dataset: str = DATASET, as_json: bool = AS_JSON) -> None:
     problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
     if as_json:
-        counts = {k: manifest[k] for k in ("name", "episodes", "decisions")}
-        typer.echo(json.dumps({**counts, "sha256": digest, "problems": problems}, indent=1))
+        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "decisions")}
+        echo_json({**counts, "sha256": digest, "problems": problems})
     elif problems:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest['name']} is sound: {manifest['episodes']} episodes, {manifest['decisions']} decision "
-            f"points, {len(manifest['files'])} files\nmanifest sha256 {digest}"
+            f"{manifest.name} is sound: {manifest.episodes} episodes, {manifest.decisions} decision "
+            f"points, {len(manifest.files)} files\nmanifest sha256 {digest}"
         )
     if problems:
         raise typer.Exit(1)
@@ -64,7 +64,7 @@ def check(dataset: str = DATASET, as_json: bool = AS_JSON) -> None:
 
 @app.command()
 def show(
-    dataset: str = DATASET,
+    dataset: Dataset,
     scene: str = typer.Argument(help="Scene id, such as 00003-2."),
     out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
     viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
@@ -72,18 +72,17 @@ def show(
     """Draw a scene from above, with what one vehicle sees of it."""
     from io import BytesIO
 
-    from harness.core.errors import unknown
     from harness.core.files import write_whole
     from harness.dataset import load
     from harness.report.drawing.scene import draw
 
     if out.suffix not in (".svg", ".png"):
         raise UserError(f"--out {printable(out)} is no picture that can be written; end it in .svg or .png")
-    found = load.load(load.find(dataset)).scene(scene)
-    if viewer is not None and viewer not in found.viewers:
-        raise unknown(f"viewer of scene {found.id}", viewer, found.viewers)
+    drawn = load.load(load.find(dataset)).scene(scene)
+    if viewer is not None and viewer not in drawn.viewers:
+        raise unknown(f"viewer of scene {drawn.id}", viewer, drawn.viewers)
     picture = BytesIO()
-    draw(found, picture, "png" if out.suffix == ".png" else "svg", viewer)
+    draw(drawn, picture, "png" if out.suffix == ".png" else "svg", viewer)
     try:
         write_whole(out, picture.getvalue())
     except OSError as error:
@@ -94,30 +93,25 @@ def show(
 
 
 @app.command("rank")
-def rank_drivers(dataset: str = DATASET, workers: int = WORKERS, as_json: bool = AS_JSON) -> None:
-    """Compare the reference drivers' frozen success with their live success on the same episodes."""
-    from harness.cli.estimates import in_range
-    from harness.cli.progress import bar
-    from harness.cli.scenario import MOST_WORKERS
+def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: options.Json = False) -> None:
+    """Compare the reference drivers' frozen and closed-loop success. Both are on the same episodes."""
     from harness.dataset import load
 
-    in_range("--workers", workers, 1, MOST_WORKERS)
+    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     data = load.load(load.find(dataset))
     from harness.studies.rank import rank, ranks_agree
 
-    episodes = int(data.manifest["episodes"])
-    with bar(f"driving {printable(data.name, 30)} live", episodes) as progress:
+    episodes = data.manifest.episodes
+    with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
         standings = rank(data, workers, progress)
     agree = ranks_agree(standings)
     if as_json:
-        typer.echo(json.dumps(_as_mapping(data.name, episodes, agree, standings), indent=1))
+        echo_json(_as_mapping(data.name, episodes, agree, standings))
     else:
         _table(episodes, agree, standings)
 
 
 def _as_mapping(name: str, episodes: int, agree: bool, standings: dict[str, "Standing"]) -> dict[str, Any]:
-    from harness.cli.estimates import as_mapping
-
     drivers = {
         driver: {k: as_mapping(getattr(s, k)) for k in ("frozen", "live", "difference_points", "agreement")}
         for driver, s in standings.items()
@@ -126,18 +120,10 @@ def _as_mapping(name: str, episodes: int, agree: bool, standings: dict[str, "Sta
 
 
 def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from harness.cli.estimates import shown
-
-    table = Table(box=None, width=80, pad_edge=False)
-    table.add_column("driver", no_wrap=True)
-    for heading in ("frozen % [95 % CI]", "live % [95 % CI]", "difference, pts", "same %"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
+    rows = []
     for driver, s in standings.items():
-        points = shown(s.difference_points, 1.0)
-        table.add_row(driver, shown(s.frozen), shown(s.live), points, f"{100 * s.agreement.value:.0f}")
-    console = Console(width=80, markup=False, highlight=False)
-    console.print(table)
-    console.print(f"n = {episodes} episodes; ranks agree: {'yes' if agree else 'no'}")
+        agreement = f"{100 * s.agreement.value:.0f}"
+        rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
+    table(heads, rows)
+    console().print(f"n = {episodes} episodes; ranks agree: {'yes' if agree else 'no'}")

@@ -9,35 +9,32 @@ from pathlib import Path
 
 import typer
 
-from harness.core import resources
+from harness.cli.progress import drawn
 from harness.core.errors import UserError, printable
+from harness.core.resources import DATASET
 
 SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
 LINE_S = 60.0
 
 
-def distill(
-    dataset: str = typer.Argument(help="A dataset's folder: what it learns from.", metavar="DIR"),
+def command(
+    dataset: str = typer.Argument(help="A dataset's folder: what the model learns from.", metavar="DIR"),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
     prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
-    samples: str = typer.Option(
-        SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers."
-    ),
-    seed: int = typer.Option(0, help="Of the weights and of the order."),
+    samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
+    seed: int = typer.Option(0, help="Seed of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
-    apart_from: str = typer.Option(
-        resources.DATASET, help="Dataset that it will be evaluated on: no scene may be in both."
-    ),
+    apart_from: str = typer.Option(DATASET, help="Dataset to evaluate it on: no scene may be in both."),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
-    """Train a small Qwen3 on a frozen dataset; the same command again goes on where a killed one stopped."""
-    from harness.backends.transformers import checkpoint
+    """Train a small Qwen3 on a frozen dataset. The same command again continues training that was stopped."""
+    from harness.backends.registry import missing_package
     from harness.dataset import load
     from harness.prompts import versions as prompts
 
-    if package := checkpoint.missing_package():
+    if package := missing_package("transformers"):
         raise UserError(
             f"harness distill needs {package}; run `pip install 'swarmdrive-harness[transformers]'`"
         )
@@ -90,10 +87,8 @@ def _losses(samples: Mapping[str, int]) -> Iterator[Callable[[str, int, float], 
     """Shows each stage's progress and loss on stderr: a bar for people, a line a minute for a log."""
     if sys.stderr.isatty():
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True)) as bars:
+        with drawn(Console(stderr=True)) as bars:
             tasks = {
                 stage: bars.add_task(stage, total=count, start=False) for stage, count in samples.items()
             }

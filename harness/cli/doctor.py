@@ -1,41 +1,53 @@
-"""`harness doctor`: what is here to run with."""
+"""`harness doctor`: versions, machine, models and what they lack, completion cache."""
 
 import json
+import os
+import subprocess
+from shutil import which
 from textwrap import wrap
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.core.errors import printable
+from harness.cli import options
+from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.backends.cards import Card
 
 WIDTH, MARGIN = 80, 10
+PACKAGES = (
+    "numpy", "scipy", "pandas", "jinja2", "highway-env", "matplotlib", "tokenizers", "torch", "transformers",
+    "llama-cpp-python",
+)  # fmt: skip
+SMI_S = 1.0  # most seconds that nvidia-smi is waited for
+GIB = 2**30
 
 
-def doctor(
+def command(
     gpu: bool = typer.Option(False, "--gpu", help="Ask torch for GPUs too; it takes seconds to load."),
-    as_json: bool = typer.Option(False, "--json", help="Print JSON."),
+    as_json: options.Json = False,
 ) -> None:
-    """Show versions, the machine, which models can run here and what the others lack, and the cache."""
-    from harness.cli.machine import look
-
-    found = look(gpu)
+    """Show what can run here: versions, machine, models, cache. Says what the other models lack."""
+    facts = look(gpu)
     if as_json:
-        typer.echo(json.dumps(found, indent=1))
+        typer.echo(json.dumps(facts, indent=1))
         return
-    of = dict(found["versions"])
+    of = dict(facts["versions"])
     _line("harness", f"{of.pop('harness')}, Python {of.pop('python')}, {of.pop('platform')}")
     _line("packages", ", ".join(f"{name} {version}" for name, version in of.items()))
-    memory = "unknown" if found["memory_gib"] is None else f"{found['memory_gib']:g} GiB"
-    _line("machine", f"{found['cores']} cores, {memory} of memory")
+    memory = "unknown" if facts["memory_gib"] is None else f"{facts['memory_gib']:g} GiB"
+    _line("machine", f"{facts['cores']} cores, {memory} of memory")
     _line(
-        "GPU", "; ".join(map(printable, found["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
+        "GPU", "; ".join(map(printable, facts["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
     )
-    size = f"{found['cache']['bytes'] / 1e6:.1f} MB" if found["cache"]["bytes"] else "empty"
-    _line("cache", f"{printable(found['cache']['file'], 1000)}, {size}")
-    _line("engines", ", ".join(engine for engine, lack in found["engines"].items() if lack is None))
-    _lacking([(engine, lack) for engine, lack in found["engines"].items() if lack is not None])
-    able = [model for model in found["models"] if model["missing"] is None]
+    size = f"{facts['cache']['bytes'] / 1e6:.1f} MB" if facts["cache"]["bytes"] else "empty"
+    _line("cache", f"{printable(facts['cache']['file'], 1000)}, {size}")
+    _line("engines", ", ".join(engine for engine, lack in facts["engines"].items() if lack is None))
+    _lacking([(engine, lack) for engine, lack in facts["engines"].items() if lack is not None])
+    able = [model for model in facts["models"] if model["missing"] is None]
     _line("models", ", ".join(model["name"] for model in able))
-    _lacking([(model["name"], model["remedy"]) for model in found["models"] if model["missing"]])
+    _lacking([(model["name"], model["remedy"]) for model in facts["models"] if model["missing"]])
     _lacking([(model["name"], model["remedy"]) for model in able if model["remedy"]])
 
 
@@ -47,3 +59,80 @@ def _line(head: str, text: str) -> None:
 def _lacking(remedies: list[tuple[str, str]]) -> None:
     for name, remedy in remedies:
         _line("", f"{printable(name)}: {remedy}")
+
+
+def look(gpu: bool) -> dict[str, Any]:
+    """What `harness doctor --json` prints.
+
+    Args:
+        gpu: ask torch for GPUs too, which takes seconds to load.
+    """
+    from harness.backends import cards, registry
+    from harness.backends.cache import default_file
+    from harness.backends.transformers.engine import gpus
+    from harness.evaluate.spec import versions
+
+    models: list[dict[str, Any]] = []
+    for name in cards.names():
+        try:
+            models += map(_model, cards.each_engine(name))
+        except UserError as error:  # a card with a mistake is what one asks a doctor about
+            models.append({"name": name, "engine": None, "missing": "a sound card", "remedy": str(error)})
+    cache = default_file()
+    return {
+        "versions": versions(PACKAGES),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gib": _memory_gib(),
+        "gpu": gpus() if gpu else _smi_gpus(),
+        "engines": {engine: _package_remedy(engine) for engine in registry.engines()},
+        "models": models,
+        "cache": {"file": str(cache), "bytes": cache.stat().st_size if cache.is_file() else 0},
+    }
+
+
+def _model(card: "Card") -> dict[str, Any]:
+    from harness.backends.registry import missing
+
+    lack = missing(card)
+    return {"name": card.name, "engine": card.engine, "missing": lack, "remedy": _remedy(card, lack)}
+
+
+def _remedy(card: "Card", lack: str | None) -> str | None:
+    """What to do about what is missing; what else the card needs, which was not tried."""
+    if card.server:
+        return f"needs a server at {printable(card.server.base_url)} (not tried)"
+    if lack is None:
+        return None
+    if lack != "weights":
+        return _package_remedy(card.engine)
+    gated = " (accept its licence on the hub first)" if card.gated else ""
+    return f"harness model pull {printable(card.name)}{gated}"
+
+
+def _package_remedy(engine: str) -> str | None:
+    from harness.backends.registry import missing_package, registration
+
+    try:
+        return registration(engine).install if missing_package(engine) else None
+    except UserError as error:  # a plug-in that does not load
+        return str(error)
+
+
+def _memory_gib() -> float | None:
+    """Memory of the machine; None where the system does not tell."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _smi_gpus() -> list[str]:
+    program = which("nvidia-smi")
+    if program is None:
+        return []
+    asked = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(asked, capture_output=True, text=True, timeout=SMI_S, check=True)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return []
+    return done.stdout.splitlines()

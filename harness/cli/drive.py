@@ -1,183 +1,111 @@
-"""`harness drive`: a model with a prompt drives live."""
+"""`harness drive`: a model with a prompt drives in the simulator."""
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
-from harness.cli.progress import QUIET
+from harness.cli import options
+from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
+from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core.errors import UserError, printable
-
-if TYPE_CHECKING:
-    from harness.backends.base import AnswerMode
-    from harness.evaluate.evaluate import Evaluated
-    from harness.evaluate.live_spec import Drive
-    from harness.evaluate.spec import Latency
+from harness.core.resources import DATASET, folder
 
 ALL = "all"
+COLUMNS = (
+    Column("success % [95 % CI]", "success_rate", 100, interval=True),
+    Column("crash", "collision_rate", 100, " %"),
+    Column("late", "late_rate", 100, " %"),
+    Column("latency", "latency_proxy_ms", unit=" ms"),
+    Column("missed", "deadline_miss_rate", 100, " %"),
+    Column("gap", "least_gap_m", unit=" m"),
+    Column("clear", "time_to_clear_s", unit=" s"),
+)
 
 
-def drive(
-    model: str = typer.Option("proxy", help="Card, checkpoint directory, .gguf file, hub id, or a driver."),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
-    prompt: str = typer.Option("v2", help="Prompt version. `harness prompt list`."),
-    condition: list[str] = typer.Option(
-        [],
-        help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all.",
-    ),
+def command(
+    model: options.Model = "proxy",
+    engine: options.Engine = None,
+    prompt: options.Prompt = "v2",
+    condition: options.Conditions = None,
+    scenario: str = typer.Option("occluded-intersection", help="Scenario to drive. `harness scenario list`."),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
-    seeds: str = typer.Option("0:5", help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9."),
-    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
-    answer: str = typer.Option("json", help="json: free text; constrained: to the schema; readout: letters."),
-    batch_size: int = typer.Option(8, help="Most prompts that go through the engine together."),
-    workers: int = typer.Option(2, help="Processes, each with the model loaded."),
-    device: str | None = typer.Option(None, help="cpu or cuda."),
-    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
-    latency: str | None = typer.Option(
-        None,
-        help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's.",
-    ),
-    out: Path | None = typer.Option(None, help="The run's folder. Default: reports/<model>-<prompt>-drive."),
-    resume: bool = typer.Option(False, "--resume", help="Go on with a run that was killed."),
-    save_video: int = typer.Option(
-        0, help="Draw the first so many failed episodes of the last condition into the run's videos/."
-    ),
-    no_cache: bool = typer.Option(False, "--no-cache", help="Ask anew for answers that an earlier run had."),
-    tag: list[str] = typer.Option([], help="Word to find the run by. Repeatable."),
-    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON on stdout."),
-    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
+    seeds: options.Seeds = "0:5",
+    thinking: options.Thinking = False,
+    answer: options.Answer = "json",
+    batch_size: options.BatchSize = 8,
+    workers: options.ModelWorkers = 2,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    latency: options.Latency = None,
+    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
+    resume: options.Resume = False,
+    save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
+    no_cache: options.NoCache = False,
+    tag: options.Tags = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Drive live episodes in highway-env, each decision asked at its moment, and write a report."""
+    """Drive closed-loop episodes with a model in highway-env. Writes the run's folder, with a report."""
     from harness.backends import cards
-    from harness.cli.estimates import in_range
-    from harness.cli.evaluate import parse_seeds
-    from harness.cli.scenario import MOST_WORKERS
+    from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
-    from harness.evaluate.live_spec import spec_of
-    from harness.prompts import versions as prompts
+    from harness.evaluate.live_world import LiveSource
+    from harness.evaluate.run import evaluate
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+    from harness.world import scenarios
 
-    if ALL in condition and len(condition) > 1:
+    if condition and ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
-    shipped = _shipped()
+    shipped = json.loads((folder("datasets") / DATASET / "manifest.json").read_text())
     episodes = shipped["episodes"] if episodes is None else episodes
     first_seed = shipped["seed"] if first_seed is None else first_seed
-    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
-    in_range("--first-seed", first_seed, 0, LAST_SEED)
-    in_range("--workers", workers, 1, MOST_WORKERS)
-    in_range("--save-video", save_video, 0, episodes)
-    names = POINTS if condition in ([], [ALL]) else condition
-    spec = spec_of(
-        cards.resolve(model, engine),
-        prompts.load(prompt),
-        tuple(named_point(name) for name in dict.fromkeys(names)),
-        parse_seeds(seeds),
+    options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    options.in_range("--first-seed", first_seed, 0, LAST_SEED)
+    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    options.in_range("--save-video", save_video, 0, episodes)
+    names = POINTS if condition in (None, [], [ALL]) else condition
+    spec = Spec(
+        card=cards.resolve(model, engine),
+        prompt=versions.load(prompt),
+        source=LiveSource(first_seed, episodes, scenarios.get(scenario).name),
+        points=tuple(named_point(name) for name in dict.fromkeys(names)),
+        seeds=options.parse_seeds(seeds),
         thinking=thinking,
-        answer=cast("AnswerMode", answer),
+        answer=answer,
         batch_size=batch_size,
         device=device,
         dtype=dtype,
-        latency=cast("Latency | None", latency),
-        tags=tuple(dict.fromkeys(tag)),
-        first_seed=first_seed,
-        episodes=episodes,
+        latency=latency,
+        tags=tuple(dict.fromkeys(tag or ())),
     )
-    _run(spec, out or _default_out(spec, resume), resume, workers, save_video, no_cache, as_json, quiet)
-
-
-def _shipped() -> dict[str, Any]:
-    from harness.core.resources import DATASET, folder
-
-    manifest: dict[str, Any] = json.loads((folder("datasets") / DATASET / "manifest.json").read_text())
-    return manifest
-
-
-def _default_out(spec: "Drive", resume: bool) -> Path:
-    from dataclasses import replace
-
-    from harness.cli.evaluate import default_out
-
-    named = replace(spec.dataset, manifest={**spec.dataset.manifest, "name": "drive"})
-    return default_out(replace(spec, dataset=named), resume)
-
-
-def _run(
-    spec: "Drive",
-    out: Path,
-    resume: bool,
-    workers: int,
-    save_video: int,
-    no_cache: bool,
-    as_json: bool,
-    quiet: bool,
-) -> None:
-    from harness.backends.cache import default_file
-    from harness.cli.evaluate import as_mapping
-    from harness.cli.progress import bar
-    from harness.evaluate.drive import run
-
-    with bar(f"driving {printable(spec.card.name, 30)}", spec.episodes, quiet=as_json or quiet) as progress:
-        done = run(spec, out, resume, workers, progress, None if no_cache else default_file())
+    where = out or default_out(spec, resume)
+    silent = as_json or quiet
+    with bar(f"driving {printable(spec.card.name, 30)}", episodes, silent) as progress:
+        cache = None if no_cache else default_file()
+        done = evaluate(spec, where, resume, progress, cache, workers=workers)
     # They draw with matplotlib, which no episode waits for.
     from harness.cli.report import write
     from harness.cli.video import write_failures
 
-    page = write([out], quiet=as_json or quiet)
-    videos = write_failures(out, save_video, quiet=as_json or quiet) if save_video else []
+    page = write([where], quiet=silent)
+    videos = write_failures(where, save_video, silent) if save_video else []
     if as_json:
-        typer.echo(json.dumps(as_mapping(done), indent=1))
-    if as_json or quiet:
+        echo_json(as_mapping(done))
+    if silent:
         return
-    _table(done)
+    notes = (
+        f"n = {episodes} episodes (layout seeds {first_seed} to {first_seed + episodes - 1}) × "
+        f"{len(spec.seeds)} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
+        "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means",
+    )
+    show(done, "closed loop", COLUMNS, notes, tight=True)
     if videos:
-        typer.echo(f"wrote {out / 'videos'}: {', '.join(video.name for video in videos)}")
+        typer.echo(f"wrote {where / 'videos'}: {', '.join(video.name for video in videos)}")
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {page}")
-
-
-def _table(done: "Evaluated") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from harness.cli.estimates import interval, tell_answers
-
-    console = Console(width=80, markup=False, highlight=False)
-    rows = done.summary[done.summary.interval != "seed means"]
-    figures: dict[Any, Any] = {(r.condition, r.metric): r for r in rows.itertuples()}
-    table = Table(box=None, width=80, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("condition", overflow="fold")
-    for heading in ("success % [95 % CI]", "crash", "late", "latency", "missed", "gap", "clear"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for point in done.manifest["conditions"]:
-        name = point["name"]
-
-        def cell(metric: str, scale: float = 1.0, unit: str = "", name: str = name) -> str:
-            value = figures[name, metric].value
-            return "-" if value != value else f"{value * scale:.1f}{unit}"
-
-        success = figures[name, "success_rate"]
-        table.add_row(
-            name,
-            interval(success.value, success.ci_low, success.ci_high, 100),
-            cell("collision_rate", 100, " %"),
-            cell("late_rate", 100, " %"),
-            cell("latency_proxy_ms", 1, " ms"),
-            cell("deadline_miss_rate", 100, " %"),
-            cell("least_gap_m", 1, " m"),
-            cell("time_to_clear_s", 1, " s"),
-        )
-    m = done.manifest
-    console.print(
-        f"{printable(m['model']['name'], 40)} · prompt {m['prompt']['version']} · {m['answer']} · driven live"
-    )
-    console.print(table)
-    last = m["first_seed"] + m["episodes"] - 1
-    console.print(
-        f"n = {m['episodes']} episodes (layout seeds {m['first_seed']} to {last}) × "
-        f"{len(m['seeds'])} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
-        "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means"
-    )
-    tell_answers(console, m, figures)

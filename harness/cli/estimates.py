@@ -1,15 +1,23 @@
-"""Estimates and runs as people and as machines read them, and numbers held to their range."""
+"""Numbers, tables and JSON as people and machines read them."""
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from harness.core.errors import UserError, printable
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from harness.core.statistics import Estimate
+
+WIDTH = 80  # columns of a terminal
+
+
+def echo_json(value: Any, indent: int | None = 1) -> None:
+    """Print JSON."""
+    typer.echo(json.dumps(value, indent=indent))
 
 
 def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
@@ -23,37 +31,28 @@ def shown(estimate: "Estimate", scale: float = 100.0) -> str:
     return interval(estimate.value, estimate.low, estimate.high, scale)
 
 
-def interval(value: float, low: float, high: float, scale: float) -> str:
+def interval(value: float | None, low: float | None, high: float | None, scale: float) -> str:
     """`value [low, high]`, one decimal; a dash for what is not known."""
-    value, low, high = (scale * number for number in (value, low, high))
-    told = ("–" if math.isnan(number) else f"{number:.1f}" for number in (value, low, high))
-    return "{} [{}, {}]".format(*told)
+    ends = (math.nan if number is None else number for number in (value, low, high))
+    numbers = ("–" if math.isnan(number) else f"{scale * number:.1f}" for number in ends)
+    return "{} [{}, {}]".format(*numbers)
 
 
-def in_range(option: str, value: int, least: int, most: int) -> None:
-    """Raises UserError unless `least` <= `value` <= `most`."""
-    if not least <= value <= most:
-        raise UserError(f"{option} {value} is out of range; give {least} to {most}")
+def console() -> "Console":
+    """Plain text in 80 columns."""
+    from rich.console import Console
+
+    return Console(width=WIDTH, markup=False, highlight=False)
 
 
-def tell_answers(console: "Console", manifest: Mapping[str, Any], figures: Mapping[Any, Any]) -> None:
-    """Say below the table of a run, frozen or live, where times come from and how answers were read.
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], tight: bool = False) -> None:
+    """Print columns, the first folded and the others aligned right; `tight` ones are one space apart."""
+    from rich.table import Table
 
-    `figures` has the rows of its summary by condition and metric.
-    """
-    m = manifest
-    console.print(f"latency: {m['latency']['source']} ({printable(m['latency']['basis'])})")
-    if (m["latency"].get("load_a_core") or 0) > 1:
-        console.print(
-            f"timed on a busy machine ({m['latency']['load_a_core']} processes a core): "
-            "let it run alone, or use --latency card or paper"
-        )
-    if m.get("cached_answers"):
-        console.print(f"{m['cached_answers']} answers came from the cache (--no-cache asks anew)")
-    if m.get("engine_errors"):
-        console.print(f"{m['engine_errors']} answers are errors of the engine; rows.jsonl has its messages")
-    for role in ("ego", "helper", "merge"):
-        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
-        if shares[0] is not None:
-            values = " / ".join(f"{100 * s.value:.1f}" for s in shares if s is not None)
-            console.print(f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}")
+    drawn = Table(box=None, width=WIDTH, pad_edge=False, padding=(0, 1, 0, 0) if tight else (0, 1))
+    drawn.add_column(heads[0], overflow="fold")
+    for head in heads[1:]:
+        drawn.add_column(head, justify="right", no_wrap=True)
+    for row in rows:
+        drawn.add_row(*row)
+    console().print(drawn)

@@ -1,38 +1,40 @@
-"""`harness fidelity`: frozen against closed."""
+"""`harness fidelity`: frozen against closed-loop."""
 
 from pathlib import Path
 
 import typer
 
+from harness.cli import options
+from harness.core.errors import printable
 
-def fidelity(
-    runs: list[Path] = typer.Argument(
-        help="Folders of `harness eval` and of `harness drive`; models may be several.", metavar="RUN..."
-    ),
+LABEL = 16  # characters of a condition's name that leave its row on one line
+
+
+def command(
+    runs: options.Runs,
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
-    as_json: bool = typer.Option(False, "--json", help="Print the table as JSON."),
+    as_json: options.Json = False,
 ) -> None:
-    """How far success on frozen scenes is that of driving, episode by episode."""
-    from harness.core.errors import printable
-    from harness.studies import fidelity_page
-    from harness.studies.fidelity import fidelity as compared
+    """Compare frozen with closed-loop success, by episode. Takes runs of `eval` and of `drive`."""
+    from harness.studies import fidelity
 
-    found = compared(runs)
-    page = fidelity_page.write(found, out)
+    result = fidelity.fidelity(runs)
+    page = fidelity.write(result, out)
     if as_json:
-        typer.echo(found.table.to_json(orient="records"))
+        typer.echo(result.table.to_json(orient="records"))
         return
-    typer.echo(f"{'condition':<16}{'frozen %':>12}{'closed %':>12}{'difference, points':>28}{'same %':>12}")
+    typer.echo(
+        f"{'condition':<{LABEL}}{'frozen %':>12}{'closed %':>12}{'difference, points':>28}{'same %':>12}"
+    )
     who = ""
-    for row in map(fidelity_page.shown, found.table.to_dict("records")):
+    for row in map(fidelity.shown, result.table.to_dict("records")):
         if row["who"] != who:
             who = row["who"]
             typer.echo(printable(who))
-        means = {name: row[name].partition(" ")[0] for name in ("frozen", "closed", "agreement")}
+        frozen, closed, same = (row[name].partition(" ")[0] for name in ("frozen", "closed", "agreement"))
         label = printable(row["condition"])
-        label = f"{label:<16}" if len(label) < 16 else f"{label}\n{'':<16}"
-        numbers = f"{means['frozen']:>12}{means['closed']:>12}{row['difference']:>28}{means['agreement']:>12}"
-        typer.echo(label + numbers)
-    for sentence in fidelity_page.headline(found):
+        label = f"{label:<{LABEL}}" if len(label) < LABEL else f"{label}\n{'':<{LABEL}}"
+        typer.echo(f"{label}{frozen:>12}{closed:>12}{row['difference']:>28}{same:>12}")
+    for sentence in fidelity.headline(result):
         typer.echo(sentence)
     typer.echo(f"wrote {printable(page)}")

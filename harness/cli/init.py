@@ -9,8 +9,10 @@ from harness.core.errors import UserError, printable
 PROMPT = "v2"  # what one's own prompt begins as
 
 
-def init(folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do.")) -> None:
-    """Make a project: a prompt and a model card to change, found by name by commands typed in its folder."""
+def command(
+    folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do."),
+) -> None:
+    """Make a project with a prompt and a model card to change. Commands typed there find them by name."""
     from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory
 
@@ -21,11 +23,13 @@ def init(folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an e
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder) as made:  # so that a full disk leaves nothing half-written
+        with TemporaryDirectory(dir=folder) as draft:  # so that a full disk leaves nothing half-written
             # Contents alone: what is installed may be read-only, and a project is there to be changed.
-            copytree(starter, made, copy_function=copyfile, dirs_exist_ok=True)
-            copytree(resources.folder("prompts") / PROMPT, Path(made, "prompts/mine"), copy_function=copyfile)
-            for whole in Path(made).iterdir():
+            copytree(starter, draft, copy_function=copyfile, dirs_exist_ok=True)
+            copytree(
+                resources.folder("prompts") / PROMPT, Path(draft, "prompts/mine"), copy_function=copyfile
+            )
+            for whole in Path(draft).iterdir():
                 whole.rename(folder / whole.name)
     except OSError as error:
         reason = printable(error.strerror)

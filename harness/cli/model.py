@@ -1,11 +1,12 @@
-"""`harness model`: the models at hand, fetching one, and a look at one before a run."""
+"""`harness model`: the model cards, fetching weights, and a look at a model before a run."""
 
 import json
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import typer
 
+from harness.cli import options
 from harness.core.errors import printable
 from harness.core.resources import DATASET
 
@@ -21,8 +22,8 @@ _WIDTH = 100  # of lines of tokens
 
 
 @app.command("list")
-def list_models(as_json: bool = typer.Option(False, "--json", help="Print the cards as JSON.")) -> None:
-    """List the model cards, on each of their engines, and which of them can run here."""
+def list_models(as_json: options.Json = False) -> None:
+    """List the model cards and which of them can run here. A card has a line for each of its engines."""
     from harness.backends import cards
     from harness.backends.registry import missing
 
@@ -46,11 +47,11 @@ def list_models(as_json: bool = typer.Option(False, "--json", help="Print the ca
 @app.command()
 def pull(
     name: str = typer.Argument(help="Card or hub id."),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
+    engine: options.Engine = None,
 ) -> None:
-    """Fetch a model's weights from its hub, at the revision that its card names."""
+    """Fetch a model's weights from its hub. The card names the revision."""
     from harness.backends.cards import resolve
-    from harness.backends.pull import pull as fetch
+    from harness.backends.weights import pull as fetch
 
     card = resolve(name, engine)
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
@@ -60,18 +61,19 @@ def pull(
 @app.command()
 def check(
     name: str = typer.Argument(help="Card, checkpoint directory, .gguf file or hub id."),
-    engine: str | None = typer.Option(None, help="Another engine that the card names, such as llama-cpp."),
-    thinking: bool = typer.Option(False, "--thinking", help="Ask the model to think first."),
+    engine: options.Engine = None,
+    thinking: options.Thinking = False,
     device: str | None = typer.Option(None, help="cpu, cuda or cuda:N; CUDA if there is any."),
-    dtype: str | None = typer.Option(None, help="float32, bfloat16 or auto, in place of the card's."),
-    as_json: bool = typer.Option(False, "--json", help="Print what was seen as JSON."),
+    dtype: options.Dtype = None,
+    as_json: options.Json = False,
 ) -> None:
-    """Load a model, show the prompt that it reads, and time one decision in each answer mode."""
-    from harness.backends import cards
+    """Load a model, show its prompt and time one decision. Does so in each answer mode."""
+    from harness.backends.cards import resolve
+    from harness.backends.registry import capabilities
 
-    card = cards.resolve(name, engine)
+    card = resolve(name, engine)
     head: dict[str, Any] = {"name": card.name, "engine": card.engine}
-    if card.engine not in (*cards.WEIGHTED, "openai"):
+    if not capabilities(card.engine).renders:
         if as_json:
             typer.echo(json.dumps({**head, "model_free": True}, indent=2))
         else:
@@ -102,17 +104,19 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     from harness.backends.registry import open_backend
     from harness.dataset import load
     from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
 
     data = load.load(load.find(DATASET), 1)
-    spec = Spec(card, prompts.load(PROMPT), data, (), (0,), 1, thinking, "json", 1, device, dtype)
+    spec = Spec(
+        card, prompts.load(PROMPT), FrozenSource(data, 1), (), (0,), thinking, "json", 1, device, dtype
+    )
     ways = ("json",) if spec.thinking else get_args(AnswerMode)
     # The first of a scene's questions is the ego's.
     asked = [next(requests(replace(spec, answer=way), data.scenes)) for way in ways]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    assert isinstance(backend, Rendering)
-    return spec, look(backend, asked)
+    return spec, look(cast("Rendering", backend), asked)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:

@@ -1,33 +1,31 @@
 """`harness parity`: one model through two engines."""
 
-import json
 from dataclasses import asdict, replace
 from math import isfinite
-from typing import TYPE_CHECKING
 
 import typer
 
+from harness.cli import options
+from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
 from harness.core import resources
 from harness.core.errors import UserError, printable
 
-if TYPE_CHECKING:
-    from harness.training.parity import Finding
 
-
-def parity(
+def command(
     model: str = typer.Argument(help="Card or directory that names a checkpoint and a GGUF file."),
-    prompt: str = typer.Option("v2", help="Prompt version."),
-    dataset: str = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder."),
+    prompt: options.Prompt = "v2",
+    dataset: options.Dataset = resources.DATASET,
     prompts: int = typer.Option(64, help="How many, spread over scenes and viewers."),
-    as_json: bool = typer.Option(False, "--json", help="Print what was found as JSON."),
+    as_json: options.Json = False,
 ) -> None:
-    """Run the same prompts through transformers and llama.cpp. Exit code 1 if they differ too much."""
+    """Compare a model's answers on transformers and llama.cpp. Exit code 1 if they differ too much."""
     from harness.backends import cards
     from harness.backends.registry import missing
-    from harness.cli.progress import bar
     from harness.coordination.operating_point import POINTS
     from harness.dataset import load
     from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import readout, versions
     from harness.training.parity import PASSES, compare
@@ -41,26 +39,22 @@ def parity(
                 f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
             )
     data = load.load(load.find(dataset))
-    spec = Spec(reference, versions.load(prompt), data, tuple(POINTS.values()), (0,))
+    spec = Spec(reference, versions.load(prompt), FrozenSource(data), tuple(POINTS.values()), (0,))
     asked = list(requests(spec, data.scenes))
     asked = asked[:: max(1, len(asked) // prompts)][:prompts]
     letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]
-    with bar(f"comparing {printable(reference.name, 30)}", PASSES, quiet=as_json) as progress:
-        found = compare(reference, gguf, asked, letters, progress)
-    holds = all(finding.holds for finding in found)
+    with bar(f"comparing {printable(reference.name, 30)}", PASSES, as_json) as progress:
+        findings = compare(reference, gguf, asked, letters, progress)
+    holds = all(finding.holds for finding in findings)
     if as_json:
-        findings = [asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in found]
-        typer.echo(json.dumps({"holds": holds, "findings": findings}, indent=1, allow_nan=False))
-    else:
-        _print(found, holds, len(asked))
-    raise typer.Exit(0 if holds else 1)
-
-
-def _print(found: "list[Finding]", holds: bool, n: int) -> None:
-    for f in found:
+        rows = [asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in findings]
+        echo_json({"holds": holds, "findings": rows})
+        raise typer.Exit(0 if holds else 1)
+    for f in findings:
         limit = "" if f.allowed is None else f"{f.allowed:g}"
         typer.echo(f"{'ok  ' if f.holds else 'FAIL'} {f.what:<52}{f.measured:>10.5g} {limit:>8}")
         for difference in f.differences:
             typer.echo(f"       {printable(difference, 200)}")
     verdict = "the engines agree" if holds else "the engines differ"
-    typer.echo(f"{verdict}: {n} prompts; measured, and what is allowed")
+    typer.echo(f"{verdict}: {len(asked)} prompts; measured, and what is allowed")
+    raise typer.Exit(0 if holds else 1)

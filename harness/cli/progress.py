@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-QUIET = "Print nothing but errors, and what --json asks for."
-
 
 @dataclass(frozen=True)
 class Bar:
@@ -28,7 +26,7 @@ class Bar:
 
 @contextmanager
 def bar(label: str, total: int, quiet: bool = False) -> Iterator[Bar]:
-    """A bar to tell how many are done, how fast and until when. Nothing is drawn where nobody watches."""
+    """A bar: how many are done, how fast, time left. None is drawn unless stderr is a terminal."""
     if quiet or not sys.stderr.isatty():
         yield Bar()
         return
@@ -58,11 +56,10 @@ def drawn(console: "Console") -> "Progress":
         def render(self, task: Task) -> Text:
             return Text(pace(task.finished_speed or task.speed, task.time_remaining, task.finished_time))
 
-    told = (MofNCompleteColumn, Pace)
     return Progress(
         TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
         BarColumn(bar_width=None),
-        *(column(table_column=Column(no_wrap=True)) for column in told),
+        *(column(table_column=Column(no_wrap=True)) for column in (MofNCompleteColumn, Pace)),
         console=console,
     )
 

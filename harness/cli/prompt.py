@@ -1,34 +1,30 @@
-"""`harness prompt`: the versions at hand, what a model is sent, and whether it keeps its budget."""
+"""`harness prompt`: the versions, the text a model is sent, and its token budget."""
 
-import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
+from harness.cli import options
+from harness.cli.estimates import echo_json
 from harness.core import resources
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, unknown
 
-app = typer.Typer(
-    help="List prompt versions, show what a model is sent, check or release one.", no_args_is_help=True
-)
+app = typer.Typer(help="List prompt versions; show, check or release one.", no_args_is_help=True)
 
-DATASET = typer.Option(resources.DATASET, help="Shipped dataset, or a dataset's folder.")
+Version = Annotated[str, typer.Argument(help="Prompt version.")]
 
 
 @app.command("list")
-def list_prompts(as_json: bool = typer.Option(False, "--json", help="Print as JSON.")) -> None:
+def list_prompts(as_json: options.Json = False) -> None:
     """List the prompt versions."""
     from harness.prompts import versions as prompts
 
-    found = [prompts.load(name) for name in prompts.names()]
-    rows = [
-        {"version": p.version, "released": p.released, "sha256": p.sha256, "description": p.description,
-         "changed": p.changed, "known_failures": p.known_failures}
-        for p in found
-    ]  # fmt: skip
+    fields = ("version", "released", "sha256", "description", "changed", "known_failures")
+    versions = [prompts.load(name) for name in prompts.names()]
+    rows = [{field: getattr(version, field) for field in fields} for version in versions]
     if as_json:
-        typer.echo(json.dumps(rows, indent=1))
+        echo_json(rows)
         return
     for row in rows:
         state = "released" if row["released"] else "draft"
@@ -37,28 +33,25 @@ def list_prompts(as_json: bool = typer.Option(False, "--json", help="Print as JS
 
 @app.command()
 def show(
-    version: str = typer.Argument(help="Prompt version."),
+    version: Version,
     scene: str = typer.Option(..., help="Scene id, such as 00003-2."),
     viewer: str | None = typer.Option(None, help="Vehicle id. Default: every viewer."),
-    dataset: str = DATASET,
-    as_json: bool = typer.Option(False, "--json", help="Print the chat messages as JSON."),
+    dataset: options.Dataset = resources.DATASET,
+    as_json: options.Json = False,
 ) -> None:
-    """Print exactly what a model is sent for a scene (before its own chat template)."""
-    from harness.core.errors import unknown
+    """Print exactly what a model is sent for a scene. Its own chat template is not applied."""
     from harness.dataset import load
     from harness.prompts import versions as prompts
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
-    found = data.scene(scene)
-    if viewer is not None and viewer not in found.viewers:
-        raise unknown("viewer", viewer, found.viewers)
-    sent = {
-        v: prompt.render(found.record["graphs"][v], data.actions)
-        for v in found.viewers
-        if viewer in (None, v)
-    }
+    at = data.scene(scene)
+    if viewer is not None and viewer not in at.viewers:
+        raise unknown("viewer", viewer, at.viewers)
+    viewers = at.viewers if viewer is None else [viewer]
+    words = data.scenario.words
+    sent = {v: prompt.render(at.record["graphs"][v], data.actions, words=words) for v in viewers}
     if as_json:
-        typer.echo(json.dumps(sent, indent=1))
+        echo_json(sent)
         return
     for v, messages in sent.items():
         for message in messages:
@@ -68,12 +61,12 @@ def show(
 
 @app.command()
 def check(
-    version: str = typer.Argument(help="Prompt version."),
-    dataset: str = DATASET,
+    version: Version,
+    dataset: options.Dataset = resources.DATASET,
     tokenizer: Path | None = typer.Option(None, help="tokenizer.json, its folder, or a Qwen2 GGUF."),
-    as_json: bool = typer.Option(False, "--json", help="Print the figures as JSON."),
+    as_json: options.Json = False,
 ) -> None:
-    """Render every scene for every viewer; with a tokenizer, count tokens against the budget."""
+    """Render every scene and count tokens against the budget. Exit code 1 if a prompt is outside it."""
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
     from harness.prompts import versions as prompts
@@ -85,7 +78,7 @@ def check(
     outside: list[dict[str, Any]] = []
     for scene in data.scenes:
         for v, graph in scene.record["graphs"].items():
-            messages = prompt.render(graph, data.actions)
+            messages = prompt.render(graph, data.actions, words=data.scenario.words)
             if count:
                 n = count(messages)
                 sizes[graph["role"]].append(n)
@@ -93,9 +86,8 @@ def check(
                     outside.append({"scene": scene.id, "viewer": v, "tokens": n})
     stats = {role: spread_of(n) for role, n in sizes.items() if n}
     if as_json:
-        typer.echo(
-            json.dumps({"version": version, "budget": [least, most], "tokens": stats, "outside": outside})
-        )
+        figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}
+        echo_json(figures, indent=None)
     else:
         typer.echo(
             f"{version}: renders for every viewer of {len(data.scenes)} scenes; "
@@ -114,8 +106,8 @@ def check(
 
 
 @app.command()
-def lock(version: str = typer.Argument(help="Prompt version to release.")) -> None:
-    """Release a version: pin its digest, so that a changed text is an error."""
+def lock(version: Version) -> None:
+    """Release a version, so that changing its text is an error."""
     from harness.prompts import versions as prompts
 
     if prompts.load(version).released:

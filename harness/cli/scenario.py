@@ -1,53 +1,50 @@
-"""`harness scenario`: what is driven, and how hard it is for drivers that need no model."""
+"""`harness scenario`: the scenarios, and how hard each is for the reference drivers."""
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.core.errors import UserError
+from harness.cli import options
+from harness.cli.estimates import as_mapping, console, echo_json, shown, table
+from harness.cli.progress import bar
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    from harness.world.scenario import Scenario
 
 app = typer.Typer(help="List scenarios, show one, or drive the reference drivers.", no_args_is_help=True)
 
-MOST_WORKERS = 256
-
 
 @app.command("list")
-def list_scenarios(as_json: bool = typer.Option(False, "--json", help="Print JSON.")) -> None:
+def list_scenarios(as_json: options.Json = False) -> None:
     """List the scenarios."""
     from harness.world import scenarios
 
-    rows = [{"name": name, "summary": _summary(scenarios.get(name))} for name in scenarios.names()]
+    rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
     if as_json:
-        typer.echo(json.dumps(rows, indent=1))
+        echo_json(rows)
         return
     for row in rows:
         typer.echo(f"{row['name']}: {row['summary']}")
 
 
 @app.command()
-def show(
-    name: str = typer.Argument(help="Scenario."),
-    as_json: bool = typer.Option(False, "--json", help="Print JSON."),
-) -> None:
-    """Print what a scenario is, its actions, and every parameter with its meaning and value."""
+def show(name: options.Scenario, as_json: options.Json = False) -> None:
+    """Print a scenario's actions and parameters. Each parameter has its meaning and value."""
     import textwrap
 
     from harness.world import scenarios
 
     scenario = scenarios.get(name)
+    description, actions = scenario.description, scenario.actions
     parameters = _parameters(scenario)
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
-        described = {"name": name, "description": scenario.__doc__, "actions": scenario.ACTIONS}
-        schemas = {role: answer_schema(role, scenario.ACTIONS, name) for role in ROLES}
-        typer.echo(json.dumps({**described, "parameters": parameters, "answer_schema": schemas}, indent=1))
+        described = {"name": name, "description": description, "actions": actions}
+        schemas = {role: answer_schema(role, actions, name) for role in ROLES}
+        echo_json({**described, "parameters": parameters, "answer_schema": schemas})
         return
-    typer.echo(f"{scenario.__doc__}\nactions: {', '.join(scenario.ACTIONS)}\n")
+    typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     for parameter, of in parameters.items():
         value = (
             ", ".join(f"{v:g}" for v in of["value"]) if isinstance(of["value"], tuple) else f"{of['value']:g}"
@@ -58,86 +55,71 @@ def show(
 
 @app.command()
 def check(
-    name: str = typer.Argument(help="Scenario."),
+    name: options.Scenario,
     episodes: int = typer.Option(500, help="Episodes to drive, each by every driver."),
-    seed: int = typer.Option(0, help="Seed of the first episode."),
-    workers: int = typer.Option(2, help="Processes."),
-    as_json: bool = typer.Option(False, "--json", help="Print JSON."),
+    seed: options.FirstSeed = 0,
+    workers: options.Workers = 2,
+    as_json: options.Json = False,
 ) -> None:
-    """Drive the reference drivers through the same episodes and say how they end."""
-    from harness.cli.progress import bar
-
-    ready_to_drive(name, episodes, seed, workers)
+    """Drive the reference drivers and show how episodes end. All drive the same episodes."""
+    scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.world import reference as live
 
     with bar(f"driving {name}", episodes) as progress:
-        found = live.check(episodes, seed, workers, progress)
+        outcomes = live.check(scenario, episodes, seed, workers, progress)
     if as_json:
-        typer.echo(json.dumps(_as_mapping(name, episodes, seed, found), indent=1))
+        echo_json(_as_mapping(name, episodes, seed, outcomes))
     else:
-        _table(episodes, seed, found)
+        _table(episodes, seed, outcomes)
 
 
-def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> None:
-    """Raises UserError where the simulator cannot drive those episodes."""
-    from harness.cli.estimates import in_range
+def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenario":
+    """The scenario. Raises UserError if there is none, or where those episodes cannot be driven."""
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
-    from harness.world.world import NAME
 
-    if scenarios.get(name).NAME != NAME:
-        raise UserError(f"scenario {name} has no simulator; give {NAME}")
-    in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
-    in_range("--seed", seed, 0, LAST_SEED)
-    in_range("--workers", workers, 1, MOST_WORKERS)
-
-
-def _summary(scenario: "ModuleType") -> str:
-    return str(scenario.__doc__).strip().splitlines()[0].rpartition(": ")[2]
+    scenario = scenarios.get(name)
+    options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    options.in_range("--seed", seed, 0, LAST_SEED)
+    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    return scenario
 
 
-def _parameters(scenario: "ModuleType") -> dict[str, dict[str, Any]]:
-    """Value of each parameter, and its meaning out of the dataclass's docstring."""
+def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
+    """Value of each parameter, and its meaning out of the docstrings of its dataclasses."""
     import inspect
     import re
     from dataclasses import asdict
 
-    attributes = str(inspect.getdoc(scenario.Parameters)).partition("Attributes:\n")[2]
-    meanings = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
+    meanings: dict[str, str] = {}
+    for kind in reversed(type(scenario.parameters).__mro__[:-1]):
+        attributes = str(inspect.getdoc(kind)).partition("Attributes:\n")[2]
+        meanings |= re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE)
     return {
         name: {"value": value, "meaning": " ".join(meanings[name].split())}
-        for name, value in asdict(scenario.Parameters()).items()
+        for name, value in asdict(scenario.parameters).items()
     }
 
 
-def _as_mapping(name: str, episodes: int, seed: int, found: dict[str, Any]) -> dict[str, Any]:
-    from harness.cli.estimates import as_mapping
+def _as_mapping(name: str, episodes: int, seed: int, outcomes: dict[str, Any]) -> dict[str, Any]:
     from harness.core.statistics import Estimate
 
     drivers = {
         driver: {k: as_mapping(v) if isinstance(v, Estimate) else v for k, v in results.items()}
-        for driver, results in found.items()
+        for driver, results in outcomes.items()
     }
     return {"scenario": name, "episodes": episodes, "seed": seed, "drivers": drivers}
 
 
-def _table(episodes: int, seed: int, found: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from harness.cli.estimates import shown
-
-    table = Table(box=None, width=80, pad_edge=False)
-    table.add_column("driver", no_wrap=True)
-    for heading in ("success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for driver, of in found.items():
+def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
+    heads = ("driver", "success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes")
+    rows = []
+    for driver, of in outcomes.items():
         rates = (f"{100 * of[k].value:.1f}" for k in ("collision", "late", "time_out"))
-        table.add_row(driver, shown(of["success"]), *rates, str(of["other_crashes"]))
-    console = Console(width=80, markup=False, highlight=False)
-    console.print(table)
-    off_road = sum(round(of["off_road"].value * episodes) for of in found.values())
-    console.print(
+        rows.append((driver, shown(of["success"]), *rates, str(of["other_crashes"])))
+    table(heads, rows)
+    off_road = sum(round(of["off_road"].value * episodes) for of in outcomes.values())
+    console().print(
         f"n = {episodes} episodes, seeds {seed} to {seed + episodes - 1}; Wilson intervals; "
         f"off the road: {off_road}"
     )

@@ -1,16 +1,20 @@
-"""`harness sweep`: finished runs, coordinated otherwise."""
+"""`harness sweep`: finished runs at other operating points."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli.progress import QUIET
+from harness.cli import options
+from harness.cli.estimates import interval
+from harness.cli.progress import bar
+from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
+LABEL = 14  # characters of a grid point's name that leave its row on one line
 COLUMNS = (
     ("trigger %", "trigger_rate", 100),
     ("msgs", "messages_per_episode", 1),
@@ -19,34 +23,27 @@ COLUMNS = (
 )
 
 
-def sweep(
-    runs: list[Path] = typer.Argument(
-        help="Folders of finished runs; several are drawn together.", metavar="RUN..."
+def command(
+    runs: options.Runs,
+    over: list[str] | None = typer.Option(
+        None,
+        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus, or any "
+        "setting of an operating point by its name; repeatable. Default: the paper's panels.",
     ),
-    over: list[str] = typer.Option(
-        [],
-        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus; repeatable. "
-        "Default: the paper's panels.",
-    ),
-    grid: list[str] = typer.Option(
-        [],
-        help="Values for each --over, in order: a list 0,10,20 or from:to:step. Default: the usual ones.",
+    grid: list[str] | None = typer.Option(
+        None, help="Values of each --over in order: 0,10,20 or from:to:step. Default: the usual ones."
     ),
     condition: list[str] = typer.Option(
         ["6g"], help="Operating point that is varied, or a change of one: 6g:on_demand=true. Repeatable."
     ),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel's luck. Default: the run's."),
+    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
     latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
     proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
     out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
-    as_json: bool = typer.Option(False, "--json", help="Print the summary as JSON."),
-    quiet: bool = typer.Option(False, "--quiet", help=QUIET),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    """Play stored answers at other operating points. No model is asked, but for ego-prompt."""
-    from harness.cli.evaluate import parse_seeds
-    from harness.cli.progress import bar
-    from harness.core.errors import UserError, printable, unknown
-    from harness.evaluate.again import Asking
+    """Score stored answers at other operating points. Needs no model, except for ego-prompt."""
     from harness.studies.axes import axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
@@ -54,57 +51,52 @@ def sweep(
     from harness.studies.stored import Stored
     from harness.studies.sweep import run_sweep, settings, usual
 
-    axes = [axis_of(name) for name in dict.fromkeys(over)]
-    if len(grid) > len(axes):
-        raise UserError(f"--grid: {len(grid)} given for {len(axes)} of --over; give one for each, in order")
+    axes = [axis_of(name) for name in dict.fromkeys(over or ())]
+    given: list[str | None] = [*(grid or ())]
+    if len(given) > len(axes):
+        raise UserError(f"--grid: {len(given)} given for {len(axes)} of --over; give one for each, in order")
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
-    grids = [values_of(axis, text) for axis, text in zip(axes, [*grid, *[None] * len(axes)], strict=False)]
-    runs_read = [Stored(run, latency) for run in runs]
-    conditions = list(dict.fromkeys(condition))
-    panels = {
-        axis.name: settings(runs_read, axis, values, conditions)
-        for axis, values in zip(axes, grids, strict=True)
-    } or usual(runs_read, conditions)
-    luck = parse_seeds(seeds) if seeds else runs_read[0].seeds
-    where = out or runs[0] / f"sweep-{'-'.join(panels)}"
-    points = [setting for panel in panels.values() for setting in panel]
-    with bar("asking with messages", 0, quiet=as_json or quiet) as asked:
-        for run in runs_read:
-            run.prepare(points, luck, Asking(asked.more, asked))
-    sources: list[Source] = [*runs_read, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
-    with bar("grid points", len(sources) * len(points), quiet=as_json or quiet) as progress:
-        summary = run_sweep(sources, panels, luck, where, progress)
+    grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
+    conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
+    with bar("grid points", 0, silent) as progress:
+        stored = [Stored(run, latency, progress.more, progress) for run in runs]
+        panels = {
+            axis.name: settings(stored, axis, values, conditions)
+            for axis, values in zip(axes, grids, strict=True)
+        } or usual(stored, conditions)
+        draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        where = out or runs[0] / f"sweep-{'-'.join(panels)}"
+        sources: list[Source] = [*stored, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
+        progress.more(len(sources) * sum(map(len, panels.values())))
+        summary = run_sweep(sources, panels, draws, where, progress)
     if as_json:
         typer.echo(summary.to_json(orient="records"))
-    if as_json or quiet:
-        return
-    tables(summary)
-    typer.echo(f"wrote {printable(where / 'sweep.svg')}")
+    if not silent:
+        tables(summary)
+        typer.echo(f"wrote {printable(where / 'sweep.svg')}")
 
 
 def tables(summary: "pd.DataFrame") -> None:
-    """A study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
-    from harness.cli.estimates import interval
-    from harness.core.errors import printable
-    from harness.studies.setting import CORE
+    """Print a study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
+    from harness.studies.axes import CORE
 
     heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
-    shown = ""
+    above = ""
     for place, rows in summary.groupby(["source", "panel", "condition", "value"], sort=False, dropna=False):
         source, panel, condition, value = place
         title = f"{printable(source)}" + ("" if panel == CORE else f" · {printable(condition)} over {panel}")
-        if title != shown:
-            typer.echo(f"{title}\n{'condition' if panel == CORE else panel:<14}{heads}")
-            shown = title
+        if title != above:
+            typer.echo(f"{title}\n{'condition' if panel == CORE else panel:<{LABEL}}{heads}")
+            above = title
         # Over episodes, but where a seed has episodes of its own.
         of = {str(row["metric"]): row for row in sorted(rows.to_dict("records"), key=_over_episodes)}
         success = of["success_rate"]
         text = interval(success["mean"], success["ci_low"], success["ci_high"], 100)
-        at = condition if panel == CORE else value if isinstance(value, str) else f"{value:g}"
         cells = "".join(f"{scale * of[metric]['mean']:>11.1f}" for _, metric, scale in COLUMNS)
-        label = printable(at) if len(str(at)) < 14 else f"{printable(at)}\n"
-        typer.echo(f"{label}{text:>{36 - len(label) if len(label) < 14 else 36}}{cells}")
+        at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
+        label = f"{printable(at):<{LABEL}}" if len(at) < LABEL else f"{printable(at)}\n{'':<{LABEL}}"
+        typer.echo(f"{label}{text:>22}{cells}")
 
 
 def _over_episodes(row: dict[Any, Any]) -> bool:

@@ -1,22 +1,20 @@
-"""`harness video`: a driven episode as a moving picture."""
+"""`harness video`: an episode of a closed-loop run as a video."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from harness.cli.progress import bar
+
 
 def command(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished live run.")],
-    episode: Annotated[int, typer.Argument(help="Number of the episode.")],
-    condition: Annotated[str | None, typer.Option(help="Operating point. Default: the run's last.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Channel seed. Default: the run's first.")] = None,
-    out: Annotated[Path, typer.Option(help="File to write: .gif, or .mp4 with the extra `video`.")] = Path(
-        "episode.gif"
-    ),
+    run: Path = typer.Argument(help="Folder of a finished run of `harness drive`."),
+    episode: int = typer.Argument(help="Number of the episode."),
+    condition: str | None = typer.Option(None, help="Operating point. Default: the run's last."),
+    seed: int | None = typer.Option(None, help="Channel seed. Default: the run's first."),
+    out: Path = typer.Option(Path("episode.gif"), help="File: .gif, or .mp4 with the extra `video`."),
 ) -> None:
-    """Play a driven episode again and draw it from above: sight, messages on their way, the ego's policy."""
-    from harness.cli.progress import bar
+    """Draw an episode of a closed-loop run as a video. Shows sight, messages and the ego's policy."""
     from harness.evaluate.replay import find, stills
     from harness.report.drawing.video import check, write_video
 
@@ -32,22 +30,20 @@ def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:
 
     They are written to the run's `videos`, the best kind that can be written here; returns the files.
     """
-    from harness.cli.progress import bar
     from harness.evaluate.replay import played
     from harness.report.drawing.video import formats, write_video
-    from harness.runs.driven_folder import read
+    from harness.runs.folder import read
 
-    found = read(run)
-    last, seeds = found.conditions[-1], found.config["seeds"]
+    driven = read(run)
+    last = driven.conditions[-1]
     failed: dict[int, int] = {}
-    for episode in range(found.config["episodes"]):
-        wrong = [seed for seed in seeds if found.ends[last, seed, episode]["result"] != "cleared"]
-        if wrong and len(failed) < most:
-            failed[episode] = wrong[0]
+    for ended in sorted(driven.episodes, key=lambda ended: ended.episode):
+        if ended.condition == last and not ended.success and len(failed) < most:
+            failed.setdefault(ended.episode, ended.seed)
     files = []
     with bar("drawing failed episodes", len(failed), quiet) as progress:
         for episode, seed in failed.items():
             files.append(run / "videos" / f"{episode:05d}-seed{seed}{formats()[-1]}")
-            write_video(played(found, episode, last, seed), files[-1], lambda done: None)
+            write_video(played(driven, episode, last, seed), files[-1], lambda done: None)
             progress(1)
     return files

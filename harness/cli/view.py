@@ -5,14 +5,15 @@ from threading import Thread
 
 import typer
 
+from harness.cli import options
 
-def view(
-    folder: Path = typer.Argument(Path("reports"), metavar="DIR", help="Folder that holds them."),
+
+def command(
+    folder: options.Reports = Path("reports"),
     port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 takes a free one."),
     open_browser: bool = typer.Option(False, "--open", help="Open it in the browser."),
 ) -> None:
-    """Show runs, sweeps and studies in a browser on this machine: list, open, compare. Ctrl-C ends it."""
-    from harness.cli.estimates import in_range
+    """Show runs and studies in a browser: list, open, compare. Serves this machine only, until Ctrl-C."""
     from harness.report.view.serve import serve
     from harness.runs.listing import runs
 
@@ -23,7 +24,7 @@ def view(
 
             Thread(target=webbrowser.open, args=[url], daemon=True).start()
 
-    in_range("--port", port, 0, 65535)
+    options.in_range("--port", port, 0, 65535)
     runs(folder)  # says what is wrong with the folder
     try:
         serve(folder, port, listening)

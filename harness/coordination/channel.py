@@ -1,17 +1,21 @@
 """The V2V channel: which replies cross it, and when they have arrived.
 
-The profiles are the paper's declared assumptions, not link budgets: nothing here was measured on a
-radio. A consultation is a round trip, so the request and the reply must both cross. Fading is block
-fading when the caller passes the same uniforms for every step of an episode: a blocked link then
-stays blocked.
+A channel is a frozen record with one method. The two built in are the paper's declared assumptions, not link
+budgets: nothing here was measured on a radio. A consultation is a round trip, so the request and the reply
+must both cross. Fading is block fading when the caller passes the same uniforms for every step of an episode:
+a blocked link then stays blocked.
+
+A new profile is an entry of `CHANNELS`; a new model is a class with `deliver`. A package adds either by an
+entry point in the group `swarmdrive.channels`.
 """
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import Field, dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.plugins import Plugins
 
 
 @dataclass(frozen=True)
@@ -33,41 +37,88 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class Profile:
-    """How one radio behaves.
+class Links:
+    """What a channel may need to know of the links between the ego and its helpers.
 
     Attributes:
-        name: what operating points call it.
+        asked: who was asked, `(..., H)`. What is said of the others may be anything, NaN included.
+        ready_s: seconds from the request until the helper has its answer, `(..., H)`; 0 if it waits.
+        range_m: ego-helper distance, `(..., H)`.
+        payload_bits: size of the reply, `(..., H)`.
+        in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
+        rounds: which of these open a round of their own, `(..., H)`.
+    """
+
+    asked: Bools
+    ready_s: Floats
+    range_m: Floats
+    payload_bits: Floats
+    in_radius: Bools
+    rounds: Bools
+
+
+class Delivery(NamedTuple):
+    """What a channel does to the replies.
+
+    Attributes:
+        up: request and reply cross, `(..., H)`; anything where not asked.
+        delay_s: seconds from the request to the end of the reply's slot, `(..., H)`; inf where not asked. A
+            lost reply keeps its slot.
+        loss: probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` where all
+            links have the same.
+    """
+
+    up: Bools
+    delay_s: Floats
+    loss: Floats
+
+
+@runtime_checkable
+class Channel(Protocol):
+    """A frozen dataclass. The operating point's overrides replace the fields of these names."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """What happens to the request and the reply of each link."""
+
+
+@dataclass(frozen=True)
+class Radio:
+    """A channel with a nominal latency and one loss for all links.
+
+    Attributes:
         latency_s: nominal seconds of one exchange, the request included, without serialisation.
-        loss: probability that one crossing (request or reply) is lost.
+        loss: probability that one crossing is lost. Where helpers open rounds of their own, the loss under
+            so many active vehicles, if that is larger.
         bandwidth_bps: bits per second while a reply is on air.
         access: `serial`, replies share one medium and are served one after another, so that the k-th
             pays k slots; `parallel`, all replies are on air at once.
         jitter_s: largest extra delay of a reply; the delay is uniform in [0, jitter_s).
+        density_coupled: the loss follows from the vehicles in the radius, the ego included, asked or not.
+        roadside_edge: replies also travel over a roadside edge node, in a second hop as long as the first.
+            The two paths are declared independent. Requests are direct.
     """
 
-    name: str
     latency_s: float
     loss: float
     bandwidth_bps: float
     access: Literal["serial", "parallel"]
     jitter_s: float
+    density_coupled: bool = False
+    roadside_edge: bool = False
 
-
-PROFILES = {
-    profile.name: profile
-    for profile in (
-        Profile("v2x", latency_s=0.025, loss=0.08, bandwidth_bps=10e6, access="serial", jitter_s=0.0),
-        # Jitter is declared, not measured: the slowest of three replies waits 3/4 of it on average, which
-        # puts the mean decision at 145 + 5 + 1.4 = 151.4 ms, the paper's figure.
-        Profile("6g", latency_s=0.005, loss=0.012, bandwidth_bps=200e6, access="parallel", jitter_s=0.0019),
-    )
-}
-
-# A vehicle without a radio: no comparison with a NaN loss holds, so nothing ever crosses.
-NO_CHANNEL = Profile(
-    "none", latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0
-)
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""
+        active = links.in_radius if self.density_coupled else links.rounds
+        loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
+        loss = loss if self.density_coupled else np.maximum(self.loss, loss)
+        slot_s = (2 if self.roadside_edge else 1) * (self.latency_s + links.payload_bits / self.bandwidth_bps)
+        slot_s = np.where(links.asked, slot_s + self.jitter_s * draws.jitter, 0.0)
+        ready_s = np.where(links.asked, links.ready_s, np.inf)
+        serial = self.access == "serial"
+        delay_s = served_s(ready_s, slot_s, links.range_m) if serial else ready_s + slot_s
+        return Delivery(link_up(draws.link, loss, self.roadside_edge), delay_s, loss)
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
@@ -84,51 +135,35 @@ def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bool
 
     Args:
         uniforms: draws in [0, 1), `(..., H, 2)`: the request's and the reply's.
-        loss: probability that one crossing is lost, `(...)`.
-        roadside_edge: replies also travel over a roadside edge node. The two paths are declared
-            independent, so a reply is lost with probability loss^2. Requests are direct.
+        loss: probability that one crossing is lost, `(..., H)` or `(..., 1)`.
+        roadside_edge: a reply has a second path, and so is lost with probability loss^2.
     """
-    per_helper = np.asarray(loss)[..., None]
-    request_up = uniforms[..., 0] >= per_helper
-    reply_up = uniforms[..., 1] >= (per_helper**2 if roadside_edge else per_helper)
-    return request_up & reply_up
+    return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))
 
 
-def reply_delay_s(
-    profile: Profile,
-    asked: Bools,
-    ready_s: Floats,
-    range_m: Floats,
-    payload_bits: Floats,
-    jitter_uniforms: Floats,
-    roadside_edge: bool = False,
-) -> Floats:
-    """Seconds from the request to the end of each reply's slot, `(..., H)`; inf where not asked.
-
-    A slot is kept whether or not its reply gets through. On a serial medium slots go to whoever is ready
-    first, the nearest first among equals, so a slow helper holds nobody up.
-
-    Args:
-        profile: the radio.
-        asked: who was asked, `(..., H)`. The other arguments may hold anything where nobody was.
-        ready_s: seconds from the request until the helper has its answer, `(..., H)`, 0 if it waits.
-        range_m: ego-helper distance, `(..., H)`.
-        payload_bits: size of the reply, `(..., H)`.
-        jitter_uniforms: draws in [0, 1), `(..., H)`.
-        roadside_edge: a reply takes a second hop over a roadside edge node, as long as the first.
-    """
-    hops = 2 if roadside_edge else 1
-    slot_s = hops * (profile.latency_s + payload_bits / profile.bandwidth_bps)
-    slot_s = np.where(asked, slot_s + profile.jitter_s * jitter_uniforms, 0.0)
-    ready_s = np.where(asked, ready_s, np.inf)
-    if profile.access == "parallel":
-        return ready_s + slot_s
+def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
+    """When each slot `(..., H)` on a serial medium ends: first come, first served; of equals, the nearest."""
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)
     busy_s = np.cumsum(served_slot_s, axis=-1)
     # A slot starts when the one before it ends or its helper is ready, whichever is later: the end of
     # slot k is the largest, over j <= k, of ready_j plus the slots j..k.
     waits_s = np.take_along_axis(ready_s, order, axis=-1) - (busy_s - served_slot_s)
-    delay_s = np.empty_like(busy_s)
-    np.put_along_axis(delay_s, order, busy_s + np.maximum.accumulate(waits_s, axis=-1), axis=-1)
-    return delay_s
+    end_s = np.empty_like(busy_s)
+    np.put_along_axis(end_s, order, busy_s + np.maximum.accumulate(waits_s, axis=-1), axis=-1)
+    return end_s
+
+
+CHANNELS: Plugins[Channel] = Plugins(
+    "swarmdrive.channels",
+    Channel,
+    {
+        "v2x": Radio(latency_s=0.025, loss=0.08, bandwidth_bps=10e6, access="serial", jitter_s=0.0),
+        # Jitter is declared, not measured: the slowest of three replies waits 3/4 of it on average, which
+        # puts the mean decision at 145 + 5 + 1.4 = 151.4 ms, the paper's figure.
+        "6g": Radio(latency_s=0.005, loss=0.012, bandwidth_bps=200e6, access="parallel", jitter_s=0.0019),
+    },
+)
+
+# A vehicle without a radio: no comparison with a NaN loss holds, so nothing ever crosses.
+NO_CHANNEL = Radio(latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0)

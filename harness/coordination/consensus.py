@@ -1,14 +1,85 @@
 """How intents become one policy. Vehicle 0 is the ego and is always heard.
 
-A new rule is one function of (p, weights) and one entry in `RULES`. `ego-prompt` is no rule: the ego's model
-is asked again, with the messages in its prompt (the paper's section III-C).
+A rule without memory is one function of (p, weights) and one entry in `POOLS`; a rule with memory is a class
+with `start` and `fuse`. A package adds either, the function wrapped by `Pool`, by an entry point in the group
+`swarmdrive.rules`. `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its
+prompt (the paper's section III-C).
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
+from harness.core.plugins import Plugins
+
+
+@dataclass(frozen=True)
+class Messages:
+    """What an ego has to fuse. A message's sender is its place: 0 is the ego, 1+h is helper h.
+
+    Attributes:
+        intents: what each vehicle intends, `(..., 1+H, A)`; a row that is not heard may hold anything.
+        weights: paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard.
+        heard: which replies came in time, `(..., H)`.
+        arrival_s: when, from the start of the decision, `(..., H)`: the message's age, for every vehicle saw
+            the scene at 0. inf where lost or not asked.
+        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
+        range_m: distance to the ego, `(..., H)`.
+    """
+
+    intents: Floats
+    weights: Floats
+    heard: Bools
+    arrival_s: Floats
+    distance_m: Floats
+    range_m: Floats
+
+
+class Fused(NamedTuple):
+    """What a rule makes of messages.
+
+    Attributes:
+        policy: `(..., A)`, each a distribution.
+        weights: each vehicle's weight in it, `(..., 1+H)`; NaN where there is no such thing.
+        state: what the rule remembers at the next step, `(..., K)`; K may be 0.
+    """
+
+    policy: Floats
+    weights: Floats
+    state: Floats
+
+
+@runtime_checkable
+class Rule(Protocol):
+    """A pure function of arrays, with a memory of its own for each episode.
+
+    Steps of an episode are fused in order, each from the state that the last one left, those in which the ego
+    hears nobody as well. In those it acts on its own intent, whatever the rule says.
+    """
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
+        """What the rule remembers before the first step of episodes `batch`, `(*batch, K)`."""
+
+    def fuse(self, messages: Messages, state: Floats) -> Fused:
+        """The policy of one step of each episode."""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The rule that remembers nothing: what was heard goes through a function of (p, weights)."""
+
+    pool: Callable[[Floats, Floats], Floats]
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
+        """Nothing."""
+        return np.zeros((*batch, 0))
+
+    def fuse(self, messages: Messages, state: Floats) -> Fused:
+        """Whatever the state."""
+        return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
@@ -94,11 +165,11 @@ def _scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))
 
 
-RULES: dict[str, Callable[[Floats, Floats], Floats]] = {
-    "linear": linear_pool,
-    "log-pool": log_pool,
-    "median": median,
-    "trimmed-mean": trimmed_mean,
-}
+POOLS = {"linear": linear_pool, "log-pool": log_pool, "median": median, "trimmed-mean": trimmed_mean}
+RULES: Plugins[Rule] = Plugins("swarmdrive.rules", Rule, {name: Pool(pool) for name, pool in POOLS.items()})
 EGO_PROMPT = "ego-prompt"
-NAMES = (*RULES, EGO_PROMPT)
+
+
+def names() -> tuple[str, ...]:
+    """What an operating point's `consensus` may be."""
+    return (*RULES, EGO_PROMPT)

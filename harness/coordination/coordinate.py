@@ -1,9 +1,9 @@
 """One cooperative decision, from seeing to acting, for any number of scenes at once.
 
 First the exchange of messages (its timeline is in `exchange.py`), then fusion: a consensus rule is
-arithmetic and takes no time; `ego-prompt` makes a fusion call, which asks the ego's model once more after
-the exchange, and the decision takes that much longer. An ego that has heard nobody acts on its own intent
-at once.
+arithmetic and takes no time; `ego-prompt` makes a fusion call: after the exchange the ego's model answers
+with the messages, and the decision takes that much longer. An ego that has heard nobody acts on its own
+intent at once.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from harness.coordination.channel import Draws
-from harness.coordination.consensus import RULES, inverse_distance_weights
+from harness.coordination.consensus import EGO_PROMPT, RULES, Messages, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -21,6 +21,20 @@ from harness.core.arrays import Bools, Floats, Ints
 # Who was heard, `(..., H)`, to the answer of the fusion call: the ego's intent `(..., A)`, where it failed or
 # nobody was heard NaN, and the seconds `(...)` it took.
 FusionCall = Callable[[Bools], tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """What fusion needs beyond the messages.
+
+    Attributes:
+        call: the fusion call; needed where the point's consensus is `ego-prompt`.
+        state: what the rule remembers of each decision's episode, `(..., K)`: `Coordination.state` of the
+            episode's last step. None at the first step.
+    """
+
+    call: FusionCall | None = None
+    state: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,7 @@ class Coordination(Exchange):
         latency_s: when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`.
             NaN where the ego's time of inference is unknown.
         deadline_missed: that was after the window, `(...)`.
+        state: what the rule remembers at the episode's next step, `(..., K)`; K is 0 without memory.
     """
 
     weights: Floats
@@ -44,6 +59,7 @@ class Coordination(Exchange):
     fusion_failed: Bools
     latency_s: Floats
     deadline_missed: Bools
+    state: Floats
 
     @property
     def fusion_s(self) -> Floats:
@@ -52,39 +68,42 @@ class Coordination(Exchange):
 
 
 def coordinate(
-    point: OperatingPoint, intents: Intents, draws: Draws, fusion_call: FusionCall | None = None
+    point: OperatingPoint, intents: Intents, draws: Draws, fusion: Fusion | None = None
 ) -> Coordination:
-    """Trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each.
-
-    A point whose consensus is `ego-prompt` needs `fusion_call`.
-    """
-    return fuse(point, exchange(point, intents, draws), intents, fusion_call)
+    """Trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each."""
+    return fuse(point, exchange(point, intents, draws), intents, fusion)
 
 
 def fuse(
-    point: OperatingPoint, heard: Exchange, intents: Intents, fusion_call: FusionCall | None = None
+    point: OperatingPoint, heard: Exchange, intents: Intents, fusion: Fusion | None = None
 ) -> Coordination:
     """The policy of each decision, once it is known who was heard; arguments as in `coordinate`."""
+    fusion = fusion or Fusion()
+    p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     weights = inverse_distance_weights(intents.distance_m, heard.on_time, point.min_distance_m)
     anybody = np.any(heard.on_time, axis=-1)
-    latency_s, fusion_failed = heard.exchange_s, np.zeros_like(heard.own_failed)
-    if point.consensus in RULES:
-        p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
-        fused = RULES[point.consensus](p, weights)
-    else:
-        if fusion_call is None:
+    latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
+    if point.consensus == EGO_PROMPT:
+        if fusion.call is None:
             raise ValueError(f"consensus {point.consensus} needs a fusion call")
-        fused, seconds = fusion_call(heard.on_time)
-        fusion_failed = anybody & np.any(np.isnan(fused), axis=-1)
+        fused, seconds = fusion.call(heard.on_time)
+        failed = anybody & np.any(np.isnan(fused), axis=-1)
         weights = np.where(anybody[..., None], np.nan, weights)
         latency_s = latency_s + np.where(anybody, seconds, 0.0)
-    fused = np.where((anybody & ~fusion_failed)[..., None], fused, heard.own)
+        state = np.zeros((*failed.shape, 0))
+    else:
+        rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
+        messages = Messages(p, weights, heard.on_time, heard.arrival_s, intents.distance_m, intents.range_m)
+        state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
+        fused, weights, state = rule.fuse(messages, state)
+    fused = np.where((anybody & ~failed)[..., None], fused, heard.own)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,
         fused=fused,
         action=np.argmax(fused, axis=-1),
-        fusion_failed=fusion_failed,
+        fusion_failed=failed,
         latency_s=np.where(np.isnan(intents.inference_s[..., 0]), np.nan, latency_s),
         deadline_missed=latency_s > point.window_s,
+        state=state,
     )

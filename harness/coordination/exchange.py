@@ -18,24 +18,17 @@ The paper counts the whole exchange as the decision's latency even when it outla
 does this. Everything here is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from harness.coordination.channel import (
-    NO_CHANNEL,
-    PROFILES,
-    Draws,
-    Profile,
-    density_coupled_loss,
-    link_up,
-    reply_delay_s,
-)
+from harness.coordination.channel import Draws, Links
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.statistics import known_mean
 
 
 @dataclass(frozen=True)
@@ -48,7 +41,8 @@ class Exchange:
         entropy_nats: entropy of `own`, `(...)`.
         triggered: the entropy is above tau and the point has a channel, `(...)`.
         asked: helpers asked, each a scheduled reply, `(..., H)`.
-        loss: probability that one crossing was lost, `(...)`; NaN without a channel.
+        loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
+            asked, where links differ; NaN without a channel.
         delivered: asked, and request and reply crossed, `(..., H)`.
         arrival_s: end of the reply, `(..., H)`; inf where lost or not asked.
         on_time: arrived within the window, so fused, `(..., H)`.
@@ -94,9 +88,6 @@ class Exchange:
 
 def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     """Trigger and channel for decisions `(...)` with up to H helpers. An unknown time counts as none."""
-    profile = NO_CHANNEL if point.profile is None else PROFILES[point.profile]
-    if point.profile is not None and point.latency_s is not None:
-        profile = replace(profile, latency_s=point.latency_s)
     own_failed = np.any(np.isnan(intents.own), axis=-1)
     fallback = fallback_intent(point.fallback, intents.own.shape[-1])
     own = np.where(own_failed[..., None], fallback, intents.own)
@@ -106,15 +97,13 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     in_radius = intents.valid & (intents.range_m <= point.radius_m)
     asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
     unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
-    loss = crossing_loss(point, profile, in_radius, unsure)
-    delivered = asked & link_up(draws.link, loss, point.roadside_edge)
 
-    inference_s = np.nan_to_num(intents.inference_s)
+    inference_s = np.where(np.isnan(intents.inference_s), 0.0, intents.inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
     ready_s = helpers_s if point.on_demand else np.maximum(helpers_s - request_s, 0.0)
-    delay_s = reply_delay_s(
-        profile, asked, ready_s, intents.range_m, intents.payload_bits, draws.jitter, point.roadside_edge
-    )
+    links = Links(asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure)
+    up, delay_s, loss = point.channel().deliver(links, draws)
+    delivered = asked & up
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)
     ends_s = np.where(asked, slot_end_s, request_s)
@@ -124,7 +113,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         entropy_nats=entropy,
         triggered=asks,
         asked=asked,
-        loss=loss,
+        loss=loss[..., 0] if loss.shape[-1] == 1 else known_mean(np.where(asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,
         on_time=arrival_s <= point.window_s,
@@ -147,19 +136,3 @@ def nearest(candidates: Bools, range_m: Floats, most: int) -> Bools:
     order = np.argsort(np.where(candidates, range_m, np.inf), axis=-1, kind="stable")
     rank = np.argsort(order, axis=-1, kind="stable")
     return candidates & (rank < most)
-
-
-def crossing_loss(point: OperatingPoint, profile: Profile, in_radius: Bools, unsure: Bools) -> Floats:
-    """Probability that one crossing is lost, `(...)`: the point's, the swarm's or the profile's.
-
-    Under density coupling every valid helper in the radius `(..., H)` is an active vehicle, asked or
-    not, and so is the ego. Where helpers open rounds of their own, those that are unsure `(..., H)` are
-    active beside the ego, and the loss is that of so many if it is the larger.
-    """
-    if point.profile is not None and point.density_coupled:
-        return density_coupled_loss(1 + np.sum(in_radius, axis=-1))
-    overridden = point.profile is not None and point.loss is not None
-    loss = np.full(in_radius.shape[:-1], point.loss if overridden else profile.loss)
-    if point.profile is not None and point.helper_rounds:
-        loss = np.maximum(loss, density_coupled_loss(1 + np.sum(in_radius & unsure, axis=-1)))
-    return loss

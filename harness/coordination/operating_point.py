@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from harness.coordination.channel import PROFILES
-from harness.coordination.consensus import EGO_PROMPT, NAMES
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel
+from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 
 FALLBACKS = ("uniform", "brake")
+OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
 _LARGEST = sys.float_info.max
 
 
@@ -32,7 +33,7 @@ class OperatingPoint:
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
-        roadside_edge: replies travel over a roadside edge node as well (`channel.link_up`).
+        roadside_edge: replies travel over a roadside edge node as well (`channel.Radio`).
         on_demand: a helper infers when it is asked, and not in parallel with the ego.
     """
 
@@ -55,12 +56,12 @@ class OperatingPoint:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
-        if self.profile is not None and str(self.profile) not in PROFILES:
-            raise unknown("channel profile", str(self.profile), PROFILES, "; leave it out to disable V2V")
+        if self.profile is not None and str(self.profile) not in CHANNELS:
+            raise unknown("channel profile", str(self.profile), CHANNELS, "; leave it out to disable V2V")
         if self.fallback not in FALLBACKS:
             raise unknown("fallback", str(self.fallback), FALLBACKS)
-        if str(self.consensus) not in NAMES:
-            raise unknown("consensus", str(self.consensus), NAMES)
+        if str(self.consensus) not in RULES and self.consensus != EGO_PROMPT:
+            raise unknown("consensus", str(self.consensus), names())
         self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
         self._number("window_s", "seconds above 0")
         self._number("radius_m", "metres above 0")
@@ -76,6 +77,7 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+        self.channel()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
@@ -91,9 +93,23 @@ class OperatingPoint:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
+    def channel(self) -> Channel:
+        """The profile's, with the point's overrides. Raises UserError for one that the profile has not."""
+        if self.profile is None:
+            return NO_CHANNEL
+        profile = CHANNELS[self.profile]
+        settings = {key: getattr(self, key) for key in OVERRIDES}
+        overrides = {
+            key: value for key, value in settings.items() if value is not None and value is not False
+        }
+        for key in overrides:
+            if key not in {field.name for field in fields(profile)}:
+                raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
+        return replace(profile, **overrides)
+
     @property
     def asks_again(self) -> bool:
-        """Whether the ego's model merges the messages, and so is asked a second time."""
+        """Whether fusion asks the ego's model a second time, with the messages."""
         return self.profile is not None and self.consensus == EGO_PROMPT
 
     def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
@@ -123,11 +139,13 @@ POINTS = {
 def named_point(text: str) -> OperatingPoint:
     """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
 
-    The text is its name. Raises UserError if there is no such point or setting, or a value is not allowed.
+    Every channel profile of a package is a point of the profile's name, with the defaults. The text is the
+    point's name. Raises UserError if there is no such point or setting, or a value is not allowed.
     """
     name, colon, settings = text.partition(":")
-    if name not in POINTS:
-        raise unknown("operating point", name, POINTS)
+    if name not in POINTS and name not in CHANNELS:
+        raise unknown("operating point", name, {*POINTS, *CHANNELS})
+    point = POINTS.get(name) or OperatingPoint(name, name)
     changed: dict[str, Any] = {}
     for setting in settings.split(",") if colon else ():
         key, _, value = setting.partition("=")
@@ -135,15 +153,16 @@ def named_point(text: str) -> OperatingPoint:
             raise unknown(f"setting of operating point {name}", key, SETTINGS, f"; as in {name}:window_s=0.3")
         if key in changed:
             raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
-        changed[key] = _value(getattr(POINTS[name], key), value)
-    return replace(POINTS[name], name=text, **changed) if changed else POINTS[name]
+        changed[key] = setting_of(key, value)
+    return replace(point, name=text, **changed) if changed else point
 
 
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
 
 
-def _value(usual: object, text: str) -> object:
+def setting_of(key: str, text: str) -> object:
     """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
+    usual = getattr(POINTS["6g"], key)
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
     if isinstance(usual, str):

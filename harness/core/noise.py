@@ -1,7 +1,7 @@
 """Random draws keyed by content.
 
-A draw depends on what it is for (run seed, scene, link), never on when it was made, so order, batch
-size, workers and a resume cannot change it, and two operating points see the same luck.
+A draw depends on its purpose (run seed, scene, link), never on when it is made, so order, batch size,
+workers and a resume cannot change it, and two operating points share their draws.
 """
 
 import hashlib

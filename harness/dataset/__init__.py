@@ -1,1 +1,1 @@
-"""Frozen datasets: scenes taken out of the simulator, with what every action leads to."""
+"""Frozen datasets: scenes taken out of the simulator, with where every action leads."""

@@ -1,8 +1,8 @@
 """Freezing an episode: one record a decision point, with an outcome table for look-up later.
 
 The behaviour that leads the ego through is declared and varied (`Behaviour`): it drives as `cruise` or
-`local-view`, now and then takes a random action, and is only stopped at the last moment. Where its action
-would end badly, the best safe action is taken instead and `full-view` drives on. So every episode comes as
+`local-view`, now and then takes a random action, and a guard stops it at the last instant: where its action
+would end badly, it takes the best safe action instead and `full-view` drives on. So every episode comes as
 close to failure as that behaviour gets, and still has all its decision points.
 """
 
@@ -12,23 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph
 from harness.world.reference import decide, finish
-from harness.world.road import JUNCTION_M, LANE_WIDTH_M, conflict_zone
+from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
 Record = dict[str, Any]
-
-ROAD = {
-    "kind": "four-way intersection",
-    "lane_width_m": LANE_WIDTH_M,
-    "junction_m": JUNCTION_M,
-    "ego": "own/straight",
-}
 
 
 @dataclass(frozen=True)
@@ -44,13 +37,13 @@ class Behaviour:
     random_share: float = 0.1
 
 
-def freeze(seed: int, episode: int, behaviour: Behaviour) -> list[Record]:
+def freeze(scenario: Scenario, seed: int, episode: int, behaviour: Behaviour) -> list[Record]:
     """Every decision point of one episode."""
-    world = World.start(seed)
-    chance = luck.generator("behaviour", seed)
+    world = World.start(scenario, seed)
+    chance = noise.generator("behaviour", seed)
     driver = "cruise" if chance.random() < behaviour.cruise_share else "local-view"
     records = []
-    while not world.outcome.ended and world.step < world.env.parameters.decisions:
+    while not world.outcome.ended and world.step < scenario.parameters.decisions:
         outcomes = {action: rollout(world, action) for action in world.actions}
         action, reason = decide(driver, world), driver
         if chance.random() < behaviour.random_share:
@@ -79,7 +72,7 @@ def _record(world: World, episode: int, outcomes: dict[str, Outcome], behaviour:
     state = world.state()
     return {
         **moment(world, state, episode, (state.ego, *state.helpers)),
-        "road": ROAD,
+        "road": world.scenario.road().facts,
         "behaviour": behaviour,
         "outcomes": {action: _row(outcome) for action, outcome in outcomes.items()},
         "snapshot": world.snapshot(),
@@ -88,15 +81,15 @@ def _record(world: World, episode: int, outcomes: dict[str, Outcome], behaviour:
 
 def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
     """What is there at a decision point, and what the viewers see of it; the ego is the first of them."""
-    zone = conflict_zone()
+    zone = world.scenario.road().zone_m
     return {
         "scene": f"{episode:05d}-{state.step}",
         "episode": episode,
         "episode_seed": world.seed,
         "step": state.step,
-        "danger": {"sector": world.env.layout.danger, "vehicle": world.env.layout.danger_id},
+        "danger": {"sector": world.layout.danger, "vehicle": world.layout.danger_id},
         "state": state.to_dict(),
-        "graphs": {v.id: scene_graph(state, v.id) for v in viewers},
+        "graphs": {v.id: scene_graph(world.scenario, state, v.id) for v in viewers},
         "distance_m": {v.id: round(float(np.hypot(v.x_m - zone[0], v.y_m - zone[1])), 3) for v in viewers},
     }
 

@@ -5,7 +5,7 @@ import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,10 @@ from harness.core.files import canonical_json
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
+from harness.dataset.schema import Manifest
 from harness.dataset.verify import file_problems, read_manifest, records, released
+from harness.world import scenarios
+from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 
 
@@ -60,19 +63,34 @@ class Dataset:
     """
 
     path: Path
-    manifest: dict[str, Any]
+    manifest: Manifest
     sha256: str
     scenes: tuple[Scene, ...]
 
     @property
     def name(self) -> str:
         """Name in the manifest."""
-        return str(self.manifest["name"])
+        return self.manifest.name
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What was frozen."""
+        return scenarios.get(self.manifest.scenario)
 
     @property
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
-        return tuple(self.manifest["actions"])
+        return tuple(self.manifest.actions)
+
+    @property
+    def delay_allowance_s(self) -> float:
+        """Needless delay that an episode is forgiven."""
+        return cast(float, self.manifest.parameters["delay_allowance_s"])
+
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """Numbers of the episodes."""
+        return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
 
     def scene(self, scene_id: str) -> Scene:
         """The scene of that id."""

@@ -1,216 +1,296 @@
-"""JSON Schemas of a frozen dataset: published beside it, enforced when it is built and checked."""
+"""The form of a frozen dataset: what its manifest and its decision points hold, and the JSON Schemas of both.
 
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+What is typed here is enforced when a dataset is built and read, and published beside it as JSON Schema.
+"""
+
+import re
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any
+from types import GenericAlias
+from typing import Annotated, Any, Literal
 
-from harness.world.road import APPROACHES, ROUTES, SECTORS
-from harness.world.scenarios.occluded_intersection import Parameters
-from harness.world.state import SIZES_M
+import msgspec
+from msgspec import Meta, field
 
-Schema = dict[str, Any]
+from harness.world.scenario import Scenario
+from harness.world.state import Kind, Part, indicator
 
-VEHICLE_ID = {"type": "string", "pattern": "^v[1-9][0-9]?$"}
 FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # of a dataset and of its files: never a path
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
+
 # No metre, second or share comes near these bounds; infinity and thousand-digit integers do not pass them.
-NUMBER = {"type": "number", "minimum": -1e6, "maximum": 1e6}
-NUMBER_OR_NULL = {**NUMBER, "type": ["number", "null"]}
-EPISODE = {"type": "integer", "minimum": 0, "maximum": LAST_EPISODE}
-SEED = {"type": "integer", "minimum": 0, "maximum": LAST_SEED + LAST_EPISODE}
-COUNT = {"type": "integer", "minimum": 0, "maximum": 1_000_000}
+Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Count = Annotated[int, Meta(ge=0, le=1_000_000)]
+Episode = Annotated[int, Meta(ge=0, le=LAST_EPISODE)]
+Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
+Text = Annotated[str, Meta(max_length=200)]
+FileName = Annotated[str, Meta(pattern=FILE_NAME)]
+Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 
 
-def _object(**properties: Any) -> Schema:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": sorted(properties),
-        "additionalProperties": False,
-    }
+class Closed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A record with these members and no other."""
 
 
-def _list(items: Any) -> Schema:
-    return {"type": "array", "items": items}
+class Vehicle(Closed, frozen=True):
+    """`harness.world.state.VehicleState` in a file."""
+
+    id: VehicleId
+    kind: Kind
+    part: Part
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
+    approach: str
+    route: str
+    crashed: bool
 
 
-def _enum(*values: Any) -> Schema:
-    return {"enum": list(values)}
+class Building(Closed, frozen=True):
+    """A box that blocks sight; its walls in metres."""
+
+    id: Annotated[str, Meta(pattern="^b[1-9]$")]
+    west_m: Number
+    north_m: Number
+    east_m: Number
+    south_m: Number
 
 
-_VEHICLE = _object(
-    id=VEHICLE_ID, kind=_enum(*SIZES_M), part=_enum("ego", "helper", "other"), x_m=NUMBER, y_m=NUMBER,
-    heading_rad=NUMBER, speed_mps=NUMBER, approach=_enum(*APPROACHES), route=_enum(*ROUTES),
-    crashed={"type": "boolean"},
-)  # fmt: skip
-_BUILDING = _object(
-    id={"type": "string", "pattern": "^b[1-9]$"}, west_m=NUMBER, north_m=NUMBER, east_m=NUMBER, south_m=NUMBER
-)
-_POINT = _object(forward_m=NUMBER, left_m=NUMBER)
-_ARRIVAL = {"arc_m": NUMBER, "time_s": NUMBER_OR_NULL}
-_GRAPH = _object(
-    viewer=VEHICLE_ID,
-    role=_enum("ego", "helper"),
-    step=COUNT,
-    self=_object(speed_mps=NUMBER, lane={"type": "string"}, zone_m=NUMBER),
-    ego=_object(
-        id=VEHICLE_ID, speed_mps=NUMBER, target_speed_mps=NUMBER, zone_m=NUMBER, forward_m=NUMBER,
-        left_m=NUMBER,
-    ),
-    nodes=_list(
-        _object(
-            id=VEHICLE_ID, type=_enum("vehicle", *SIZES_M), forward_m=NUMBER, left_m=NUMBER,
-            heading_deg=NUMBER_OR_NULL, speed_mps=NUMBER, range_rate_mps=NUMBER_OR_NULL,
-            lane={"type": "string"}, indicator=_enum("left", "off", None),
-            sensors=_list(_enum("camera", "lidar", "radar")),
-        )
-    ),
-    conflicts=_list(
-        _object(**{
-            "with": VEHICLE_ID, "sector": _enum(*SECTORS), "route": _enum(*ROUTES), "point": _POINT,
-            "ego": _object(**_ARRIVAL), "other": _object(**_ARRIVAL, speed_mps=NUMBER),
-        })
-    ),
-    sectors=_list(
-        _object(
-            sector=_enum(*SECTORS), seen_share=NUMBER, occluded={"type": "boolean"},
-            by=_list({"type": "string"}),
-        )
-    ),
-)  # fmt: skip
-_OUTCOME = _object(
-    result=_enum("cleared", "collision", "time_out", "off_road"),
-    time_s=NUMBER,
-    partner={"anyOf": [VEHICLE_ID, {"type": "null"}]},
-    striker=_enum("ego", "other", "both", "neither", None),
-    fault=_enum("ego", "other", None),
-    least_gap_m=NUMBER,
-    other_crashes=COUNT,
-)
+class State(Closed, frozen=True):
+    """`harness.world.state.WorldState` in a file."""
+
+    scenario: str
+    episode_seed: Seed
+    step: Count
+    time_s: Number
+    target_speed_mps: Number
+    vehicles: Annotated[list[Vehicle], Meta(min_length=1)]
+    buildings: list[Building]
 
 
-def record_schema(actions: tuple[str, ...]) -> Schema:
-    """Schema of one line of `scenes.jsonl`."""
-    by_viewer = {"type": "object", "propertyNames": VEHICLE_ID}
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "decision point",
-        **_object(
-            scene={"type": "string", "pattern": "^[0-9]{5}-[0-9]$"},
-            episode=EPISODE,
-            episode_seed=SEED,
-            step=COUNT,
-            road=_object(
-                kind={"type": "string"}, lane_width_m=NUMBER, junction_m=NUMBER, ego={"type": "string"}
-            ),
-            danger=_object(sector=_enum(*SECTORS, None), vehicle={"anyOf": [VEHICLE_ID, {"type": "null"}]}),
-            behaviour=_object(
-                action=_enum(*actions), reason=_enum("cruise", "local-view", "full-view", "random", "guard")
-            ),
-            state=_object(
-                scenario={"type": "string"}, episode_seed=SEED, step=COUNT, time_s=NUMBER,
-                target_speed_mps=NUMBER,
-                vehicles={**_list(_VEHICLE), "minItems": 1}, buildings=_list(_BUILDING),
-            ),
-            graphs={**by_viewer, "additionalProperties": _GRAPH},
-            distance_m={**by_viewer, "additionalProperties": NUMBER},
-            outcomes=_object(**dict.fromkeys(actions, _OUTCOME)),
-            snapshot=_object(
-                frame=COUNT,
-                sections=_list({"type": "integer", "minimum": 0, "maximum": 2}),
-                speed_index={**COUNT, "maximum": len(Parameters().target_speeds_mps) - 1},
-            ),
-        ),
-    }  # fmt: skip
+class Viewer(Closed, frozen=True):
+    """The viewer itself."""
+
+    speed_mps: Number
+    lane: str
+    zone_m: Number
 
 
-def manifest_schema() -> Schema:
-    """Schema of `manifest.json`."""
-    text = {"type": "string", "maxLength": 200}
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "dataset manifest",
-        **_object(
-            format={"const": "swarmdrive-dataset/1"},
-            name={"type": "string", "pattern": FILE_NAME},
-            scenario=text,
-            actions={**_list(text), "minItems": 2, "uniqueItems": True},
-            parameters=_object(
-                **{
-                    name: _list(NUMBER) if isinstance(value, tuple) else NUMBER
-                    for name, value in asdict(Parameters()).items()
-                }
-            ),
-            behaviour={"type": "object", "additionalProperties": NUMBER},
-            episodes={**EPISODE, "minimum": 1, "maximum": LAST_EPISODE + 1},
-            decisions={**COUNT, "minimum": 1},
-            seed={**SEED, "maximum": LAST_SEED},
-            versions={"type": "object", "additionalProperties": text},
-            files={
-                "type": "object",
-                "required": ["scenes.jsonl"],
-                "propertyNames": {"pattern": FILE_NAME},
-                "additionalProperties": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
-            },
-        ),
-    }
+class Ego(Closed, frozen=True):
+    """The ego, in the viewer's frame."""
+
+    id: VehicleId
+    speed_mps: Number
+    target_speed_mps: Number
+    zone_m: Number
+    forward_m: Number
+    left_m: Number
 
 
-def manifest_validator() -> Any:
-    """Validator of a manifest, which says what is wrong."""
-    from jsonschema import Draft202012Validator
+class Node(Closed, frozen=True):
+    """A vehicle that the viewer's sensors report."""
 
-    return Draft202012Validator(manifest_schema())
+    id: VehicleId
+    type: Literal["vehicle", "car", "truck"]
+    forward_m: Number
+    left_m: Number
+    heading_deg: Number | None
+    speed_mps: Number
+    range_rate_mps: Number | None
+    lane: str
+    indicator: str | None
+    sensors: list[Literal["camera", "lidar", "radar"]]
+
+
+class Point(Closed, frozen=True):
+    """A place in the viewer's frame."""
+
+    forward_m: Number
+    left_m: Number
+
+
+class EgoArrival(Closed, frozen=True):
+    """How far the ego is from a conflict; no time where it stands."""
+
+    arc_m: Number
+    time_s: Number | None
+
+
+class Arrival(EgoArrival, frozen=True):
+    """How far another vehicle is from a conflict, and how fast it is."""
+
+    speed_mps: Number
+
+
+class Conflict(Closed, frozen=True):
+    """A vehicle whose path crosses the ego's."""
+
+    vehicle: VehicleId = field(name="with")
+    sector: str
+    route: str
+    point: Point
+    ego: EgoArrival
+    other: Arrival
+
+
+class SectorSeen(Closed, frozen=True):
+    """How much of a sector is in sight, and what hides the rest."""
+
+    sector: str
+    seen_share: Number
+    occluded: bool
+    by: list[str]
+
+
+class Graph(Closed, frozen=True):
+    """What one viewer knows."""
+
+    viewer: VehicleId
+    role: Literal["ego", "helper"]
+    step: Count
+    itself: Viewer = field(name="self")
+    ego: Ego
+    nodes: list[Node]
+    conflicts: list[Conflict]
+    sectors: list[SectorSeen]
+
+
+class Outcome(Closed, frozen=True):
+    """What an action leads to."""
+
+    result: Literal["cleared", "collision", "time_out", "off_road"]
+    time_s: Number
+    partner: VehicleId | None
+    striker: Literal["ego", "other", "both", "neither", None]
+    fault: Literal["ego", "other", None]
+    least_gap_m: Number
+    other_crashes: Count
+
+
+class Road(Closed, frozen=True):
+    """What the scenario says of its road."""
+
+
+class Danger(Closed, frozen=True):
+    """The vehicle that the layout sends against the ego, if any."""
+
+    sector: str | None
+    vehicle: VehicleId | None
+
+
+class Lead(Closed, frozen=True):
+    """The action that was taken when the episode was frozen, and who chose it."""
+
+    action: str
+    reason: Literal["cruise", "local-view", "full-view", "random", "guard"]
+
+
+class Snapshot(Closed, frozen=True):
+    """What the simulator needs beyond the state to go on from here."""
+
+    frame: Count
+    sections: list[Count]
+    speed_index: Count
+
+
+class Record(Closed, frozen=True):
+    """A decision point: one line of `scenes.jsonl`. `record_type` has the names of a scenario's places."""
+
+    scene: Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]$")]
+    episode: Episode
+    episode_seed: Seed
+    step: Count
+    road: Road
+    danger: Danger
+    behaviour: Lead
+    state: State
+    graphs: dict[VehicleId, Graph]
+    distance_m: dict[VehicleId, Number]
+    outcomes: dict[str, Outcome]
+    snapshot: Snapshot
+
+
+class Manifest(Closed, frozen=True):
+    """`manifest.json`: what a dataset was built from, and the sha256 of every file."""
+
+    format: Literal["swarmdrive-dataset/1"]
+    name: FileName
+    scenario: Text
+    actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
+    parameters: dict[str, Number | list[Number]]
+    behaviour: dict[str, Number]
+    episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
+    decisions: Annotated[int, Meta(ge=1, le=1_000_000)]
+    seed: Annotated[int, Meta(ge=0, le=LAST_SEED)]
+    versions: dict[str, Text]
+    files: Annotated[dict[FileName, Sha256], Meta(extra_json_schema={"required": ["scenes.jsonl"]})]
+
+    def number(self, parameter: str) -> float:
+        """A scenario parameter that is one number."""
+        value = self.parameters[parameter]
+        if isinstance(value, list):
+            raise TypeError(f"{parameter} is a list")
+        return value
 
 
 @lru_cache(maxsize=8)
-def record_validator(actions: tuple[str, ...]) -> Any:
-    """Compiled validator of one record; 1.0 is no integer to it."""
-    from jsonschema import Draft202012Validator
-    from jsonschema.validators import extend
-
-    whole = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
-    strict: Any = extend(Draft202012Validator, type_checker=whole)  # type: ignore[no-untyped-call]
-    return strict(record_schema(actions))
-
-
-@lru_cache(maxsize=8)
-def fits_record(actions: tuple[str, ...]) -> Callable[[Any], bool]:
-    """A quick yes to valid records; 1.0 is no integer to it either."""
-    valid = _quick_yes(record_schema(actions))
-    return lambda record: valid(record) and all(type(n) is int for n in _integers(record))
-
-
-def fits_manifest(manifest: Any) -> bool:
-    """A quick yes to a valid manifest."""
-    return _quick_yes(manifest_schema())(manifest)
-
-
-def _integers(record: dict[str, Any]) -> Iterator[Any]:
-    """What a record's schema calls integers."""
-    state, snapshot = record["state"], record["snapshot"]
-    yield from (record["episode"], record["episode_seed"], record["step"])
-    yield from (state["episode_seed"], state["step"], snapshot["frame"], snapshot["speed_index"])
-    yield from snapshot["sections"]
-    yield from (graph["step"] for graph in record["graphs"].values())
-    yield from (outcome["other_crashes"] for outcome in record["outcomes"].values())
+def record_type(scenario: Scenario) -> type[Record]:
+    """`Record` with the approaches, routes, sectors and facts of the scenario's road."""
+    road = scenario.road()
+    approach = _choice(approach for approach, _ in road.paths)
+    route = _choice(route for _, route in road.paths)
+    sector = _choice(road.sectors)
+    signal = _choice([*(r for _, r in road.paths if indicator(r) == r), "off"])
+    section = Annotated[int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)]
+    vehicle = _narrowed(Vehicle, approach=approach, route=route)
+    graph = _narrowed(
+        Graph,
+        nodes=_list(_narrowed(Node, indicator=signal | None)),
+        conflicts=_list(_narrowed(Conflict, sector=sector, route=route)),
+        sectors=_list(_narrowed(SectorSeen, sector=sector)),
+    )
+    kind: type[Record] = _narrowed(
+        Record,
+        road=_narrowed(Road, **{k: str if isinstance(v, str) else Number for k, v in road.facts.items()}),
+        danger=_narrowed(Danger, sector=sector | None),
+        state=_narrowed(State, vehicles=Annotated[_list(vehicle), Meta(min_length=1)]),
+        graphs=GenericAlias(dict, (VehicleId, graph)),
+        snapshot=_narrowed(Snapshot, sections=_list(section)),
+    )
+    return kind
 
 
-def _quick_yes(schema: Schema) -> Callable[[Any], bool]:
-    """A schema compiled by fastjsonschema, some ten times as fast as jsonschema, and sooner loaded.
+def _choice(names: Iterable[str]) -> Any:
+    unique = list(dict.fromkeys(names))
+    pattern = f"^({'|'.join(map(re.escape, unique))})$"
+    return Annotated[str, Meta(pattern=pattern, extra_json_schema={"enum": unique})]
 
-    What it says no to, jsonschema looks at: that decides, and says what is wrong and where.
-    """
-    from fastjsonschema import JsonSchemaValueException, compile
 
-    validate = compile(schema, use_default=False)
+def _list(kind: Any) -> Any:
+    return GenericAlias(list, (kind,))
 
-    def fits(value: Any) -> bool:
-        try:
-            validate(value)
-        except JsonSchemaValueException:
-            return False
-        return True
 
-    return fits
+def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
+    """The kind, some of whose members are of a narrower type."""
+    return msgspec.defstruct(kind.__name__, fields.items(), bases=(kind,), frozen=True)
+
+
+def record_schema(scenario: Scenario) -> dict[str, Any]:
+    """JSON Schema of one line of `scenes.jsonl`."""
+    schema, actions = _published(record_type(scenario), "decision point"), scenario.actions
+    schema["$defs"]["Lead"]["properties"]["action"] = {"enum": list(actions)}
+    outcomes = schema["$defs"]["Record"]["properties"]["outcomes"]
+    outcomes |= {"propertyNames": {"enum": list(actions)}, "required": sorted(actions)}
+    return schema
+
+
+def manifest_schema() -> dict[str, Any]:
+    """JSON Schema of `manifest.json`."""
+    return _published(Manifest, "dataset manifest")
+
+
+def _published(kind: type[Closed], title: str) -> dict[str, Any]:
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, "title": title, **msgspec.json.schema(kind)}

@@ -1,120 +1,242 @@
-"""Asking: every viewer of every scene once, kept as they come, so that a killed run continues."""
+"""Answers: one for each viewer at each decision point, kept as they come, so that a killed run resumes."""
 
-import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
+
+import msgspec
+import numpy as np
 
 from harness.backends.base import Backend, Completion, Request, Role
+from harness.coordination.coordinate import FusionCall
+from harness.coordination.intents import Intents
+from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
+from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
+from harness.evaluate.latency import fusion_s, inference_s, lacks_fusion, with_fusion
 from harness.evaluate.spec import Spec
+from harness.parsing.parse import parse
 from harness.prompts import readout
+from harness.runs.records import Answer, Latency
 from harness.world.perception.graph import truth_graph
 
-Answer = dict[str, Any]
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
-def request_count(spec: Spec) -> int:
-    """How many requests an evaluation makes."""
-    return sum(1 if spec.card.engine == "driver" else len(scene.viewers) for scene in spec.dataset.scenes)
+def request_count(spec: Spec, scenes: Sequence[Scene]) -> int:
+    """Number of requests for these scenes."""
+    return sum(len(spec.viewers(scene)) for scene in scenes)
 
 
 def most_tokens(spec: Spec, role: Role) -> int:
-    """Most tokens that an answer may have, its thought included where the model is asked to think."""
+    """Most tokens that an answer may have, its thought included if the model thinks first."""
     answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
     return answer + (spec.card.thinking_tokens if spec.thinking else 0)
 
 
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
-    """What is asked, scene by scene, the ego first. Drivers are asked for the ego alone."""
+    """The requests, scene by scene, the ego first."""
     for scene in scenes:
-        truth = truth_graph(scene.state) if spec.card.privileged else None
-        for viewer in scene.viewers if spec.card.engine != "driver" else scene.viewers[:1]:
+        truth = truth_graph(spec.scenario, scene.state) if spec.card.privileged else None
+        for viewer in spec.viewers(scene):
             graph = scene.record["graphs"][viewer]
             role: Role = graph["role"]
             yield Request(
                 id=f"{scene.id}/{viewer}",
                 role=role,
                 messages=_messages(spec, graph),
-                actions=spec.dataset.actions,
+                actions=spec.actions,
                 max_tokens=most_tokens(spec, role),
                 form=spec.prompt.helper_answer,
                 answer=spec.answer,
                 thinking=spec.thinking,
                 view=graph,
                 truth=truth,
+                scenario=spec.scenario,
             )
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.dataset.actions)
-    return readout.asked(rendered, spec.dataset.actions) if spec.answer == "readout" else rendered
+    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.words)
+    return readout.asked(rendered, spec.actions) if spec.answer == "readout" else rendered
 
 
-def ask_all(
-    spec: Spec, backend: Backend, asked: Iterable[Request], kept: Path, progress: Callable[[int], None]
-) -> dict[str, Answer]:
-    """Ask what is still owed and keep each answer in a file at once.
-
-    Args:
-        spec: the evaluation.
-        backend: who answers.
-        asked: the questions, in the same order whenever the run is taken up again.
-        kept: JSON Lines file of answers so far; may be torn at its end by a kill.
-        progress: called with the number of answers just had, those kept from before included.
-
-    Returns:
-        Answers by request id.
-    """
-    answers = read_kept(kept)
-    # Chunks begin at the same places in a resumed run, and a torn one is asked again whole: an engine may
-    # answer with an eye on a request's company.
-    size = spec.batch_size * math.ceil(CHUNK / spec.batch_size)
-    asked = iter(asked)
-    with kept.open("a", encoding="utf-8") as file:
-        while chunk := list(islice(asked, size)):
-            if any(request.id not in answers for request in chunk):
-                _ask(backend, chunk, file, answers)
-            progress(len(chunk))
-    return answers
+def fusion_request(
+    spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
+) -> Request:
+    """The fusion call with these helpers' messages; `answers` by viewer."""
+    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
+    return Request(
+        id=_fusion_id(scene, senders),
+        role="ego",
+        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.words),
+        actions=spec.actions,
+        max_tokens=most_tokens(spec, "ego"),
+        form=spec.prompt.helper_answer,
+        answer=spec.answer,
+        thinking=spec.thinking,
+    )
 
 
-def _ask(backend: Backend, chunk: list[Request], file: TextIO, answers: dict[str, Answer]) -> None:
-    for request, completion in zip(chunk, backend.complete(chunk), strict=True):
-        answers[request.id] = answer = answer_of(request, completion)
-        file.write(canonical_json([request.id, answer]) + "\n")
-    file.flush()
-    os.fsync(file.fileno())
+def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
+    return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """What is kept of an answer."""
+    """The answer that a completion holds."""
     # A lone surrogate cannot be written to a file; nothing else of the text is touched.
-    text = completion.text.encode("utf-8", "replace").decode("utf-8")
-    return {
-        "raw": text,
-        "finish_reason": completion.finish_reason,
-        "error": completion.error,
-        "prompt_tokens": completion.prompt_tokens,
-        "completion_tokens": completion.completion_tokens,
-        "seconds": completion.seconds,
-        "batch_size": completion.batch_size,
-        "label_mass": completion.label_mass,
-        "retries": completion.retries,
-        "cached": completion.cached,
-        "slow_s": completion.slow_s,
-        "prompt_sha256": digest(request.messages),
+    raw = completion.text.encode("utf-8", "replace").decode("utf-8")
+    scene, _, viewers = request.id.partition("/")
+    viewer, *heard = viewers.split("+")
+    said = parse(
+        # A read-out is a bare distribution, a helper's too.
+        raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
+        thinking=request.thinking, finish_reason=completion.finish_reason, error=completion.error,
+    )  # fmt: skip
+    return Answer(
+        scene=scene, viewer=viewer, heard=tuple(heard), role="merge" if heard else request.role, raw=raw,
+        finish_reason=completion.finish_reason, error=completion.error,
+        prompt_tokens=completion.prompt_tokens, completion_tokens=completion.completion_tokens,
+        seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
+        retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
+        prompt_sha256=digest(request.messages), status=str(said.status), verdict=said.verdict,
+        repairs=tuple(map(str, said.repairs)), intent=said.intent, mass=said.mass, message=said.message,
+        detail=said.detail,
+    )  # fmt: skip
+
+
+class Asker:
+    """Gets the answers that are missing, and turns answers into arrays of intents.
+
+    Attributes:
+        spec: the evaluation.
+        answers: by request id, in the order of the requests.
+        latency: how long inference takes.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        backend: Callable[[], Backend],
+        latency: Latency,
+        kept: Path | None = None,
+        answers: Mapping[str, Answer] | None = None,
+        progress: Callable[[int], None] = lambda count: None,
+        more: Callable[[int], None] = lambda count: None,
+    ) -> None:
+        """An asker.
+
+        Args:
+            spec: the evaluation.
+            backend: opens the backend, at the first request.
+            latency: how long inference takes.
+            kept: JSON Lines file of answers so far; may be torn at its end by a kill.
+            answers: further answers that are there already, by request id.
+            progress: called with the number of new answers, those kept from before included.
+            more: called with the number of fusion calls, once it is known.
+        """
+        self.spec, self._backend, self._kept = spec, backend, kept
+        self._progress, self._more = progress, more
+        self.latency = latency
+        self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
+
+    def ask(self, asked: Sequence[Request]) -> None:
+        """Get the answers that are missing, and keep each at once."""
+        # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
+        # depend on the other requests in its batch.
+        size = self.spec.batch_size * math.ceil(CHUNK / self.spec.batch_size)
+        for start in range(0, len(asked), size):
+            chunk = asked[start : start + size]
+            if any(request.id not in self.answers for request in chunk):
+                completions = self._backend().complete(chunk)
+                answers = [answer_of(r, c) for r, c in zip(chunk, completions, strict=True)]
+                self.answers |= {answer.id: answer for answer in answers}
+                if self._kept:
+                    _keep(self._kept, answers)
+            self._progress(len(chunk))
+
+    def __call__(self, moments: Sequence[Scene]) -> Intents:
+        """What every viewer intends; NaN for one without a request, or whose answer failed."""
+        viewers = [(scene.id, self.spec.viewers(scene)) for scene in moments]
+        if any(f"{scene}/{viewer}" not in self.answers for scene, some in viewers for viewer in some):
+            self.ask(list(requests(self.spec, moments)))
+        answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
+        return self._laid_out(moments, answers)
+
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages."""
+        ids = [_fusion_id(*each) for each in _heard(moments, codes)]
+        if lacks_fusion(self.latency, self.answers) or not self.answers.keys() >= set(ids):
+            asked = self.fusion_requests(moments, codes)
+            self.ask_fusion([request for request in asked if request.id not in self.answers], asked)
+        answers = [self.answers[name] for name in ids]
+        nothing = [np.nan] * len(self.spec.actions)
+        intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
+        return FusionAnswers(codes, intents, fusion_s(self.latency, answers, self.answers)).at
+
+    def fusion_requests(self, moments: Sequence[Scene], codes: Ints) -> list[Request]:
+        """The requests of the fusion calls with these sets of messages."""
+        asked = []
+        for scene, senders in _heard(moments, codes):
+            of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
+            asked.append(fusion_request(self.spec, scene, of_viewers, senders))
+        return asked
+
+    def ask_fusion(self, owed: Sequence[Request], needed: Sequence[Request]) -> None:
+        """Make the fusion calls that are owed, and time a sample of those needed if no time is known."""
+        if owed:
+            self._more(len(owed))
+            self.ask(owed)
+        if needed and lacks_fusion(self.latency, self.answers):
+            self.latency = with_fusion(self.latency, self._backend(), needed)
+
+    def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
+        width, actions = max(map(len, answers)), len(self.spec.actions)
+        p = np.full((len(moments), width, actions), np.nan)
+        distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
+        bits = np.zeros((len(moments), width - 1))
+        for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
+            at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
+            ego_x_m, ego_y_m = at[scene.viewers[0]]
+            for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
+                distance[i, j] = scene.record["distance_m"][viewer]
+                if answer and answer.intent is not None:
+                    p[i, j] = answer.intent
+                if j:
+                    x_m, y_m = at[viewer]
+                    reach[i, j - 1] = np.hypot(x_m - ego_x_m, y_m - ego_y_m)
+                    bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
+            row += [None] * (width - len(row))
+        valid = ~np.isnan(p[:, 1:]).any(axis=-1)
+        seconds = inference_s(self.latency, answers, self.answers)
+        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, seconds)
+
+
+def _heard(moments: Sequence[Scene], codes: Ints) -> Iterator[tuple[Scene, list[str]]]:
+    """The scene of each set of messages, and its senders."""
+    helpers = max(len(scene.viewers) for scene in moments) - 1
+    for code in codes.tolist():
+        moment, heard = heard_in(code, helpers)
+        yield moments[moment], [moments[moment].viewers[1 + h] for h in heard]
+
+
+def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
+    """Size of the message a helper sends: its id, position, intent, evidence and risk, as compact JSON."""
+    message = {
+        "from": answer.viewer,
+        "xy_m": [round(x, 1) for x in xy_m],
+        "intent": answer.intent and [round(x, 2) for x in answer.intent],
+        "says": answer.message,
     }
+    return 8 * len(canonical_json(message).encode())
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Answers kept so far. A torn last line is dropped and asked again."""
+    """Answers kept so far, by request id. A torn last line is dropped."""
     if not kept.is_file():
         return {}
     data = kept.read_bytes()
@@ -123,8 +245,19 @@ def read_kept(kept: Path) -> dict[str, Answer]:
         with kept.open("r+b") as file:
             file.truncate(len(whole))
     try:
-        return dict(json.loads(line) for line in whole.splitlines())
-    except (ValueError, TypeError) as error:
+        answers = [_DECODER.decode(line) for line in whole.splitlines()]
+    except msgspec.MsgspecError as error:
         raise UserError(
             f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
         ) from None
+    return {answer.id: answer for answer in answers}
+
+
+_DECODER = msgspec.json.Decoder(Answer)
+
+
+def _keep(kept: Path, answers: Sequence[Answer]) -> None:
+    with kept.open("ab") as file:
+        file.write(b"".join(msgspec.json.encode(answer) + b"\n" for answer in answers))
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,12 +1,11 @@
-"""A live episode, and the world it shares with those that have gone the same way so far.
+"""An episode of the closed loop, and the world it shares with those that have acted alike so far.
 
 Episodes of one layout differ in condition and seed alone. Until one takes another action than the rest, or
-takes it in another frame, they are in one and the same world: it is simulated, seen and asked once. There the
-world branches. A branch goes on to the last bit as the whole would have.
+takes it in another frame, they are in one world, which is simulated and observed once. Then the world
+branches. A branch continues exactly as the whole would, to the last bit.
 """
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.world.world import World
@@ -14,84 +13,82 @@ from harness.world.world import World
 
 @dataclass
 class Decision:
-    """A decision that is made but does not act yet.
+    """A decision of the ego, and when it acts.
 
     Attributes:
         action: the meta-action.
         frame: when it acts.
-        made: its record; `acted` becomes true when it has.
+        acted: whether it has.
     """
 
     action: str
     frame: int
-    made: dict[str, Any]
+    acted: bool = False
 
 
 @dataclass
-class Episode:
+class Course:
     """One layout under one condition and seed.
 
     Attributes:
         point: the condition.
-        seed: seed of the channel's luck.
-        open: the decision that is still being made; its ego keeps to the action before.
-        decisions: records of all decisions so far.
-        skipped: decisions that were not begun, since one was still open when they were due.
+        seed: seed of the channel's draws.
+        open: the decision that does not act yet; the ego keeps to the action before.
+        skipped: decisions that did not begin, since one was still open when they were due.
     """
 
     point: OperatingPoint
     seed: int
     open: Decision | None = None
-    decisions: list[dict[str, Any]] = field(default_factory=list)
     skipped: int = 0
 
 
 @dataclass
 class Trajectory:
-    """A world, and the episodes that have it in common so far.
+    """A world, and the courses that have it in common so far.
 
     Attributes:
-        number: the episodes' number.
+        number: the episode's number.
         world: the world.
-        episodes: whoever is in it.
+        courses: of the episode, under conditions and seeds.
     """
 
     number: int
     world: World
-    episodes: list[Episode]
+    courses: list[Course]
 
     def advance(self, until_frame: int) -> list["Trajectory"]:
-        """Live on until so many frames are simulated or the episode is decided; decisions act meanwhile.
+        """Simulate up to a frame or the end of the episode; decisions act meanwhile.
 
         Returns:
-            What has become of it: one trajectory for each way that its episodes have gone.
+            One trajectory for each way in which its episodes continue.
         """
         going, arrived = [self], []
         while going:
-            one = going.pop()
-            frame = min((e.open.frame for e in one.episodes if e.open), default=until_frame + 1)
-            one.world.advance(min(frame, until_frame))
-            if one.world.outcome.ended or frame > until_frame:
-                arrived.append(one)
+            trajectory = going.pop()
+            frame = min((c.open.frame for c in trajectory.courses if c.open), default=until_frame + 1)
+            trajectory.world.advance(min(frame, until_frame))
+            if trajectory.world.outcome.ended or frame > until_frame:
+                arrived.append(trajectory)
             else:
-                going += one._act()
+                going += trajectory._act()
         return arrived
 
     def _act(self) -> list["Trajectory"]:
         """Let what is ready act; one trajectory for each target speed that the egos have then."""
         now = self.world.speed_index
-        worlds, parted = {now: self.world}, {now: list[Episode]()}
+        worlds, parted = {now: self.world}, {now: list[Course]()}
         after: dict[str, int] = {}
-        for episode in self.episodes:
-            ready = episode.open
+        for course in self.courses:
+            ready = course.open
             if ready is None or ready.frame > self.world.frame:
-                parted[now].append(episode)
+                parted[now].append(course)
                 continue
             if ready.action not in after:
                 after[ready.action] = self.world.speed_index_after(ready.action)
-            parted.setdefault(after[ready.action], []).append(episode)
-            ready.made["acted"] = True
-            episode.open = None
+            parted.setdefault(after[ready.action], []).append(course)
+            ready.acted = True
+            course.open = None
         new = {index: action for action, index in after.items() if index != now}
         for n, (index, action) in enumerate(new.items(), 1):
             nobody_stays = n == len(new) and not parted[now]

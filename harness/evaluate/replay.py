@@ -1,16 +1,21 @@
-"""A driven episode, played again from its record: the same actions in the same frames give the same world."""
+"""A closed-loop episode, replayed from its record: equal actions in equal frames give an equal world."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+
+from harness.backends.registry import capabilities
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Trajectory
-from harness.evaluate.live import P, look
-from harness.runs.driven_folder import read
-from harness.runs.folder import Row, Run
+from harness.evaluate.live_world import look
+from harness.runs.folder import Run, read
+from harness.runs.records import ClosedLoop, Decision, Manifest
+from harness.world import scenarios
+from harness.world.scenario import Parameters, Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 
@@ -19,41 +24,47 @@ EVERY_FRAMES = 5  # between two stills, where no decision is open
 
 @dataclass(frozen=True)
 class Played:
-    """One episode of a finished live run.
+    """One episode of a finished closed-loop run.
 
     Attributes:
-        config: the run's manifest.
+        manifest: the run's.
         condition: the operating point.
-        seed: seed of the channel's luck.
+        seed: seed of the channel's draws.
         episode: its number.
-        moments: rows of its decisions, by step.
-        decisions: what it made of them, in the same order.
+        layout_seed: of its layout.
+        decisions: by step.
     """
 
-    config: Mapping[str, Any]
+    manifest: Manifest
     condition: str
     seed: int
     episode: int
-    moments: list[Row]
-    decisions: list[Row]
+    layout_seed: int
+    decisions: list[Decision]
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What was driven."""
+        assert isinstance(self.manifest.world, ClosedLoop)
+        return scenarios.get(self.manifest.world.scenario["name"])
 
 
 @dataclass(frozen=True)
 class Still:
-    """One moment to be drawn.
+    """One picture of an episode.
 
     Attributes:
         state: what is where.
         seen: what was there when the last decision began.
         decision: that decision, open or taken.
         since_s: how long ago it began.
-        open: whether it is still being made.
-        outcome: what has become of the episode; empty while it goes on.
+        open: whether it does not act yet.
+        outcome: how the episode ended; empty until then.
     """
 
     state: WorldState
     seen: WorldState
-    decision: Row
+    decision: Decision
     since_s: float
     open: bool
     outcome: str
@@ -63,63 +74,73 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
     """An episode of a run folder; the last condition and the first seed unless others are given.
 
     Raises:
-        UserError: the folder is no live run, or has no such episode, condition or seed.
+        UserError: the folder is no closed-loop run, or has no such episode, condition or seed.
     """
     run = read(path)
-    names, seeds = run.conditions, run.config["seeds"]
+    if not isinstance(run.manifest.world, ClosedLoop):
+        raise UserError(
+            f"{printable(path)} was made by `harness eval`; give a folder made by `harness drive`"
+        )
+    names, seeds, n = run.conditions, run.manifest.seeds, run.manifest.world.episodes
     condition, seed = condition or names[-1], seeds[0] if seed is None else seed
     if condition not in names:
         raise unknown("condition", condition, names)
     if seed not in seeds:
         raise unknown("seed", str(seed), list(map(str, seeds)))
-    if not 0 <= episode < run.config["episodes"]:
-        raise UserError(
-            f"episode {episode} is not in {printable(path)}; give 0 to {run.config['episodes'] - 1}"
-        )
+    if not 0 <= episode < n:
+        raise UserError(f"episode {episode} is not in {printable(path)}; give 0 to {n - 1}")
     return played(run, episode, condition, seed)
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> Played:
     """An episode that the run has."""
-    found = [
-        (row, made)
-        for row in run.rows
-        if row["episode"] == episode
-        for made in row["decisions"]
-        if (made["condition"], made["seed"]) == (condition, seed)
-    ]
-    return Played(
-        run.config, condition, seed, episode, [row for row, _ in found], [made for _, made in found]
-    )
+    world, d = run.manifest.world, run.decisions
+    assert isinstance(world, ClosedLoop)
+    here = (d.whole("episode") == episode) & (d.whole("seed") == seed)
+    here &= d.codes("condition", run.conditions) == run.conditions.index(condition)
+    mine = d.take(np.flatnonzero(here))
+    decisions = sorted(mine.records(0, len(mine)), key=lambda decision: decision.step)
+    return Played(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
-def scene_of(run: Run, row: Row) -> Scene:
-    """What there was to be seen in a moment, had by playing one of the episodes in it again.
+def scene_of(run: Run, name: str) -> Scene:
+    """A decision point's scene, by replaying one of the episodes that reach it.
 
-    Its id is the row's only where this simulator does what the run's did.
+    Its id is the decision point's only if this simulator does what the run's did.
     """
-    mine, hz = row["decisions"][0], P.simulation_hz
-    episode = played(run, row["episode"], mine["condition"], mine["seed"])
-    begins = round(row["step"] * P.decision_period_s * hz)
-    world = World.start(run.config["first_seed"] + row["episode"])
+    rows = run.decisions.scenes[name]
+    [mine] = run.decisions.records(rows.start, rows.start + 1)
+    episode = played(run, mine.episode, mine.condition, mine.seed)
+    begins = _begins(mine, episode.scenario.parameters)
+    world = World.start(episode.scenario, episode.layout_seed)
     for frame, action in _acts(episode).items():
         if frame <= begins:
             world.advance(frame)
             world.take(action)
     world.advance(begins)
-    return look(run.config["model"]["engine"], Trajectory(row["episode"], world, []), row["step"])
+    alone = not capabilities(run.manifest.model["engine"]).asks_helpers
+    return look(Trajectory(mine.episode, world, []), mine.step, alone)
+
+
+def _begins(decision: Decision, p: Parameters) -> int:
+    return round(decision.step * p.decision_period_s * p.simulation_hz)
 
 
 def _acts(played: Played) -> dict[int, str]:
     """Actions by the frame in which they were taken."""
-    return {round(d["acts_at_s"] * P.simulation_hz): d["action"] for d in played.decisions if d["acted"]}
+    p = played.scenario.parameters
+    return {_acts_in(d, p): d.action for d in played.decisions if d.acted}
+
+
+def _acts_in(decision: Decision, p: Parameters) -> int:
+    return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """The episode, ten stills a second, and one a frame while a decision is open."""
-    hz = P.simulation_hz
-    world = World.start(played.config["first_seed"] + played.episode)
-    begins = [round(row["step"] * P.decision_period_s * hz) for row in played.moments]
+    p = played.scenario.parameters
+    world = World.start(played.scenario, played.layout_seed)
+    begins = [_begins(decision, p) for decision in played.decisions]
     acts = _acts(played)
     place, seen = 0, world.state()
     while True:
@@ -127,13 +148,13 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
             place += 1
             seen = world.state()
         decision = played.decisions[place]
-        thinking = world.frame < round(decision["acts_at_s"] * hz)
+        thinking = world.frame < _acts_in(decision, p)
         outcome = world.outcome
-        told = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
-        told += f" with {outcome.partner}" if outcome.partner else ""
-        since_s = (world.frame - begins[place]) / hz
+        ending = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
+        ending += f" with {outcome.partner}" if outcome.partner else ""
+        since_s = (world.frame - begins[place]) / p.simulation_hz
         progress(1)
-        yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, told)
+        yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, ending)
         if outcome.ended:
             return
         until = world.frame + (1 if thinking else EVERY_FRAMES)

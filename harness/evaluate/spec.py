@@ -1,4 +1,4 @@
-"""What is evaluated, resolved and complete: enough to run it again."""
+"""An evaluation's settings, complete: enough to run it again."""
 
 import platform
 import shlex
@@ -6,19 +6,61 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Protocol, Self, get_args
+
+import msgspec
 
 from harness import __version__
 from harness.backends.base import AnswerMode
-from harness.backends.cards import WEIGHTED, Card, load, names
+from harness.backends.cards import Card, argument
+from harness.backends.registry import capabilities, registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
-from harness.dataset.load import Dataset
+from harness.dataset.load import Scene
 from harness.prompts.versions import Prompt
+from harness.runs.metrics import World
+from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.world.scenario import Scenario
 
-FORMAT = "swarmdrive-run/1"
 Latency = Literal["card", "measured", "paper"]
 TAG_CHARACTERS = 40
+
+
+class Source(Protocol):
+    """Which world is walked."""
+
+    @property
+    def kind(self) -> World:
+        """Its kind in a run's manifest."""
+        ...
+
+    @property
+    def command(self) -> str:
+        """The command that walks it: `eval` or `drive`."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Its part of the name of a run's folder."""
+        ...
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the environment's order."""
+        ...
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of its episodes."""
+        ...
+
+    def record(self) -> FrozenScenes | ClosedLoop:
+        """Its record in a run's manifest."""
+        ...
+
+    def options(self) -> list[tuple[str, object]]:
+        """Options of `command` that name it; None for an option that is not given."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -28,12 +70,11 @@ class Spec:
     Attributes:
         card: the model.
         prompt: the prompt version.
-        dataset: the scenes, already limited.
+        source: which world is walked.
         points: conditions, each an operating point.
-        seeds: seeds of the channel's luck.
-        limit: how many episodes of the dataset were taken; None for all.
-        thinking: whether the model is asked to think first.
-        answer: how answers are had: free `json`, `constrained` to the schema, or the `readout` of letters.
+        seeds: of the channel's draws.
+        thinking: whether the model thinks first.
+        answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
         batch_size: most requests that go through the engine together.
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
@@ -43,10 +84,9 @@ class Spec:
 
     card: Card
     prompt: Prompt
-    dataset: Dataset
+    source: Source
     points: tuple[OperatingPoint, ...]
     seeds: tuple[int, ...]
-    limit: int | None = None
     thinking: bool = False
     answer: AnswerMode = "json"
     batch_size: int = 8
@@ -68,17 +108,23 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        served = self.card.engine == "openai" and self.card.thinking != "none"
-        if self.thinking and not (served or self.card.engine in (*WEIGHTED, "replay")):
+        can = capabilities(self.card.engine)
+        if self.source.kind == "closed-loop" and not can.closed_loop:
+            raise UserError(
+                f"--model {printable(self.card.name)}: a replay has answers to frozen scenes alone; "
+                "give the model that it replays"
+            )
+        thinks = can.thinks == "always" or (can.thinks == "card" and self.card.thinking != "none")
+        if self.thinking and not thinks:
             raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
         if self.answer not in get_args(AnswerMode):
             raise unknown("answer mode", self.answer, get_args(AnswerMode))
-        if self.answer != "json" and self.card.engine in ("proxy", "driver"):
-            raise UserError(
-                f"--answer {self.answer}: {printable(self.card.name)} is no language model; use json"
-            )
+        if self.answer not in can.answer_modes:
+            reason = "cannot answer so" if can.language_model else "is no language model"
+            modes = " or ".join(can.answer_modes)
+            raise UserError(f"--answer {self.answer}: {printable(self.card.name)} {reason}; use {modes}")
         if self.answer != "json" and self.thinking:
             raise UserError(
                 f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
@@ -86,7 +132,7 @@ class Spec:
             )
         self._check_latency()
         for point in self.points:
-            if point.asks_again and (self.card.engine in ("proxy", "driver") or self.answer == "readout"):
+            if point.asks_again and (not can.language_model or self.answer == "readout"):
                 raise UserError(
                     f"condition {printable(point.name)}: "
                     + ("a readout gives no messages to merge; use --answer json or constrained"
@@ -94,21 +140,22 @@ class Spec:
                        else f"{printable(self.card.name)} is no language model and cannot merge messages")
                 )  # fmt: skip
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
-            if value is not None and self.card.engine not in WEIGHTED:
+            if value is not None and not can.has_weights:
+                able = [name for name, engine in registrations().items() if engine.capabilities.has_weights]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
-                    f"(engines {' and '.join(WEIGHTED)} have); leave it out"
+                    f"(engines {' and '.join(able)} have); leave it out"
                 )
 
     def _check_latency(self) -> None:
-        shown, engine = f"--latency {printable(self.latency)}", self.card.engine
+        shown, can = f"--latency {printable(self.latency)}", capabilities(self.card.engine)
         if self.latency is None:
             return
         if self.latency not in get_args(Latency):
             raise unknown("--latency", self.latency, get_args(Latency))
-        if engine == "replay" and self.latency != "paper":
+        if can.own_latency and self.latency != "paper":
             raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
-        if self.latency == "measured" and engine in ("proxy", "driver"):
+        if self.latency == "measured" and not can.language_model:
             raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
         if self.latency == "card" and self.card.latency.inference_s is None:
             raise UserError(
@@ -117,48 +164,57 @@ class Spec:
             )
 
     def tagged(self, begun: Mapping[str, Any]) -> Self:
-        """This, with the tags that a run was begun with before its own."""
+        """This, with a run's own tags before these."""
         return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
 
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the environment's order."""
+        return self.source.actions
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is decided in."""
+        return self.source.scenario
+
+    @property
+    def ego_alone(self) -> bool:
+        """Whether the model answers for the ego only, as a driver does."""
+        return not capabilities(self.card.engine).asks_helpers
+
+    def viewers(self, scene: Scene) -> tuple[str, ...]:
+        """The vehicles of a scene that the model answers for, the ego first."""
+        return scene.viewers[:1] if self.ego_alone else scene.viewers
+
     def settings(self) -> dict[str, Any]:
-        """What a resumed run must have in common with the one it continues."""
+        """What a resumed run must have in common with the one it continues, as plain values."""
+        world = msgspec.to_builtins(self.source.record())
         return {
             "model": asdict(self.card),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
-            "dataset": {
-                "name": self.dataset.name, "sha256": self.dataset.sha256, "scenes": len(self.dataset.scenes),
-                "episodes": len({s.record["episode"] for s in self.dataset.scenes}),
-            },
-            "actions": list(self.dataset.actions),
+            "world": world,
+            "actions": list(self.actions),
             "conditions": [asdict(point) for point in self.points],
             "seeds": list(self.seeds),
-            "limit": self.limit,
             "thinking": self.thinking,
             "answer": self.answer,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
             "latency_source": self.latency,
-        }  # fmt: skip
+        }
 
     def command(self, out: Path) -> str:
         """A command line that runs this again, quoted for a shell."""
         options = [
-            ("--model", model_argument(self.card)), ("--prompt", self.prompt.version),
-            ("--dataset", self.dataset.path), ("--seeds", ",".join(map(str, self.seeds))),
+            ("--model", argument(self.card)), ("--prompt", self.prompt.version),
+            *self.source.options(), ("--seeds", ",".join(map(str, self.seeds))),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
-            ("--batch-size", self.batch_size),
-            ("--limit", self.limit), ("--device", self.device), ("--dtype", self.dtype),
+            ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
-        return shlex.join(["harness", "eval", *parts, *(["--thinking"] if self.thinking else [])])
-
-
-def model_argument(card: Card) -> str:
-    """What `--model` was given, or anything that resolves to the same card."""
-    if card.name.partition(":")[0] in names() and load(card.name) == card:
-        return card.name
-    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
+        command = ["harness", self.source.command, *parts, *(["--thinking"] if self.thinking else [])]
+        return shlex.join(command)
 
 
 def versions(
@@ -172,11 +228,11 @@ def versions(
         "llama-cpp-python",
     ),
 ) -> Any:
-    """Versions of what a result may depend on, as far as it is installed."""
-    found = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    """Versions of the installed packages that a result may depend on."""
+    installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return installed

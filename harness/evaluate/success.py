@@ -1,30 +1,38 @@
 """How an episode of frozen decisions is scored, without a simulator.
 
-The rule. A decision is looked up in its scene's outcome table: its action, followed by the full-view driver,
+The rule. The scene's outcome table judges a decision: its action, followed by the full-view driver,
 either clears the intersection (it is *safe*) or does not; a safe action clears it some seconds later than the
 best safe action would have (its *delay*). An episode succeeds if every decision is safe and the delays add up
-to no more than the scenario's allowance. A decision in which no action is safe blames nobody and is left out.
+to no more than the scenario's allowance. A decision in which no action is safe does not count.
 
 Why the delays count: after one needless SLOWER a perfect driver still gets through, so "safe" alone would
-make always braking perfect. Live driving is judged alike: clearing later than the full-view driver by more
-than the allowance is a forced failure. `harness dataset rank` holds the two against each other.
+make always braking perfect. The closed loop is judged alike: clearing later than the full-view driver by
+more than the allowance is a forced failure. `harness dataset rank` compares the two.
 """
 
+import json
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from harness.core import kept
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.files import canonical_json, digest
 from harness.dataset.load import Dataset
-from harness.world.drivers import PRIVILEGED, choose
+from harness.world import scenarios
+from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import ROUNDING_S
 from harness.world.perception.graph import truth_graph
+
+# The code that a reference driver's success depends on: what other code kept does not count.
+_CODE = ("core/**/*.py", "world/**/*.py", "dataset/**/*.py", "evaluate/success.py")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of episodes, each array of shape (...).
+    """How episodes ended, each array of shape (...).
 
     Attributes:
         success: every avoidable decision safe, delays within the allowance.
@@ -93,12 +101,12 @@ def table(dataset: Dataset) -> Table:
         index[row, : len(positions)] = positions
     safe, delay_s = dataset.outcome_arrays()
     seeds = [dataset.scenes[p[0]].record["episode_seed"] for p in places.values()]
-    allowance_s = float(dataset.manifest["parameters"]["delay_allowance_s"])
+    allowance_s = dataset.manifest.number("delay_allowance_s")
     return Table(index, np.array(list(places)), np.array(seeds), safe, delay_s, allowance_s)
 
 
 def judge_choices(laid: Table, chosen: Ints) -> Verdict:
-    """What becomes of the episodes if action `chosen` (n,) is taken in each scene."""
+    """How the episodes end if action `chosen` (n,) is taken in each scene."""
     rows = np.arange(len(chosen))
     return judge(
         laid.by_episode(laid.safe[rows, chosen], fill=True),
@@ -110,10 +118,39 @@ def judge_choices(laid: Table, chosen: Ints) -> Verdict:
 
 def driver_choices(dataset: Dataset, driver: str) -> Ints:
     """Index of a reference driver's action in every scene, (n,)."""
-    actions = dataset.actions
+    actions, scenario = dataset.actions, dataset.scenario
     chosen = []
     for scene in dataset.scenes:
         graph = scene.record["graphs"][scene.state.ego.id]
-        truth = truth_graph(scene.state) if driver == PRIVILEGED else None
-        chosen.append(actions.index(choose(driver, graph, truth, actions)))
+        truth = truth_graph(scenario, scene.state) if driver == PRIVILEGED else None
+        chosen.append(actions.index(choose(scenario, driver, graph, truth)))
     return np.array(chosen)
+
+
+def reference_success(dataset: Dataset) -> dict[str, float]:
+    """Share of a dataset's episodes in which each reference driver succeeds; computed once and then kept."""
+    laid = table(dataset)
+    here = scenarios.is_here(dataset.scenario.name)  # of another's code no digest is known
+    decided_by = [
+        dataset.sha256, laid.episodes.tolist(), kept.code_sha256(*_CODE), version("numpy"), version("shapely")
+    ]  # fmt: skip
+    name = f"references-{digest(decided_by)}.json"
+    shares = _shares(kept.recall(name)) if here else None
+    if shares is None:
+        shares = {
+            driver: float(judge_choices(laid, driver_choices(dataset, driver)).success.mean())
+            for driver in DRIVERS
+        }
+        if here:
+            kept.keep(name, canonical_json(shares).encode())
+    return shares
+
+
+def _shares(data: bytes | None) -> dict[str, float] | None:
+    """The kept share of every reference driver; None if the file holds something else."""
+    try:
+        shares = json.loads(data or b"")
+        by_driver = {driver: float(shares[driver]) for driver in DRIVERS}
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return by_driver if all(0.0 <= share <= 1.0 for share in by_driver.values()) else None

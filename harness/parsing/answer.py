@@ -29,11 +29,11 @@ class Answer:
         return replace(self, repairs=self.repairs | {repair})
 
 
-def read(members: dict[str, Any], found_with: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
+def read(members: dict[str, Any], so_far: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
     """What an answer-shaped object means. Raises `Failure` with one of the value statuses."""
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
-    repairs = set(found_with)
+    repairs = set(so_far)
     fields, rest = values.sort_fields(members, FIELDS[role], repairs)
     loose = any(values.match(key, actions) for key in rest)
     if loose and ("action_distribution" in fields or "recommended_maneuver" in fields):

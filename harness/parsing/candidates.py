@@ -30,7 +30,7 @@ class Candidate:
 
 
 @dataclass
-class _Found:
+class _Objects:
     """Top-level objects of a text with their spans, and what else was met on the way."""
 
     readings: list[tuple[int, relaxed.Reading]] = field(default_factory=list)
@@ -60,16 +60,16 @@ def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> lis
         Failure: no_json, label_only, truncated_json, syntax or, without any candidate, missing_action.
     """
     escapes: frozenset[Repair] = frozenset()
-    found = _objects(text, cut)
-    if not found.readings and ('\\"' in text or "&quot;" in text):
+    objects = _objects(text, cut)
+    if not objects.readings and ('\\"' in text or "&quot;" in text):
         text, escapes = html.unescape(text).replace('\\"', '"'), frozenset({Repair.ESCAPES})
-        found = _objects(text, cut)
-    if found.unfinished:
+        objects = _objects(text, cut)
+    if objects.unfinished:
         raise Failure(Status.TRUNCATED_JSON, "the text ends inside a JSON value")
 
     shaped: list[Candidate] = []
     outside, at = [], 0
-    for start, reading in found.readings:
+    for start, reading in objects.readings:
         inside = list(_answers(reading.value, role, actions))
         shaped += [Candidate(members, extra | reading.repairs | escapes) for members, extra in inside]
         if inside:
@@ -78,62 +78,62 @@ def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> lis
     if shaped:
         around = _around("\n".join([*outside, text[at:]]))
         return [Candidate(one.members, one.repairs | around) for one in shaped]
-    if found.broken is not None:
-        mended, rest = mend.mended(text[found.broken :], FIELDS[role] + actions, cut)
-        extra = escapes | _around(text[: found.broken] + rest) | {Repair.JSON_REPAIR}
+    if objects.broken is not None:
+        mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
+        extra = escapes | _around(text[: objects.broken] + rest) | {Repair.JSON_REPAIR}
         inside = list(_answers(mended, role, actions))
         if not inside:
             raise mend.unreadable()
         return [Candidate(members, nested | extra) for members, nested in inside]
-    raise _nothing(text, bool(found.readings), actions)
+    raise _nothing(text, bool(objects.readings), actions)
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
     """Where in a text the objects stand that `candidates` finds; empty where it takes more than finding."""
     try:
-        found = _objects(text, cut=False)
+        objects = _objects(text, cut=False)
     except Failure:
         return []
     return [
         (start, reading.end)
-        for start, reading in found.readings
+        for start, reading in objects.readings
         if any(_answers(reading.value, role, actions))
     ]
 
 
-def _objects(text: str, cut: bool) -> _Found:
+def _objects(text: str, cut: bool) -> _Objects:
     """Objects from left to right; a brace that opens none is passed by."""
-    found = _Found()
+    objects = _Objects()
     tries = at = 0
     while opening := _OPENING.search(text, at):
         start = at = opening.start()
         try:
             value, at = relaxed.DECODER.raw_decode(text, start)
-            found.readings.append((start, relaxed.Reading(value, at)))
+            objects.readings.append((start, relaxed.Reading(value, at)))
             continue
         except (ValueError, RecursionError):
             pass
         try:
             reading = relaxed.read(text, start)
             if reading.closed_by_end and cut:
-                found.unfinished = True
-                return found
-            found.readings.append((start, reading))
+                objects.unfinished = True
+                return objects
+            objects.readings.append((start, reading))
             at = reading.end
         except relaxed.Unfinished:
             if cut or not text.rstrip("` \t\r\n").endswith("}"):
-                found.unfinished = True
-                return found
+                objects.unfinished = True
+                return objects
             at = start + 1  # closed, so not cut off: an opening quote has no partner
-            found.broken = start if found.broken is None else found.broken
+            objects.broken = start if objects.broken is None else objects.broken
         except relaxed.Broken as error:
             at = start + 1
-            if error.meant and found.broken is None:
-                found.broken = start
+            if error.meant and objects.broken is None:
+                objects.broken = start
         tries += 1
         if tries > _MAX_BROKEN:
             raise Failure(Status.SYNTAX, f"more than {_MAX_BROKEN} braces that open no JSON object")
-    return found
+    return objects
 
 
 def _shaped(value: object, role: str, actions: tuple[str, ...]) -> bool:
@@ -162,11 +162,11 @@ def _answers(
 def _around(outside: str) -> frozenset[Repair]:
     """What the text outside the answers is."""
     bare, fences = _FENCE.subn("", outside)
-    found = {Repair.CODE_FENCE} if fences else set()
+    repairs = {Repair.CODE_FENCE} if fences else set()
     rest = "".join(bare.split())
     if rest:
-        found.add(Repair.STRAY_PUNCTUATION if _STRAY.issuperset(rest) else Repair.PROSE_AROUND)
-    return frozenset(found)
+        repairs.add(Repair.STRAY_PUNCTUATION if _STRAY.issuperset(rest) else Repair.PROSE_AROUND)
+    return frozenset(repairs)
 
 
 def _name(action: str) -> str:

@@ -15,6 +15,7 @@ from harness.parsing.answer import Answer, read
 from harness.parsing.candidates import Candidate, whole
 from harness.parsing.mend import unreadable
 from harness.parsing.status import Failure, Repair, Status
+from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import ROLES
 
 __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
@@ -134,6 +135,10 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
 
 def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     """The answer if the text is nothing but that and needs no repair."""
+    return fitting(text, role, actions) or _unmended(text, role, actions)
+
+
+def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     candidate = whole(text, role, actions)
     if candidate is None:
         return None
@@ -146,7 +151,7 @@ def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
 
 def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
-    text, zero_width = _INVISIBLE.subn(lambda found: " " if found.group().isspace() else "", text)
+    text, zero_width = _INVISIBLE.subn(lambda match: " " if match.group().isspace() else "", text)
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
     answer = _choose(candidates.candidates(text, role, actions, cut), role, actions)
@@ -155,22 +160,22 @@ def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Ans
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
 
 
-def _choose(found: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
+def _choose(offered: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
     """The one answer among the candidates. An echo of the template beside it is no second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
-    for candidate in found:
+    for candidate in offered:
         try:
             answers.append(read(candidate.members, candidate.repairs, role, actions))
         except Failure as failure:
             failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
-        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in found):
+        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in offered):
             raise unreadable()  # what is wrong in a guessed object need not be wrong in the text
         raise (serious or failures)[-1]
     last = answers[-1]
-    same = all(abs(p - q) <= _SAME for one in answers for p, q in zip(one.intent, last.intent, strict=True))
+    same = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
     if serious or not same:
         count = len(answers) + len(serious)
         raise Failure(Status.CONFLICTING_ANSWERS, f"{count} answers stand in the text and they differ")

@@ -7,14 +7,28 @@ rule can take it for a number. Numbers and words that touch the end of the text 
 
 import json
 import re
+import unicodedata
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 from harness.parsing.status import Repair
-from harness.parsing.tokens import Token, next_token
 
 MAX_DEPTH = 32
 
+_DIGITS = r"(?:\d+(?:[.．]\d*)?|[.．]\d+)(?:[eE][-+]?\d*)?"
+_TOKEN = re.compile(
+    rf"""
+    (?P<comment> //[^\n]* | /\*.*?\*/ | \#[^\n]* )
+  | (?P<string> "(?:[^"\\]|\\.)*" | '(?:[^'\\]|\\.)*' | `[^`]+`(?!`)
+              | [“”„‟＂][^“”„‟＂"\\]*[“”„‟＂"] | [‘’‚][^‘’‚\\]*[‘’] )
+  | (?P<expression> [-+]?{_DIGITS}\s*%?(?:\s*(?:\*\*|[-+*/^])\s*[-+(]*{_DIGITS}\s*%?\)*)+ )
+  | (?P<number> [-+]?{_DIGITS}(?:\s*[%％])? )
+  | (?P<fence> ``` )
+  | (?P<mark> [{{}}\[\]:,｛｝［］：，] )
+  | (?P<word> -?[^\W\d]\w* | <[^<>{{}}\n]*> | \.\.\.|… )
+    """,
+    re.DOTALL | re.VERBOSE,
+)
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?%?")
 _JSON_NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?")
 _WORDS = {
@@ -57,14 +71,52 @@ class Reading:
     closed_by_end: bool = False
 
 
-def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """`object_pairs_hook` that does not lose sight of a repeated key."""
-    found = dict(pairs)
-    return found if len(found) == len(pairs) else Repeated(found)
+    members = dict(pairs)
+    return members if len(members) == len(pairs) else Repeated(members)
 
 
 # An integer read as float has no limit of digits, and one too large is infinite instead of an error.
-DECODER = json.JSONDecoder(object_pairs_hook=members, parse_int=float)
+DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
+
+
+@dataclass(frozen=True)
+class Token:
+    """A piece of text.
+
+    Attributes:
+        kind: a group of the pattern; `other` for a character that begins no token, `end` at the text's end.
+        text: as written, but full-width numbers and marks as ASCII.
+        end: where the next token may begin.
+        repairs: liberties taken up to here.
+    """
+
+    kind: str
+    text: str
+    end: int
+    repairs: frozenset[Repair] = frozenset()
+
+
+def next_token(text: str, at: int) -> Token:
+    """The first token at or after `at`; white space and comments are passed over."""
+    repairs: frozenset[Repair] = frozenset()
+    while True:
+        while at < len(text) and text[at].isspace():
+            at += 1
+        if at == len(text):
+            return Token("end", "", at)
+        match = _TOKEN.match(text, at)
+        if match is None:
+            return Token("other", text[at], at + 1)
+        kind, written, at = match.lastgroup or "other", match.group(), match.end()
+        if kind == "comment":
+            repairs |= {Repair.COMMENTS}
+            continue
+        if kind in ("number", "mark") and not written.isascii():
+            written = unicodedata.normalize("NFKC", written)
+            repairs |= {Repair.FULL_WIDTH}
+        return Token(kind, written, at, repairs)
 
 
 def read(text: str, at: int) -> Reading:
@@ -137,7 +189,7 @@ class _Reader:
             pairs.append((key, self._value(depth + 1)))
             if self._ends_after_value("}"):
                 break
-        return members(pairs)
+        return from_pairs(pairs)
 
     def _array(self, depth: int) -> list[Any]:
         items: list[Any] = []

@@ -31,7 +31,7 @@ def match(name: str, known: Sequence[str]) -> str | None:
     """The known name that is meant: the same, or the only one that differs in case and separators."""
     if name in known:
         return name
-    near = [one for one in known if _plain(one) == _plain(name)]
+    near = [other for other in known if _plain(other) == _plain(name)]
     return near[0] if len(near) == 1 else None
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from harness.report.drawing.pictures import BLUE, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing.colours import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from harness.report.layers import (
     BASE,
     NUMBER,
@@ -10,9 +10,12 @@ from harness.report.layers import (
     Rows,
     Spec,
     band,
+    colour,
     colours_of,
     interval,
     layered,
+    names_axis,
+    point,
     rules_at,
     shapes_of,
     share_axis,
@@ -27,28 +30,26 @@ VERDICTS = {
     "failed": [VERMILLION, ORANGE, PURPLE, "#8C510A", "#F0E442", "#B2A1C7", "#999999"],
 }
 REPLIES = {"on time": BLUE, "late": ORANGE, "lost": VERMILLION}
+TIMES = {
+    "inference": SKY, "reply on time": BLUE, "reply late": ORANGE, "reply lost": VERMILLION, "fusion": PURPLE,
+    "decision": GREEN,
+}  # fmt: skip
 
 
 def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
     """Success over latency, a point a run and condition; reference drivers are lines."""
-    colour = colours_of(rows, "condition")
+    condition = colours_of(rows, "condition")
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
-    known = {key for row in rows for key, value in row.items() if value is not None}
-    intervals = {
-        "low": interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=colour),
-        "latency_low": interval(
-            x={**x, "field": "latency_low"}, x2={"field": "latency_high"}, y=y, color=colour
-        ),
-    }
+    present = {key for row in rows for key, value in row.items() if value is not None}
+    along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
+    along_y = {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}}
+    ends = {"low": along_y, "latency_low": along_x}
     return layered(
         band(*REACTION_MS, "reaction window, 150 to 250 ms"),
         _references(references, y),
-        *(one for end, one in intervals.items() if end in known),
-        {
-            "mark": {"type": "point", "filled": True, "size": 90, "opacity": 1},
-            "encoding": {"x": x, "y": y, "color": colour, "shape": shape, "tooltip": tooltip(rows)},
-        },
+        *(interval(**along, color=condition) for end, along in ends.items() if end in present),
+        point(90, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)),
         rows=rows,
         height=320,
     )
@@ -77,16 +78,16 @@ def statuses(rows: Rows) -> Spec:
     met = list(dict.fromkeys((v, str(row["status"])) for v, row in zip(verdicts, rows, strict=True)))
     met.sort(key=lambda one: list(VERDICTS).index(one[0]))
     taken = dict.fromkeys(VERDICTS, 0)
-    colours = []
-    for verdict, _ in met:
-        colours.append(VERDICTS[verdict][taken[verdict] % len(VERDICTS[verdict])])
+    colours = {}
+    for verdict, status in met:
+        colours[status] = VERDICTS[verdict][taken[verdict] % len(VERDICTS[verdict])]
         taken[verdict] += 1
-    return _stacked(rows, "role", "status", [status for _, status in met], colours, "answers")
+    return _stacked(rows, "role", "status", colours, "answers")
 
 
 def replies(rows: Rows) -> Spec:
     """On time, late and lost replies, a stacked bar a run and condition."""
-    return _stacked(rows, "condition", "reply", list(REPLIES), list(REPLIES.values()), "replies")
+    return _stacked(rows, "condition", "reply", REPLIES, "replies")
 
 
 def reliability(rows: Rows) -> Spec:
@@ -119,16 +120,55 @@ def arrivals(rows: Rows, window_ms: Sequence[float], width: float) -> Spec:
     return _bars(rows, "arrival_ms", title, "replies", width, series="condition", rules=window_ms)
 
 
-def _stacked(
-    rows: Rows, by: str, field: str, domain: Sequence[str], colours: Sequence[str], what: str
-) -> Spec:
-    """A bar a run and `by`, in parts of the values of a field, in their order in `domain`."""
+def policies() -> Spec:
+    """One decision's distributions around fusion; the page fills in `values`: who, what, action, p."""
+    return {
+        **BASE,
+        "data": {"name": "values", "values": []},
+        "mark": {"type": "bar", "height": {"band": 0.8}},
+        "encoding": {
+            "y": names_axis("who"),
+            "yOffset": {"field": "action", "sort": None},
+            "x": {**x_axis("p", "probability"), "scale": {"domain": [0, 1]}},
+            "color": {
+                "field": "action", "type": "nominal", "sort": None,
+                "scale": {"range": [VERMILLION, BLUE, GREEN]}, "legend": {"orient": "top", "title": None},
+            },
+            "tooltip": [{"field": f} for f in ("who", "what", "action", "p")],
+        },
+    }  # fmt: skip
+
+
+def timeline() -> Spec:
+    """When what happens in one decision; the page fills in `values`: who, what, from, to; and `window`."""
+    return layered(
+        {
+            "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
+            "encoding": {
+                "x": {"field": "from", **NUMBER, "title": "ms from the start of the decision"},
+                "x2": {"field": "to"},
+                "y": names_axis("who"),
+                "color": colour("what", TIMES),
+                "tooltip": [{"field": f} for f in ("who", "what", "from", "to")],
+            },
+        },
+        {
+            "data": {"name": "window", "values": []},
+            "mark": RULE,
+            "encoding": {"x": {"field": "window_ms", **NUMBER}, "tooltip": {"field": "what"}},
+        },
+        rows=[],
+    )
+
+
+def _stacked(rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str) -> Spec:
+    """A bar a run and `by`, in parts of the values of a field, in the order of their colours."""
     several = len({row["run"] for row in rows}) > 1
     bars = [
         {
             **row,
             "bar": f"{row['run']}: {row[by]}" if several else str(row[by]),
-            "order": domain.index(row[field]),
+            "order": list(colours).index(row[field]),
         }
         for row in rows
     ]
@@ -139,37 +179,27 @@ def _stacked(
         "data": {"name": "values", "values": bars},
         "mark": {"type": "bar", "stroke": "white", "strokeWidth": 0.6},
         "encoding": {
-            "y": {
-                "field": "bar", "type": "nominal", "sort": None, "title": None, "axis": {"labelLimit": 260},
-            },
+            "y": {**names_axis("bar"), "axis": {"labelLimit": 260}},
             "x": {**x, "scale": {"domain": [0, 1]}},
-            "color": {
-                "field": field, "type": "nominal", "scale": {"domain": list(domain), "range": list(colours)},
-                "legend": {"orient": "top", "title": None},
-            },
+            "color": colour(field, colours),
             "order": {"field": "order"},
             "tooltip": tooltip(bars),
         },
-    }  # fmt: skip
+    }
 
 
 def _shares(
     rows: Rows, field: str, title: str, what: str, diagonal: bool = False, rules: Sequence[float] = ()
 ) -> Spec:
-    x, y, colour = x_axis(field, title), share_axis("share", what), colours_of(rows, "condition")
+    x, y = x_axis(field, title), share_axis("share", what)
+    condition, shape = colours_of(rows, "condition"), shapes_of(rows, "condition")
     if not diagonal:
         y["scale"] = {"zero": True, "nice": True}
     layers: list[Spec] = [
-        interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=colour),
-        {"mark": {"type": "line", "strokeWidth": 1.5}, "encoding": {"x": x, "y": y, "color": colour}},
-        {
-            "mark": {"type": "point", "filled": True, "size": 55, "opacity": 1},
-            "encoding": {
-                "x": x, "y": y, "color": colour, "tooltip": tooltip(rows),
-                "shape": shapes_of(rows, "condition"),
-            },
-        },
-    ]  # fmt: skip
+        interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=condition),
+        {"mark": {"type": "line", "strokeWidth": 1.5}, "encoding": {"x": x, "y": y, "color": condition}},
+        point(55, x=x, y=y, color=condition, tooltip=tooltip(rows), shape=shape),
+    ]
     if diagonal:
         ends = [{field: end, "share": end} for end in (0.3, 1.0)]
         line = {"mark": {**RULE, "type": "line"}, "encoding": {"x": x, "y": y}}

@@ -1,102 +1,73 @@
-"""Which rows of a run tell most: where episodes begin to fail, others of note, and then an even sample."""
+"""Which decision points of a run tell most: where episodes begin to fail, others of note, an even sample."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
-from harness.runs.driven_folder import Driven
-from harness.runs.folder import Row, Run, answers_of
+import numpy as np
 
-FAILURE, DISAGREEMENT, ANSWER, SAMPLE = (
-    "first failure",
-    "conditions disagree",
-    "answer not strict",
-    "even sample",
-)
+from harness.runs.folder import Run
 
 
-class Pick(NamedTuple):
-    """A row, the seed of the channel under which it tells, and why it was chosen."""
-
-    row: Row
-    seed: int
-    why: str
+def failures(run: Run) -> dict[str, int]:
+    """Decision points at which an episode begins to fail, and the seed with which it does."""
+    return _unsafe(run) if run.world == "frozen" else _wrecks(run)
 
 
-def decisions_of(row: Row, seed: int) -> list[dict[str, Any]]:
-    """The row's decisions of one seed, one a condition."""
-    return [d for d in row["decisions"] if d["seed"] == seed]
-
-
-def failures(run: Run) -> dict[int, int]:
-    """Rows in which an episode begins to fail, and the seed with which it does."""
-    return _wrecks(run) if isinstance(run, Driven) else _unsafe(run.rows)
-
-
-def _unsafe(rows: Sequence[Row]) -> dict[int, int]:
+def _unsafe(run: Run) -> dict[str, int]:
     """Each episode's first action of the run's first seed that is unsafe where another was safe."""
-    found: dict[int, int] = {}
-    episodes: set[int] = set()
-    for i, row in enumerate(rows):
-        seed = _first_seed(row)
-        bad = any(row["safe"]) and not all(d["safe"] for d in decisions_of(row, seed))
-        if bad and row["episode"] not in episodes:
-            episodes.add(row["episode"])
-            found[i] = seed
-    return found
+    d, seed = run.decisions, run.manifest.seeds[0]
+    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
+    bad = avoidable & ~d.flags("safe") & (d.whole("seed") == seed)
+    episode = d.whole("episode")
+    first: dict[int, str] = {}
+    for scene, rows in d.scenes.items():
+        if bad[rows.start : rows.stop].any():
+            first.setdefault(int(episode[rows.start]), scene)
+    return dict.fromkeys(first.values(), seed)
 
 
-def _wrecks(run: Driven) -> dict[int, int]:
-    """The last moment that a layout's failed episodes have in common with one that did not fail.
+def _wrecks(run: Run) -> dict[str, int]:
+    """The last decision point that a layout's failed episodes share with one that did not fail.
 
-    Where all episodes of a layout fail, it is the last moment of the first of them.
+    Where all episodes of a layout fail, it is the last decision point of the first of them.
     """
-    telling: dict[int, tuple[bool, int, int]] = {}
-    for i, row in enumerate(run.rows):
-        number = row["episode"]
-        ends = {
-            (d["condition"], d["seed"]): run.ends[d["condition"], d["seed"], number]["result"]
-            for d in row["decisions"]
-        }
-        failed = [seed for (_, seed), result in ends.items() if result != "cleared"]
-        if failed:
-            parts = len(failed) < len(ends)
+    d = run.decisions
+    failed = np.array([not episode.success for episode in run.episodes])[run.grid.places(d)]
+    seeds, episodes = d.whole("seed"), d.whole("episode")
+    telling: dict[int, tuple[bool, str, int]] = {}
+    for scene, rows in d.scenes.items():
+        here = failed[rows.start : rows.stop]
+        number = int(episodes[rows.start])
+        if here.any():
+            parts = not here.all()
             if number not in telling or parts >= telling[number][0]:
-                telling[number] = parts, i, failed[0]
-    return {i: seed for _, i, seed in telling.values()}
+                telling[number] = parts, scene, int(seeds[rows.start + int(here.argmax())])
+    return {scene: seed for _, scene, seed in telling.values()}
 
 
-def _first_seed(row: Row) -> int:
-    return int(row["decisions"][0]["seed"])
+def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
+    """Choose up to n decision points, in their order; the same run always gives the same choice.
 
-
-def pick(rows: Sequence[Row], failed: Mapping[int, int], n: int) -> list[Pick]:
-    """Choose up to n rows, kept in their order; the same rows always give the same choice.
-
-    Up to a quarter each are: failures, each with the seed that shows it; conditions that act differently;
-    answers that were recovered or failed. The rest is spread evenly. Where one kind is scarce, the sample is
-    larger.
+    Up to a quarter each are: failures; conditions that act differently with the seed that shows a failure, or
+    the first; answers that were recovered or failed. The rest is spread evenly. Where one kind is scarce, the
+    sample is larger.
     """
-    seeds = [failed.get(i, _first_seed(row)) for i, row in enumerate(rows)]
-    kinds: dict[str, list[int]] = {
-        FAILURE: list(failed),
-        DISAGREEMENT: [],
-        ANSWER: [],
-        SAMPLE: list(range(len(rows))),
-    }
-    for i, row in enumerate(rows):
-        if len({d["action"] for d in decisions_of(row, seeds[i])}) > 1:
-            kinds[DISAGREEMENT].append(i)
-        if any(a["verdict"] != "strict" for a in answers_of(row).values()):
-            kinds[ANSWER].append(i)
-    why: dict[int, str] = {}
-    for kind, candidates in kinds.items():
-        left = [i for i in candidates if i not in why]
-        room = n - len(why) if kind == SAMPLE else n // 4
-        why |= dict.fromkeys(_spread(left, room), kind)
-    return [Pick(rows[i], seeds[i], why[i]) for i in sorted(why)]
+    d = run.decisions
+    action, seeds = d.codes("action", run.actions), d.whole("seed")
+    disagreement, answer = [], []
+    for scene, rows in d.scenes.items():
+        mine = seeds[rows.start : rows.stop] == failed.get(scene, int(seeds[rows.start]))
+        if len(set(action[rows.start : rows.stop][mine].tolist())) > 1:
+            disagreement.append(scene)
+        if any(a.verdict != "strict" for a in run.answers_by_scene.get(scene, ())):
+            answer.append(scene)
+    chosen: list[str] = []
+    for kind, room in ((list(failed), n // 4), (disagreement, n // 4), (answer, n // 4), (list(d.scenes), n)):
+        left = [scene for scene in kind if scene not in chosen]
+        chosen += _spread(left, min(room, n - len(chosen)))
+    return [scene for scene in d.scenes if scene in chosen]
 
 
-def _spread(items: Sequence[int], n: int) -> list[int]:
+def _spread(items: Sequence[str], n: int) -> list[str]:
     """Up to n of the items, evenly spaced, the first among them."""
     n = min(n, len(items))
     return [items[k * len(items) // n] for k in range(n)]

@@ -3,21 +3,20 @@
 from typing import Any
 
 from harness.report import words
-from harness.report.drawing.pictures import uri
+from harness.report.library import picture
 from harness.report.runs import Runs
-from harness.runs.driven_folder import Driven
-from harness.runs.folder import Run, answers_of
+from harness.runs import metrics
+from harness.runs.folder import Run
 
 EXAMPLES = 3  # of each status of answers
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
     """A run's summary: a metric a line, with its value in each condition."""
-    meanings = words.LIVE_MEANINGS if isinstance(run, Driven) else words.MEANINGS
     return [
         {
-            "name": words.metric_name(metric),
-            "meaning": meanings.get(metric, ""),
+            "name": metrics.label(metric),
+            "meaning": metrics.meaning(metric, run.world),
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
         for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
@@ -26,32 +25,31 @@ def summary(run: Run) -> list[dict[str, Any]]:
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
     """What does not depend on the condition: a metric a line, with its value in each run."""
-    metrics = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
+    names = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
     return [
-        (words.metric_name(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
-        for m in metrics
+        (metrics.label(m), [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
+        for m in names
     ]
 
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
     """The first answers of each status but strict, and where each stands."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    by_status: dict[str, list[dict[str, Any]]] = {}
     for n, run in enumerate(runs.runs):
-        for row in run.rows:
-            for viewer, answer in answers_of(row).items():
-                if answer["status"] != "strict":
-                    of = found.setdefault(answer["status"], [])
-                    if len(of) < EXAMPLES:
-                        of.append({"run": n, "scene": row["scene"], "viewer": viewer, **answer})
-    return [{"status": status, "answers": of} for status, of in found.items()]
+        for answer in run.answers:
+            if answer.status != "strict":
+                of = by_status.setdefault(answer.status, [])
+                if len(of) < EXAMPLES:
+                    of.append({"run": n, "answer": answer})
+    return [{"status": status, "answers": of} for status, of in by_status.items()]
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:
     """Pictures of the sweeps that lie in the run's folder; none that a link leads out of it to."""
     here = run.path.resolve()
     return [
-        {"name": f"{manifest.parent.name}: {picture.stem}", "src": uri(picture.read_bytes())}
+        {"name": f"{manifest.parent.name}: {svg.stem}", "src": picture(svg.read_bytes())}
         for manifest in sorted(run.path.glob("*/sweep.json"))
-        for picture in sorted(manifest.parent.glob("*.svg"))
-        if picture.is_file() and picture.resolve().is_relative_to(here)
+        for svg in sorted(manifest.parent.glob("*.svg"))
+        if svg.is_file() and svg.resolve().is_relative_to(here)
     ]

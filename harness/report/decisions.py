@@ -1,22 +1,27 @@
-"""What a page knows of each decision: an index of all, and details in blocks that are read when opened."""
+"""What a page shows of each decision: an index of all, and details in blocks that are read when opened."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
+
+import msgspec
+import numpy as np
 
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.dataset.load import Scene
-from harness.evaluate.replay import scene_of
-from harness.parsing.parse import Status, spans
+from harness.evaluate.fusion import messages_of
+from harness.parsing.parse import spans
+from harness.parsing.status import Status
 from harness.prompts import readout, versions
 from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.runs import Runs
-from harness.runs.driven_folder import Driven
-from harness.runs.folder import Row, Run, answers_of
+from harness.runs.folder import Run
+from harness.runs.records import Answer, Decision
+from harness.world import scenarios
 
 BLOCK = 24  # scenes that are compressed and read together
-REPLAYED = 60  # moments of a live run that are played again, for their picture and prompts
+REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
 
 Messages = Sequence[Mapping[str, Any]]
 Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
@@ -26,21 +31,23 @@ KEPT = (
     "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
     "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
 )  # fmt: skip
-LEFT_OUT = ("seed", "safe", "delay_s", "fusion_ms", "effective_loss", "observed_loss", "normalised_entropy")
+# The same for all decisions of a scene, or known from its outcomes.
+LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
 
 
 def prompts_of(run: Run) -> Sent | None:
     """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
-    version, actions = str(run.config["prompt"]["version"]), tuple(run.config["actions"])
+    version, actions = run.manifest.prompt["version"], run.actions
     if version not in versions.names():
         return None
     prompt = versions.load(version)
-    if prompt.sha256 != run.config["prompt"]["sha256"]:
+    if prompt.sha256 != run.manifest.prompt["sha256"]:
         return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard)
-        return readout.asked(messages, actions) if run.answer == "readout" else messages
+        words = scenarios.get(scene.state.scenario).words
+        messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
+        return readout.asked(messages, actions) if run.manifest.answer == "readout" else messages
 
     return sent
 
@@ -56,72 +63,82 @@ class Decisions:
     def __init__(self, runs: Runs, prompts: Prompts = prompts_of) -> None:
         self._runs = runs
         self._prompts = [prompts(run) for run in runs.runs]
-        self._rows = [{str(row["scene"]): row for row in run.rows} for run in runs.runs]
-        first = {scene: row for rows in reversed(self._rows) for scene, row in rows.items()}
-        order = sorted(first.items(), key=lambda one: (one[1]["episode"], one[1]["step"], one[0]))
+        places: dict[str, tuple[int, int, str | None]] = {}
+        for run in reversed(runs.runs):
+            episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
+            danger = run.decisions.labels("danger")
+            for scene, rows in run.decisions.scenes.items():
+                places[scene] = int(episode[rows.start]), int(step[rows.start]), danger[rows.start]
+        order = sorted(places.items(), key=lambda item: (*item[1][:2], item[0]))
         self.ids = [scene for scene, _ in order]
         failed = [failures(run) for run in runs.runs]
+        self._ends = [_ends(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self.index = {
             "actions": runs.actions,
-            "scenes": [[scene, row["episode"], row["step"], row["danger"]] for scene, row in order],
+            "scenes": [[scene, *place] for scene, place in order],
             "block": BLOCK,
             "live": runs.live,
             "statuses": list(map(str, Status)),
-            "runs": [
-                self._indexed(run, rows, [str(run.rows[i]["scene"]) for i in first_failures])
-                for run, rows, first_failures in zip(runs.runs, self._rows, failed, strict=True)
-            ],
+            "runs": [self._indexed(n, list(of)) for n, of in enumerate(failed)],
         }
 
     def _frozen(self) -> dict[str, Scene]:
         assert self._runs.dataset is not None
-        found = {scene.id: scene for scene in self._runs.dataset.scenes}
+        by_id = {scene.id: scene for scene in self._runs.dataset.scenes}
         for run in self._runs.runs:
-            for row in run.rows:
-                if row["scene"] not in found:
+            for scene in run.decisions.scenes:
+                if scene not in by_id:
                     raise UserError(
-                        f"{printable(run.path / 'rows.jsonl')} has scene {printable(row['scene'])!r}, "
+                        f"{printable(run.path / 'decisions.parquet')} has scene {printable(scene)!r}, "
                         "which its dataset has not; make the run again"
                     )
-        return found
+        return by_id
 
-    def _played(self, failed: Sequence[Mapping[int, int]]) -> dict[str, Scene]:
-        """The telling moments, played again; none where this simulator is not what the run's was."""
+    def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
+        """The telling decision points, replayed; none where this simulator differs from the run's."""
+        from harness.evaluate.replay import scene_of  # loads the simulator
+
         telling = [
-            str(chosen.row["scene"])
+            scene
             for run, of in zip(self._runs.runs, failed, strict=True)
-            for chosen in pick(run.rows, of, REPLAYED)
+            for scene in pick(run, of, REPLAYED)
         ]
-        found: dict[str, Scene] = {}
+        replayed: dict[str, Scene] = {}
         for name in dict.fromkeys(telling):
-            here = [
-                (run, of[name]) for run, of in zip(self._runs.runs, self._rows, strict=True) if name in of
-            ]
-            # Who asks nobody, such as a driver, sees a moment with fewer eyes.
-            scene = scene_of(*max(here, key=lambda one: len(one[1]["answers"])))
+            # A run without helpers, such as a driver's, has fewer viewers.
+            here = [run for run in self._runs.runs if name in run.decisions.scenes]
+            scene = scene_of(max(here, key=lambda run: len(run.answers_by_scene.get(name, ()))), name)
             if scene.id == name:
-                found[name] = scene
-        return found
+                replayed[name] = scene
+        return replayed
 
-    def _indexed(self, run: Run, rows: Mapping[str, Row], first_failures: Iterable[str]) -> dict[str, Any]:
+    def _indexed(self, n: int, first_failures: Sequence[str]) -> dict[str, Any]:
         """One run's part of the index: a letter a scene, condition and seed, in this order."""
-        actions, statuses = list(run.config["actions"]), list(map(str, Status))
-        acted, ended, asked, verdicts = [], [], [], []
-        place = {scene: n for n, scene in enumerate(self.ids)}
-        for scene in self.ids:
-            row = rows.get(scene)
-            made = {(d["condition"], d["seed"]): d for d in row["decisions"]} if row else {}
-            for key in ((c, s) for c in run.conditions for s in run.config["seeds"]):
-                d = made.get(key)
-                acted.append(str(actions.index(d["action"])) if d else ABSENT)
-                ended.append(_end(run, row, d) if row and d else ABSENT)
-                asked.append("1" if d and d["triggered"] else "0")
-            met = {a["status"] for a in answers_of(row).values()} if row else ()
-            verdicts.append(sum(1 << statuses.index(status) for status in met if status in statuses))
+        run, ends = self._runs.runs[n], self._ends[n]
+        d, shape = run.decisions, run.grid.shape[:2]
+        place = {scene: position for position, scene in enumerate(self.ids)}
+        of_scene = np.empty(len(d), dtype=int)
+        for scene, rows in d.scenes.items():
+            of_scene[rows.start : rows.stop] = place[scene]
+        of_run = run.grid.places(d) // run.grid.shape[2]
+        letters = {
+            "acted": np.array([str(number) for number in range(len(run.actions))])[
+                d.codes("action", run.actions)
+            ],
+            "ended": ends,
+            "asked": np.where(d.flags("triggered"), "1", "0"),
+        }
+        index = {}
+        for name, values in letters.items():
+            line = np.full((len(self.ids), shape[0] * shape[1]), "0" if name == "asked" else ABSENT)
+            line[of_scene, of_run] = values
+            index[name] = "".join(line.ravel().tolist())
+        statuses = list(map(str, Status))
+        met = [{a.status for a in run.answers_by_scene.get(scene, ())} for scene in self.ids]
         return {
-            "conditions": run.conditions, "seeds": run.config["seeds"], "acted": "".join(acted),
-            "ended": "".join(ended), "asked": "".join(asked), "statuses": verdicts,
+            "conditions": run.conditions, "seeds": run.manifest.seeds, **index,
+            "statuses": [sum(1 << statuses.index(s) for s in of if s in statuses) for of in met],
             "first": [place[scene] for scene in first_failures],
         }  # fmt: skip
 
@@ -131,67 +148,79 @@ class Decisions:
             yield [self._detail(scene) for scene in self.ids[start : start + BLOCK]]
 
     def _detail(self, name: str) -> dict[str, Any]:
-        scene, rows = self._scenes.get(name), [of.get(name) for of in self._rows]
+        scene = self._scenes.get(name)
         sent: dict[str, Any] = {}
-        told = [self._told(n, row, scene, sent) if row else None for n, row in enumerate(rows)]
-        row = next(row for row in rows if row)
+        outcomes = None
+        if scene and self._runs.dataset:
+            run = next(run for run in self._runs.runs if name in run.decisions.scenes)
+            outcomes = scenes.outcomes(scene, run.decisions, run.decisions.scenes[name].start)
         return {
             "world": scene and scenes.world(scene),
-            "outcomes": scenes.outcomes(scene, self._runs.actions, row) if scene and "safe" in row else None,
+            "outcomes": outcomes,
+            "runs": [self._of_run(n, name, scene, sent) for n in range(len(self._runs.runs))],
             "prompts": list(sent.values()),
-            "runs": told,
         }
 
-    def _told(self, n: int, row: Row, scene: Scene | None, sent: dict[str, Any]) -> dict[str, Any]:
+    def _of_run(self, n: int, name: str, scene: Scene | None, sent: dict[str, Any]) -> dict[str, Any] | None:
         run, prompts = self._runs.runs[n], self._prompts[n]
+        rows = run.decisions.scenes.get(name)
+        if rows is None:
+            return None
         answers = []
-        for viewer, answer in answers_of(row).items():
+        by_viewer = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
+        for answer in by_viewer.values():
             shown = {
-                key: v for key in KEPT if (v := answer.get(key)) is not None and v is not False and v != []
+                key: v
+                for key in KEPT
+                if (v := getattr(answer, key)) is not None and v is not False and v != ()
             }
-            found = _read_in(answer, run) if answer["repairs"] else []
             asked = None
             if scene and prompts:
-                messages = prompts(scene, viewer.partition("+")[0], _heard(row, viewer))
+                messages = prompts(scene, answer.viewer, messages_of(by_viewer, answer.heard))
                 key = digest(messages)
-                if answer.get("prompt_sha256") in (None, key):
+                if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
-            answers.append({**shown, "viewer": viewer, "spans": found, "prompt": asked})
-        decisions: dict[str, dict[str, Any]] = {}  # seeds that came to the same are told once
-        for d in row["decisions"]:
-            made = {key: value for key, value in d.items() if key not in LEFT_OUT} | {
-                "end": _end(run, row, d)
-            }
-            decisions.setdefault(repr(made), {**made, "seeds": []})["seeds"].append(d["seed"])
+            spans_read = _read_in(answer, run) if answer.repairs else []
+            answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
+        decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
+        for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
+            shown = {**_shown(d), "end": str(self._ends[n][row])}
+            decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
         ends = None
-        if isinstance(run, Driven):
+        if run.world == "closed-loop":
+            number = int(run.decisions.whole("episode")[rows.start])
             ends = [
-                {"condition": c, "seed": s, **run.ends[c, s, row["episode"]]}
-                for c in run.conditions for s in run.config["seeds"]
+                {
+                    "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
+                    "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
+                    "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
+                    "other_crashes": e.other_crashes,
+                }
+                for e in run.episodes if e.episode == number
             ]  # fmt: skip
         return {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
 
 
-def _read_in(answer: Row, run: Run) -> list[tuple[int, int]]:
+def _shown(d: Decision) -> dict[str, Any]:
+    plain = msgspec.to_builtins(d)
+    return {key: value for key, value in plain.items() if key not in LEFT_OUT and not (
+        value is None and key in ("acts_at_s", "acted")
+    )}  # fmt: skip
+
+
+def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
-    role = "helper" if answer["role"] == "helper" else "ego"
-    return spans(answer["raw"], role, run.config["actions"], bool(run.config.get("thinking")))
+    role = "helper" if answer.role == "helper" else "ego"
+    return spans(answer.raw, role, run.actions, run.manifest.thinking)
 
 
-def _end(run: Run, row: Row, d: Row) -> str:
-    """What came of a decision; live, what its episode came to."""
-    if isinstance(run, Driven):
-        result = run.ends[d["condition"], d["seed"], row["episode"]]["result"]
-        return {"cleared": GOOD, "late": SLOW}.get(result, BAD)
-    if not any(row["safe"]):
-        return BLAMELESS
-    if not d["safe"]:
-        return BAD
-    return SLOW if d["delay_s"] else GOOD
-
-
-def _heard(row: Row, viewer: str) -> Messages:
-    """What an ego that answered a second time had heard, from its key in `merged`: itself and the senders."""
-    said = {sender: row["answers"][sender] for sender in viewer.split("+")[1:] if sender in row["answers"]}
-    return [{"sender": s, "intent": a["intent"], **(a["message"] or {})} for s, a in said.items()]
+def _ends(run: Run) -> Any:
+    """What each decision led to, a letter a decision (n,); in the closed loop, what its episode came to."""
+    d = run.decisions
+    if run.world == "closed-loop":
+        letters = {"": GOOD, "late": SLOW}
+        return np.array([letters.get(e.failure, BAD) for e in run.episodes])[run.grid.places(d)]
+    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
+    safe = np.where(np.nan_to_num(d["delay_s"]) > 0, SLOW, GOOD)
+    return np.where(avoidable, np.where(d.flags("safe"), safe, BAD), BLAMELESS)

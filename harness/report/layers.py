@@ -7,7 +7,7 @@ What is drawn in `currentColor` is light on dark and dark on light.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from harness.report.drawing.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
 
 Spec = dict[str, Any]
 Rows = Sequence[Mapping[str, Any]]
@@ -60,19 +60,35 @@ def share_axis(field: str, title: str) -> Spec:
     return {"field": field, **NUMBER, "title": title, "axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
 
 
+def colour(field: str, colours: Mapping[str, str]) -> Spec:
+    """A colour for each value of a field, whose name the legend leaves out."""
+    return {
+        "field": field, "type": "nominal",
+        "scale": {"domain": list(colours), "range": list(colours.values())},
+        "legend": {"orient": "top", "title": None},
+    }  # fmt: skip
+
+
 def colours_of(rows: Rows, field: str) -> Spec:
     """A colour for each value of a field, in the order in which they come."""
-    domain = list(dict.fromkeys(str(row[field]) for row in rows))
-    return {
-        "field": field, "type": "nominal", "scale": {"domain": domain, "range": SERIES},
-        "legend": {"orient": "top"},
-    }  # fmt: skip
+    shapes = shapes_of(rows, field)
+    return {**shapes, "scale": {**shapes["scale"], "range": SERIES}}
 
 
 def shapes_of(rows: Rows, field: str) -> Spec:
     """A shape where `colours_of` has a colour; of one field, both have one legend."""
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
     return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
+
+
+def names_axis(field: str) -> Spec:
+    """A name a line along y, in the order in which they come."""
+    return {"field": field, "type": "nominal", "sort": None, "title": None}
+
+
+def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
+    """A filled point for each row."""
+    return {"mark": {"type": "point", "filled": True, "size": size, "opacity": 1}, "encoding": encoding}
 
 
 def tooltip(rows: Rows) -> list[Spec]:

@@ -1,4 +1,4 @@
-"""What a page carries besides its text: compressed data, the charting library, and what lets it run.
+"""What a page carries besides its text: packed data, pictures, the charting library, and what lets it run.
 
 Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which vl-convert
 brings along. It is compressed in the page as everything large is; scripts are let run by their digest alone.
@@ -15,17 +15,30 @@ from typing import Any
 
 from markupsafe import Markup
 
+from harness.core import kept
+from harness.core.files import sha256_bytes
+
 # In the order in which they need each other.
 SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")
 FOLDER = Path(__file__).parent / "scripts"
+# Digests of the bundles of versions of vl-convert: making one takes a second, and no other script is taken
+# from a cache that anyone may have written to.
+BUNDLES = {"1.9.0.post1": "373b1f84072b31010f15ceb787be6b415c53936411aae267c8c2b2b6ccde46e7"}
 
 
 @cache
 def vega() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script that leaves `vegaEmbed` behind."""
-    import vl_convert
+    expected = BUNDLES.get(version("vl-convert-python"))
+    name = f"vega-{expected}.js"
+    bundle = kept.recall(name) if expected else None
+    if bundle is None or sha256_bytes(bundle) != expected:
+        import vl_convert
 
-    return "(()=>{" + vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;") + "})();"
+        bundle = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;").encode()
+        if sha256_bytes(bundle) == expected:
+            kept.keep(name, bundle)
+    return f"(()=>{{{bundle.decode()}}})();"
 
 
 @cache
@@ -52,6 +65,11 @@ def packed(value: Any) -> Markup:
     if not isinstance(value, str):
         text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode())
+
+
+def picture(svg: bytes) -> str:
+    """A picture as what an `img` of a page that stands alone takes."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
 
 
 def policy(*scripts: str) -> str:

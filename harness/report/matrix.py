@@ -6,11 +6,12 @@ from statistics import median
 
 import numpy as np
 
-from harness.core.errors import UserError, printable
 from harness.core.paired import SuccessTest, success_test
 from harness.report.runs import Runs
-from harness.report.words import LATENCY, SUCCESS, success_of
-from harness.runs.folder import Run, Score, answers_of, table
+from harness.report.words import success_of
+from harness.runs.folder import Run
+from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.records import Score
 
 P_VALUE = 0.05
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
@@ -89,17 +90,16 @@ def lines(runs: Runs) -> list[Line]:
     """Every run under each of its conditions, by condition and then in the runs' order."""
     ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
-    found = []
+    rows = []
     for condition in runs.conditions:
         marks = _marks([of.get(condition) for of in ended])
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                model, prompt = str(run.config["model"].get("name")), str(run.config["prompt"]["version"])
-                found.append(
-                    Line(runs.names[n], model, prompt, run.answer, condition, scores, lengths[n], *marks[n])
-                )
-    return found
+                who = run.manifest.variant
+                of_line = runs.names[n], who.model, who.prompt, who.answer, condition
+                rows.append(Line(*of_line, scores, lengths[n], *marks[n]))
+    return rows
 
 
 def grids(found: Sequence[Line]) -> list[Grid]:
@@ -125,9 +125,9 @@ def _score(run: Run, condition: str, metric: str) -> Score | None:
 
 
 def _tokens(run: Run) -> tuple[float | None, float | None]:
-    answers = [a for row in run.rows for a in answers_of(row).values()]
     counts = [
-        [a[key] for a in answers if a.get(key) is not None] for key in ("prompt_tokens", "completion_tokens")
+        [count for a in run.answers if (count := getattr(a, key)) is not None]
+        for key in ("prompt_tokens", "completion_tokens")
     ]
     sent, answered = (float(median(of)) if of else None for of in counts)
     return sent, answered
@@ -135,31 +135,24 @@ def _tokens(run: Run) -> tuple[float | None, float | None]:
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
     """Success, 0 or 1, by condition and, in each, by episode and seed."""
-
-    def one(line: Mapping[str, str]) -> tuple[str, tuple[int, int], float]:
-        return line["condition"], (int(line["episode"]), int(line["seed"])), float(line["success"] == "True")
-
-    file = run.path / "episodes.csv"
-    found: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
-    for condition, key, success in table(file, one):
-        if condition not in found:
-            raise UserError(f"{printable(file)} has another condition than its run; make the run again")
-        found[condition][key] = success
-    return found
+    by_condition: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
+    for episode in run.episodes:
+        by_condition[episode.condition][episode.episode, episode.seed] = float(episode.success)
+    return by_condition
 
 
 def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Behind | None]]:
     """What each run is against the best, paired by episode; nothing where there is only one."""
-    known = [n for n, of in enumerate(ended) if of]
-    if len(known) < 2:
+    scored = [n for n, of in enumerate(ended) if of]
+    if len(scored) < 2:
         return [("", None)] * len(ended)
-    best = max(known, key=lambda n: np.mean(list((ended[n] or {}).values())))
-    found: list[tuple[str, Behind | None]] = []
+    best = max(scored, key=lambda n: np.mean(list((ended[n] or {}).values())))
+    marks: list[tuple[str, Behind | None]] = []
     for n, of in enumerate(ended):
         behind = None if n == best else _behind(of or {}, ended[best] or {})
         mark = "" if behind is None else CLOSE if behind.undecided else WORSE
-        found.append((BEST if n == best else mark, behind))
-    return found
+        marks.append((BEST if n == best else mark, behind))
+    return marks
 
 
 def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]) -> Behind | None:
@@ -174,15 +167,15 @@ def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int],
 
 def headline(found: Sequence[Line]) -> str:
     """What came out of several runs: under each condition the best, and which cannot be told from it."""
-    told = []
+    best = []
     for line in found:
         success = line.scores[SUCCESS]
         if line.mark == BEST and success:
             close = [o.name for o in found if o.condition == line.condition and o.mark == CLOSE]
             rest = f", not told apart from {', '.join(close)}" if close else ""
-            told.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
+            best.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
     return (
-        f"Best under {'; '.join(told)}."
-        if told
+        f"Best under {'; '.join(best)}."
+        if best
         else "The runs share no episodes, so none is called the best."
     )

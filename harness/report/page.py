@@ -9,19 +9,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
-from harness.report.decision_charts import policies, timeline
+from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
-from harness.report.drawing.ground import roads
-from harness.report.drawing.scene import VIEW_M
+from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
+from harness.runs.records import Latency
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -38,7 +40,7 @@ def write_report(
         runs: what to report.
         out: file to replace.
         prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
-            had heard; None where nobody knows. By default the run's own prompt version, if it is here.
+            had heard; None where they are unknown. By default the run's own prompt version, if it is here.
         progress: called with the number of scenes just packed.
 
     Returns:
@@ -63,6 +65,7 @@ def save(page: str, out: Path, option: str) -> None:
         ) from None
 
 
+@uncollected()
 def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:
@@ -97,24 +100,24 @@ def render(
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     """What the page's script has to know of the runs, besides the decisions."""
-    outline, marks, stops = roads(VIEW_M + 5.0)
+    surface = ground_of(runs.scenario)
     return {
         "names": runs.names,
         "runs": [
             {
-                "inference_s": run.config["latency"]["inference_s"],
-                "merge_s": run.config["latency"].get("merge_s"),
+                "inference_s": inference_s(run.manifest.latency),
+                "merge_s": run.manifest.latency.fusion_s,
                 "points": {
                     c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}
-                    for c in run.config["conditions"]
+                    for c in run.manifest.conditions
                 },
             }
             for run in runs.runs
         ],
         "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
         "ground": {
-            "view_m": VIEW_M, "outline": outline.round(2).tolist(),
-            "marks": [m.tolist() for m in marks], "stops": [s.tolist() for s in stops],
+            "view_m": VIEW_M, "outline": surface.outline.round(2).tolist(),
+            "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},
         "policies": policies(),
@@ -122,20 +125,25 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def inference_s(latency: Latency) -> dict[str, float | None] | None:
+    """Seconds of one inference by role; None where each answer has its own time."""
+    return None if latency.each_its_own else {"ego": latency.ego_s, "helper": latency.helper_s}
+
+
 def environment(*more: Path) -> Environment:
     """The report's templates, and those of other folders: everything is escaped and made `visible`."""
-    found = Environment(
+    templates = Environment(
         loader=FileSystemLoader([*more, TEMPLATES]),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=visible,
     )
-    found.filters |= {
+    templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown,
-        "latency_source": words.latency_source, "columns": _table,
+        "latency_source": words.latency_source, "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
-    return found
+    return templates
 
 
 def visible(value: Any) -> Any:

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from harness.evaluate.success import driver_choices, judge_choices, table
+from harness.backends.registry import find
+from harness.evaluate.success import reference_success
 from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
 from harness.runs.folder import Run
-from harness.world.drivers import DRIVERS
 
 Part = Literal["overview", "answers", "communication"]
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
@@ -43,8 +43,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             for row in of(run)
         ]
 
-    laid = {run.path: statistics.decisions(run) for run in runs.runs}
-    points = [c for run in runs.runs for c in run.config["conditions"] if c.get("profile")]
+    points = [c for run in runs.runs for c in run.manifest.conditions if c.get("profile")]
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
@@ -66,7 +65,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "the others gave no distribution.",
             charts.statuses(rows),
         )  # fmt: skip
-    if rows := joined(lambda run: statistics.reliability(run, laid[run.path])):
+    if rows := joined(statistics.reliability):
         yield Panel(
             "reliability", "answers", "Is the policy as safe as it is sure?",
             "Each point is the decisions whose fused probability of the action taken lies in one tenth: "
@@ -82,7 +81,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "One count an answer that could be read. Dashed: τ, above which the ego asks for help.",
             charts.entropies(rows, tau_nats, statistics.ENTROPY_NATS),
         )  # fmt: skip
-    if rows := joined(lambda run: statistics.errors(run, laid[run.path])):
+    if rows := joined(statistics.errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
@@ -112,21 +111,17 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
 
 def _references(runs: Runs) -> dict[str, float]:
-    """Success of the reference drivers: on frozen scenes by the rule, live where a run was driven by one."""
+    """Success of the reference drivers: on frozen scenes by the rule, in closed loop from their own runs."""
     if runs.dataset is None:
-        found = {
-            run.config["model"]["name"]: run
+        drivers = {
+            run.manifest.model["name"]: run
             for run in runs.runs
-            if run.config["model"].get("engine") == "driver"
+            if (engine := find(str(run.manifest.model.get("engine")))) and engine.capabilities.reference
         }
-        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in found.items()}
+        scores = {name: run.score(run.conditions[0], "success_rate") for name, run in drivers.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}
-    episodes = {row["episode"] for run in runs.runs for row in run.rows}
+    episodes = {number for run in runs.runs for number in run.grid.episodes}
     driven = replace(
         runs.dataset, scenes=tuple(s for s in runs.dataset.scenes if s.record["episode"] in episodes)
     )
-    laid = table(driven)
-    return {
-        driver: float(judge_choices(laid, driver_choices(driven, driver)).success.mean())
-        for driver in DRIVERS
-    }
+    return reference_success(driven)

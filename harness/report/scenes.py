@@ -1,11 +1,12 @@
-"""What a page knows of a scene itself: who is where, what each viewer sees, what each action leads to."""
+"""What a page knows of a scene itself: who is where, what each viewer sees, where each action leads."""
 
-from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from harness.dataset.load import Scene
-from harness.report.drawing.scene import conflict_points
-from harness.runs.folder import Row
+from harness.report.drawing.geometry import conflict_points
+from harness.runs.decisions import Decisions
 
 
 def world(scene: Scene) -> dict[str, Any]:
@@ -42,9 +43,13 @@ def world(scene: Scene) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def outcomes(scene: Scene, actions: Sequence[str], row: Row) -> list[dict[str, Any]]:
-    """What each action leads to, in a frozen scene."""
+def outcomes(scene: Scene, decisions: Decisions, row: int) -> list[dict[str, Any]]:
+    """What each action leads to, in a frozen scene, of which a row of decisions is one."""
     return [
-        {**scene.record["outcomes"][action], "action": action, "safe": safe, "delay_s": delay_s}
-        for action, safe, delay_s in zip(actions, row["safe"], row["delay_s"], strict=True)
-    ]
+        {**scene.record["outcomes"][action], "action": action, "safe": bool(safe == 1.0),
+         "delay_s": None if np.isnan(delay_s) else float(delay_s)}
+        for action, safe, delay_s in zip(
+            decisions.actions, decisions.of_actions("safe")[row], decisions.of_actions("delay_s")[row],
+            strict=True,
+        )
+    ]  # fmt: skip

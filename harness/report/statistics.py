@@ -1,82 +1,42 @@
-"""What the report's charts show, counted from the rows of runs: a table a chart, as plain rows.
+"""What the report's charts show, counted from the tables of runs: a table a chart, as plain rows.
 
 Shares are 0 to 1. Where a row has `low` and `high` they are a 95 % interval over episodes.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import share_interval
-from harness.parsing.parse import Status
-from harness.report.words import LATENCY, SUCCESS
-from harness.runs.folder import Run, answers_of
+from harness.parsing.status import Status
+from harness.runs.folder import Run
+from harness.runs.metrics import LATENCY, SUCCESS
 
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
 CERTAINTY = 0.1
 
 
-@dataclass(frozen=True)
-class Decisions:
-    """All decisions of a run as arrays (n,).
-
-    Attributes:
-        condition: position among the run's conditions.
-        episode: its number.
-        entropy_nats: of the ego's own intent.
-        certainty: the fused probability of the action taken.
-        unsafe: 1, 0, or NaN where nobody knows or no action was safe.
-    """
-
-    condition: Ints
-    episode: Ints
-    entropy_nats: Floats
-    certainty: Floats
-    unsafe: Floats
-
-
-def decisions(run: Run) -> Decisions:
-    """Lay a run's decisions out as arrays."""
-    place = {name: n for n, name in enumerate(run.conditions)}
-    actions = list(run.config["actions"])
-    found: list[tuple[float, ...]] = []
-    for row in run.rows:
-        judged = any(row.get("safe", ()))
-        for d in row["decisions"]:
-            found.append((
-                place[d["condition"]], row["episode"],
-                np.nan if d["entropy_nats"] is None else d["entropy_nats"],
-                d["fused"][actions.index(d["action"])],
-                float(not d["safe"]) if judged else np.nan,
-            ))  # fmt: skip
-    columns = np.array(found, dtype=float).reshape(-1, 5).T
-    return Decisions(columns[0].astype(int), columns[1].astype(int), *columns[2:])
-
-
 def success(run: Run) -> Table:
     """Success and latency of each condition, of which both are known."""
-    told = []
+    rows = []
     for condition in run.conditions:
         latency, rate = run.score(condition, LATENCY), run.score(condition, SUCCESS)
         if latency and rate:
-            told.append({
+            rows.append({
                 "condition": condition, "latency_ms": latency.value, "latency_low": latency.low,
                 "latency_high": latency.high, "success": rate.value, "low": rate.low, "high": rate.high,
                 "n": rate.n, "interval": rate.interval,
             })  # fmt: skip
-    return told
+    return rows
 
 
 def statuses(run: Run) -> Table:
     """How many answers of each role have which status."""
-    count = Counter(
-        (a["role"], a["status"], a["verdict"]) for row in run.rows for a in answers_of(row).values()
-    )
+    count = Counter((a.role, a.status, a.verdict) for a in run.answers)
     of: Counter[str] = Counter()
     for (role, _, _), n in count.items():
         of[role] += n
@@ -90,26 +50,34 @@ def statuses(run: Run) -> Table:
     ]
 
 
-def reliability(run: Run, found: Decisions) -> Table:
+def reliability(run: Run) -> Table:
     """How often the action taken was safe, by how probable fusion held it."""
-    bins = np.minimum((found.certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
-    return list(_shares(run, found, bins, found.certainty, 1.0 - found.unsafe, "certainty"))
+    certainty = run.decisions.of_actions("fused").max(axis=1)
+    bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
+    return list(_shares(run, bins, certainty, 1.0 - _unsafe(run), "certainty"))
 
 
-def errors(run: Run, found: Decisions) -> Table:
+def errors(run: Run) -> Table:
     """How often a decision was unsafe, by the entropy of the ego's own intent."""
-    bins = np.where(np.isnan(found.entropy_nats), -1, found.entropy_nats / ENTROPY_NATS).astype(int)
-    return list(_shares(run, found, bins, found.entropy_nats, found.unsafe, "entropy_nats"))
+    nats = run.decisions["entropy_nats"]
+    bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
+    return list(_shares(run, bins, nats, _unsafe(run), "entropy_nats"))
 
 
-def _shares(
-    run: Run, found: Decisions, bins: Ints, value: Floats, hits: Floats, name: str
-) -> Iterator[dict[str, Any]]:
+def _unsafe(run: Run) -> Floats:
+    """1 or 0 a decision, (n,); NaN where that is unknown or no action was safe."""
+    d = run.decisions
+    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
+    return np.where(avoidable, 1.0 - d["safe"], np.nan)
+
+
+def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Iterator[dict[str, Any]]:
+    conditions, episodes = run.decisions.codes("condition", run.conditions), run.decisions.whole("episode")
     for n, condition in enumerate(run.conditions):
-        for one in np.unique(bins[(found.condition == n) & (bins >= 0)]):
-            here = (found.condition == n) & (bins == one) & ~np.isnan(hits)
+        for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
+            here = (conditions == n) & (bins == place) & ~np.isnan(hits)
             if here.any():
-                share = share_interval(hits[here], found.episode[here])
+                share = share_interval(hits[here], episodes[here])
                 yield {
                     "condition": condition, name: round(float(value[here].mean()), 4), "share": share.value,
                     "low": share.low, "high": share.high, "n": share.n,
@@ -118,55 +86,55 @@ def _shares(
 
 def entropies(run: Run) -> Table:
     """How uncertain the ego's own answers are."""
-    p = [
-        a["intent"] for row in run.rows for a in row["answers"].values() if a["role"] == "ego" and a["intent"]
-    ]
+    p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
     if not p:
         return []
-    known = np.array(p, dtype=float)
-    nats = -np.sum(known * np.log(np.where(known > 0, known, 1.0)), axis=1)
+    probabilities = np.array(p, dtype=float)
+    nats = -np.sum(probabilities * np.log(np.where(probabilities > 0, probabilities, 1.0)), axis=1)
     return _histogram(nats, ENTROPY_NATS, "entropy_nats")
 
 
 def tokens(run: Run) -> Table:
     """Tokens of prompts by role, where the engine counts them."""
     by_role: dict[str, list[float]] = {}
-    for row in run.rows:
-        for a in answers_of(row).values():
-            if a.get("prompt_tokens") is not None:
-                by_role.setdefault(a["role"], []).append(a["prompt_tokens"])
+    for answer in run.answers:
+        if answer.prompt_tokens is not None:
+            by_role.setdefault(answer.role, []).append(answer.prompt_tokens)
     return [{"role": role, **bar} for role, of in by_role.items() for bar in _histogram(of, TOKENS, "tokens")]
 
 
 def replies(run: Run) -> Table:
     """What became of the replies that were scheduled."""
-    count: Counter[tuple[str, str]] = Counter()
-    for row in run.rows:
-        for d in row["decisions"]:
-            for m in d["messages"]:
-                came = "on time" if m["on_time"] else "late" if m["delivered"] else "lost"
-                count[d["condition"], came] += 1
-    return [
-        {"condition": condition, "reply": came, "count": n, "share": n / total, "n": total}
-        for condition in run.conditions
-        if (total := sum(count[condition, came] for came in ("on time", "late", "lost")))
-        for came in ("on time", "late", "lost")
-        if (n := count[condition, came])
-    ]
+    d = run.decisions
+    delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
+    became = {
+        "on time": on_time == 1.0,
+        "late": (delivered == 1.0) & (on_time == 0.0),
+        "lost": delivered == 0.0,
+    }
+    conditions = d.codes("condition", run.conditions)
+    rows = []
+    for place, condition in enumerate(run.conditions):
+        count = {reply: int(which[conditions == place].sum()) for reply, which in became.items()}
+        total = sum(count.values())
+        rows += [
+            {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}
+            for reply, n in count.items() if n
+        ]  # fmt: skip
+    return rows
 
 
 def arrivals(run: Run) -> Table:
     """When replies that are not lost arrive, in ms from the start of the decision."""
-    by_condition: dict[str, list[float]] = {}
-    for row in run.rows:
-        for d in row["decisions"]:
-            of = by_condition.setdefault(d["condition"], [])
-            of += [m["arrival_ms"] for m in d["messages"] if m["arrival_ms"] is not None]
+    d = run.decisions
+    arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
+    by_condition = {name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)}
     return [
         {"condition": condition, **bar}
-        for condition, of in by_condition.items() if of
-        for bar in _histogram(of, ARRIVAL_MS, "arrival_ms")
-    ]  # fmt: skip
+        for condition, of in by_condition.items()
+        if len(known := of[~np.isnan(of)])
+        for bar in _histogram(known, ARRIVAL_MS, "arrival_ms")
+    ]
 
 
 def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Table:

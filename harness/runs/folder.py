@@ -1,203 +1,284 @@
-"""A run folder, read again: for its report, to be coordinated otherwise, and to be played again."""
+"""A run's folder: one writer and one reader, for every world.
+
+`answers.jsonl` has an answer a line, `decisions.parquet` a decision a row; `episodes.csv` and `summary.csv`
+follow from them; `run.json` says what all was made of, and is written last.
+"""
 
 import csv
-import json
-from collections.abc import Callable, Iterable, Mapping
+import io
+import os
+import shutil
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.spec import FORMAT
+from harness.runs.decisions import Decisions
+from harness.runs.formats import FORMAT, READ_BY
+from harness.runs.metrics import Grid, World
+from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score, Variant
 
 T = TypeVar("T")
-Row = dict[str, Any]  # one decision point of rows.jsonl
-
-
-@dataclass(frozen=True)
-class Form:
-    """What a run of one kind has.
-
-    Attributes:
-        format: what its run.json says it is.
-        command: what makes it.
-        needed: keys of its run.json.
-        needed_in_row: keys of each row of its rows.jsonl.
-    """
-
-    format: str
-    command: str
-    needed: tuple[str, ...]
-    needed_in_row: tuple[str, ...]
-
-
-NEEDED = ("model", "prompt", "actions", "conditions", "seeds", "latency")
-NEEDED_IN_ROW = ("scene", "episode", "danger", "answers", "decisions")
-FROZEN = Form(FORMAT, "harness eval", (*NEEDED, "dataset"), (*NEEDED_IN_ROW, "safe", "delay_s"))
-
-
-@dataclass(frozen=True)
-class Score:
-    """One line of summary.csv.
-
-    Attributes:
-        condition: name of the operating point, or `all` for what does not depend on it.
-        metric: name of the metric, its unit at the end.
-        value: the mean; None if there was nothing to average.
-        low: lower end of the 95 % interval; None where the data cannot bound it.
-        high: upper end.
-        n: units behind it.
-        n_excluded: units without a value.
-        interval: what the units are: `episodes`, `seed means` or `answers`.
-    """
-
-    condition: str
-    metric: str
-    value: float | None
-    low: float | None
-    high: float | None
-    n: int
-    n_excluded: int
-    interval: str
+Record = TypeVar("Record", bound=Struct)
+_BROKEN = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    NotImplementedError,  # of Arrow, for a column of another type
+    RecursionError,
+    OverflowError,
+    csv.Error,
+)
+_KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+_ANSWER = msgspec.json.Decoder(Answer)
+_ENCODER = msgspec.json.Encoder()
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run. A table is read when it is first asked for; each raises UserError if it is broken.
 
     Attributes:
         path: its folder.
-        config: run.json.
-        scores: summary.csv.
-        rows: rows.jsonl.
+        manifest: `run.json`.
     """
 
     path: Path
-    config: Mapping[str, Any]
-    scores: tuple[Score, ...]
-    rows: tuple[Row, ...]
+    manifest: Manifest
 
     @property
-    def answer(self) -> str:
-        """Its answer mode; runs of older versions name none, and had one."""
-        return str(self.config.get("answer", "json"))
+    def world(self) -> World:
+        """Frozen or closed-loop."""
+        return "frozen" if isinstance(self.manifest.world, FrozenScenes) else "closed-loop"
 
     @property
-    def source(self) -> str:
-        """What its episodes are of."""
-        return str(self.config["dataset"].get("name"))
+    def actions(self) -> tuple[str, ...]:
+        """Meta-actions, in the order of every distribution."""
+        return self.manifest.actions
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the operating points, in the run's order."""
-        return tuple(str(condition["name"]) for condition in self.config["conditions"])
+        return tuple(str(condition["name"]) for condition in self.manifest.conditions)
+
+    @property
+    def source(self) -> str:
+        """The source of its episodes, for people."""
+        world = self.manifest.world
+        return world.name if isinstance(world, FrozenScenes) else f"{world.scenario['name']} (driven live)"
+
+    @cached_property
+    def scores(self) -> tuple[Score, ...]:
+        """`summary.csv`."""
+        return self._read("summary.csv", lambda file: _records(file, Score))
+
+    @property
+    def episodes(self) -> tuple[Episode, ...]:
+        """`episodes.csv`, one of each condition, seed and episode."""
+        return self._placed[1]
+
+    @property
+    def grid(self) -> Grid:
+        """Conditions, seeds and episodes."""
+        return self._placed[0]
+
+    @cached_property
+    def _placed(self) -> tuple[Grid, tuple[Episode, ...]]:
+        return self._read("episodes.csv", self._place)
+
+    @cached_property
+    def decisions(self) -> Decisions:
+        """`decisions.parquet`: every decision is of an episode of the run."""
+        return self._read("decisions.parquet", self._decisions)
+
+    @cached_property
+    def answers(self) -> tuple[Answer, ...]:
+        """`answers.jsonl`."""
+        return self._read("answers.jsonl", lambda file: tuple(_answers(file, len(self.actions))))
+
+    @cached_property
+    def answers_by_scene(self) -> dict[str, list[Answer]]:
+        """The answers of each decision point, in their order."""
+        by_scene: dict[str, list[Answer]] = {}
+        for answer in self.answers:
+            by_scene.setdefault(answer.scene, []).append(answer)
+        return by_scene
 
     def score(self, condition: str, metric: str) -> Score | None:
         """A metric's value in one condition; where it has several intervals, the one over episodes."""
-        found = [
+        candidates = [
             s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
-        return min(found, key=lambda s: s.interval != "episodes", default=None)
+        return min(candidates, key=lambda s: s.interval != "episodes", default=None)
+
+    def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
+        episodes = _records(file, Episode)
+        numbers = tuple(dict.fromkeys(episode.episode for episode in episodes))
+        grid = Grid(self.conditions, self.manifest.seeds, numbers)
+        return grid, tuple(grid.ordered(episodes))
+
+    def _decisions(self, file: Path) -> Decisions:
+        decisions = Decisions.read(file, self.actions)
+        decisions.codes("action", self.actions)
+        if infinite := decisions.infinite():
+            raise ValueError(f"{infinite} is infinite")
+        places = self.grid.places(decisions)
+        steps, step = np.unique(decisions.whole("step"), return_inverse=True)
+        decided = np.sort(places * len(steps) + step, kind="stable")
+        if (decided[1:] == decided[:-1]).any():
+            raise ValueError("a decision is there twice")
+        begun = np.bincount(places, minlength=len(self.episodes))
+        if (begun != [episode.decisions for episode in self.episodes]).any():
+            raise ValueError("not every decision of episodes.csv is there")
+        return decisions
+
+    def _read(self, name: str, reader: Callable[[Path], T]) -> T:
+        return whole(self.path / name, reader)
 
 
-def answers_of(row: Row) -> dict[str, Row]:
-    """All answers of a row: by viewer, and the ego's second ones by whose messages they had."""
-    return {**row["answers"], **row.get("merged", {})}
-
-
-def read(path: Path, *forms: Form) -> Run:
-    """Read a run folder of one of these forms; of a frozen run, where none is given.
+def read(path: Path) -> Run:
+    """Read a run folder.
 
     Raises:
-        UserError: it is none, or a file of it is missing or broken.
+        UserError: it is none, its manifest is broken, or it is of another version.
     """
-    forms = forms or (FROZEN,)
-    makers = " or ".join(f"`{form.command}`" for form in forms)
-    if not (path / "run.json").is_file():
-        raise UserError(f"{printable(path)} is no run: it has no run.json; give a folder made by {makers}")
-    config = _parsed(path / "run.json", json.loads, _text(path / "run.json"))
-    found = config.get("format") if isinstance(config, dict) else None
-    form = next((form for form in forms if form.format == found), None)
-    if form is None:
+    file = path / "run.json"
+    if not file.is_file():
         raise UserError(
-            f"{printable(path / 'run.json')} has format {printable(found)!r}, not "
-            f"{' or '.join(repr(form.format) for form in forms)}; give a folder made by {makers}"
+            f"{printable(path)} is no finished run: it has no run.json; "
+            "give a folder made by `harness eval` or `harness drive`"
         )
-    _need(path / "run.json", config, form.needed)
-    scores = table(path / "summary.csv", _score)
-    rows = []
-    for n, line in enumerate(_text(path / "rows.jsonl").split("\n"), 1):
-        if line.strip():
-            where = f"{path / 'rows.jsonl'} line {n}"
-            row = _parsed(where, json.loads, line)
-            _need(where, row, form.needed_in_row)
-            rows.append(row)
-    if not rows:
-        raise UserError(f"{printable(path / 'rows.jsonl')} holds no decisions; make the run again")
-    return Run(path, config, scores, tuple(rows))
+    stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))
+    version = stated.get("format") if isinstance(stated, dict) else None
+    if version != FORMAT:
+        old = READ_BY.get(version) if isinstance(version, str) else None
+        raise UserError(
+            f"{printable(file)} has format {printable(version)!r}, not {FORMAT!r}; "
+            + (f"harness {old} reads it: run again, or install that version" if old
+               else "give a folder made by `harness eval` or `harness drive`")
+        )  # fmt: skip
+    return Run(path, whole(file, lambda file: msgspec.convert(stated, Manifest)))
 
 
-def table(file: Path, row: Callable[[Mapping[str, str]], T]) -> tuple[T, ...]:
-    """What `row` makes of each line of a CSV file. Raises UserError if it is missing or broken."""
-    rows: tuple[T, ...] = _parsed(
-        file, lambda text: tuple(map(row, csv.DictReader(text.splitlines()))), _text(file)
-    )
-    return rows
+def write(
+    out: Path, manifest: Manifest, decisions: Decisions, episodes: Sequence[Episode],
+    answers: Sequence[Answer], scores: Sequence[Score],
+) -> None:  # fmt: skip
+    """Write a run's files, the manifest last. Decisions are rounded already."""
+    write_whole(out / "answers.jsonl", _ENCODER.encode_lines(answers))
+    decisions.write(out / "decisions.parquet")
+    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
+    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
+    text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
+    write_whole(out / "run.json", text + b"\n")
+
+
+def write_part(
+    out: Path, decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
+) -> None:
+    """Write part of a run to a folder of its own, which is there whole or not at all."""
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    decisions.write(part / "decisions.parquet")
+    write_whole(part / "answers.jsonl", _ENCODER.encode_lines(answers))
+    write_whole(part / "episodes.csv", csv_text(Episode, episodes))
+    os.replace(part, out)
+
+
+def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[Answer]]:
+    """What `write_part` wrote. Raises UserError if it is broken."""
+    return whole(part, lambda part: (
+        Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
+        _answers(part / "answers.jsonl", len(actions)),
+    ))  # fmt: skip
+
+
+def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
+    """Answers in the order of their decision points; of each the ego's, the helpers', the fusion calls'."""
+    place = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
+    return sorted(answers, key=lambda answer: (place[answer.scene], answer.heard))
 
 
 def dataset_of(run: Run) -> Dataset:
-    """The dataset that the run was made on, the very same bytes.
+    """The dataset of a run on frozen scenes, with the same digest.
 
     Raises:
         UserError: it is not there, or has changed since.
     """
-    stated = run.config["dataset"]
-    path = Path(str(stated["path"]))
-    dataset = load(path if path.is_dir() else find(str(stated["name"])))
-    if dataset.sha256 != stated["sha256"]:
+    stated = run.manifest.world
+    assert isinstance(stated, FrozenScenes)
+    path = Path(stated.path)
+    dataset = load(path if path.is_dir() else find(stated.name))
+    if dataset.sha256 != stated.sha256:
         raise UserError(
             f"dataset {printable(dataset.path)} is not the one that {printable(run.path)} was made on "
-            f"(sha256 {dataset.sha256[:12]}…, not {printable(stated['sha256'], 13)}); restore it or run again"
+            f"(sha256 {dataset.sha256[:12]}…, not {printable(stated.sha256, 13)}); restore it or run again"
         )
     return dataset
 
 
-def _text(file: Path) -> str:
+def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
+    """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    before = asdict(variant) if variant else {}
+    writer.writerow([*before, *kind.__struct_encode_fields__])
+    for record in records:
+        values = (getattr(record, name) for name in kind.__struct_fields__)
+        writer.writerow([*before.values(), *("" if value is None else value for value in values)])
+    return text.getvalue()
+
+
+def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
+    hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
+    optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
+    with file.open("rb") as lines:
+        table = pacsv.read_csv(
+            lines,
+            parse_options=pacsv.ParseOptions(newlines_in_values=True),
+            convert_options=pacsv.ConvertOptions(
+                column_types={name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()},
+                include_columns=list(hints), null_values=[""], true_values=["True"], false_values=["False"],
+            ),
+        )  # fmt: skip
+    columns = {}
+    for field, name, column in zip(kind.__struct_fields__, hints, table.columns, strict=True):
+        values = column.to_pylist()
+        if name in optional:
+            values = [None if value == "" else value for value in values]
+        elif column.null_count:
+            raise ValueError(f"{name} is unknown in some rows")
+        columns[field] = values
+    rows = zip(*columns.values(), strict=True)
+    return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
+
+
+def _answers(file: Path, actions: int) -> list[Answer]:
+    answers = _ANSWER.decode_lines(file.read_bytes())
+    for answer in answers:
+        if answer.intent is not None and len(answer.intent) != actions:
+            raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
+    return answers
+
+
+def whole(file: Path, reader: Callable[[Path], T]) -> T:
+    """A file as its reader returns it. Raises UserError if it is broken."""
     try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise UserError(f"cannot read {printable(file)}: {reason}; make the run again") from None
-
-
-def _parsed(where: object, reader: Any, text: str) -> Any:
-    try:
-        return reader(text)
-    except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as error:
-        raise UserError(f"{printable(where)} is broken ({printable(error)}); make the run again") from None
-
-
-def _need(where: object, found: Any, keys: Iterable[str]) -> None:
-    missing = [key for key in keys if not isinstance(found, dict) or key not in found]
-    if missing:
-        raise UserError(f"{printable(where)} lacks {', '.join(missing)}; make the run again")
-
-
-def _score(line: Mapping[str, str]) -> Score:
-    return Score(
-        line["condition"],
-        line["metric"],
-        number(line["value"]),
-        number(line["ci_low"]),
-        number(line["ci_high"]),
-        int(line["n"]),
-        int(line["n_excluded"] or 0),
-        line["interval"],
-    )
-
-
-def number(text: str) -> float | None:
-    """A number of a CSV file; None where it is empty or NaN."""
-    value = float(text or "nan")
-    return None if value != value else value
+        with uncollected():
+            return reader(file)
+    except _BROKEN as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{printable(file)} is broken ({printable(reason)}); make the run again") from None

@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.evaluate.evaluate import CONFIG, WORK
-from harness.evaluate.live_spec import FORMAT as DRIVE
-from harness.evaluate.spec import FORMAT as EVAL
+from harness.runs.formats import CONFIG, FORMAT, READ_BY, WORK
 
-DEPTH = 2  # a sweep lies in its run's folder, and a driven study's run in the study's
-KINDS = {EVAL: "eval", DRIVE: "drive"}
+DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
+KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
 _BROKEN = (
     OSError,
@@ -38,12 +36,13 @@ class Listed:
         name: its folder, from the folder that is listed.
         kind: `eval`, `drive`, `sweep` or `study`; `run` where a broken one does not say.
         state: `finished`, `unfinished` or `broken`.
-        date: when it was begun; of a study and a broken run, when it was last written.
-        why: of an unfinished one, the option that goes on with it; of a broken one, the file at fault.
+        date: when it began; of a study and a broken run, when it was last written.
+        why: of an unfinished one, the option that continues it; of a broken one, the file at fault, and
+            whose format it has where that is an older version's.
         model: name of its card; of a sweep, its sources.
         prompt: version.
         answer: answer mode.
-        tags: words that it was given to be found by.
+        tags: words to find it by.
         condition: the one of the highest success rate; the first of several.
         success: that rate, 0 to 1, over episodes.
         low: lower end of its 95 % interval; None where the data cannot bound it.
@@ -66,7 +65,7 @@ class Listed:
 
 
 def runs(folder: Path) -> list[Listed]:
-    """What lies in a folder, newest first. Nothing outside it is read: a link that leads out is passed over.
+    """The runs and studies in a folder, newest first. Links that lead out of it are skipped.
 
     Raises:
         UserError: there is no such folder.
@@ -95,7 +94,7 @@ def _within(path: str, root: str) -> bool:
 
 
 def _one(path: str, root: str) -> Listed | None:
-    """What a folder is; None if it is neither a run nor a study."""
+    """A folder as an entry; None if it is neither a run nor a study."""
 
     def has(*names: str) -> bool:
         file = os.path.join(path, *names)
@@ -107,8 +106,9 @@ def _one(path: str, root: str) -> Listed | None:
     if has(WORK, CONFIG):
         try:
             begun = _json(path, WORK, CONFIG)
-            made = Listed("", _kind(begun["settings"]), "unfinished", _date(begun["created"]), "--resume")
-            return _described(made, {**begun["settings"], "tags": begun.get("tags", ())})
+            kind = KINDS[begun["settings"]["world"]["kind"]]
+            made = Listed("", kind, "unfinished", _date(begun["created"]), "--resume")
+            return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     for name, kind in STUDIES.items():
@@ -120,35 +120,35 @@ def _one(path: str, root: str) -> Listed | None:
                 return Listed("", kind, "finished", written, model=model or None)
             except _BROKEN:
                 return Listed("", kind, "broken", written, name)
-    if has("rows.jsonl") or has("summary.csv"):  # the manifest is written last
+    if has("answers.jsonl") or has("summary.csv"):  # the manifest is written last
         return Listed("", "run", "broken", written, "run.json")
     return None
 
 
 def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
-    made = Listed("", "run", "broken", written, "run.json")
+    listed = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
-        made = replace(made, kind=KINDS[config["format"]], date=_date(config["created"]))
-        made = replace(_described(made, config), why="summary.csv")
+        if config["format"] in READ_BY:
+            return replace(listed, why=f"run.json: format of harness {READ_BY[config['format']]}")
+        if config["format"] != FORMAT:
+            return listed
+        listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
+        listed = replace(_described(listed, config), why="summary.csv")
         if not has_summary:
-            return made
+            return listed
         with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
             # A summary may have a thousand rows, and a folder a thousand summaries.
-            head, *told = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
+            head, *lines = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
         which = ("success_rate", "episodes")
-        rows = [row for row in csv.DictReader([head, *told]) if (row["metric"], row["interval"]) == which]
+        rows = [row for row in csv.DictReader([head, *lines]) if (row["metric"], row["interval"]) == which]
         best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
         value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
         return replace(
-            made, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
+            listed, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
         )
     except _BROKEN:
-        return made
-
-
-def _kind(settings: dict[str, Any]) -> str:
-    return "drive" if "scenario" in settings else "eval"
+        return listed
 
 
 def _described(made: Listed, config: dict[str, Any]) -> Listed:
@@ -156,8 +156,8 @@ def _described(made: Listed, config: dict[str, Any]) -> Listed:
         made,
         model=str(config["model"]["name"]),
         prompt=str(config["prompt"]["version"]),
-        answer=str(config.get("answer", "json")),  # runs of older versions name none, and had one
-        tags=tuple(map(str, config.get("tags", ()))),
+        answer=str(config["answer"]),
+        tags=tuple(map(str, config["tags"])),
     )
 
 

@@ -1,192 +1,128 @@
-"""Summary of a run: every metric with n, an interval, and what the interval is over.
+"""`summary.csv` and `episodes.csv`: both computed from decisions, answers and episodes' ends."""
 
-Two intervals, because they answer different questions (docs/decisions/0004). `seed means`: Student's t across
-seeds, the paper's error bars: how much the channel's luck moves the figure, given these very episodes.
-`episodes`: how far it would move with other episodes of the scenario, each averaged over seeds and steps;
-Wilson for yes/no outcomes that no seed changes, else Student's t. Both are conditional on the one set of
-answers the model gave.
-"""
-
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from harness.core.arrays import Floats
-from harness.core.statistics import (
-    Estimate,
-    brier,
-    episode_interval,
-    known_mean,
-    negative_log_likelihood,
-    rate_interval,
-    safe_target,
-    seed_interval,
-)  # fmt: skip
-from harness.evaluate.asking import Answer
-from harness.evaluate.intents import Answered
-from harness.evaluate.merging import Merged
-from harness.evaluate.scoring import Scored, statuses
-from harness.evaluate.spec import Spec
-from harness.evaluate.success import Table
+from harness.core.statistics import Estimate, episode_interval, rate_interval, seed_interval
+from harness.runs.decisions import Decisions
+from harness.runs.metrics import (
+    ALL,
+    GAIN,
+    LATENCY,
+    PERCENTILES,
+    SUCCESS,
+    Grid,
+    World,
+    by_episode,
+    in_range,
+    mean_by_place,
+    metrics_of,
+    over_episodes,
+    over_seeds,
+    percentiles,
+    sum_by_place,
+)
+from harness.runs.records import Answer, Episode, Role, Score
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-COLUMNS = (
-    "model", "prompt", "answer", "condition", "metric", "value", "ci_low", "ci_high", "n", "n_excluded",
-    "interval",
-)  # fmt: skip
-ALL = "all"  # stands for the condition where a figure does not depend on it
 BASELINE = "single-local"
-# What an episode has or has not.
-YES_OR_NO = (
-    "success_rate", "unsafe_rate", "late_rate", "collision_rate", "time_out_rate", "off_road_rate",
-    "at_fault_rate",
-)  # fmt: skip
-PERCENTILES = (50, 95, 99)
+ROLES: tuple[Role, ...] = ("ego", "helper", "merge")
 
 
-PER_EPISODE: dict[str, Callable[[Table, Scored], Any]] = {  # values (E,)
-    "success_rate": lambda laid, r: r.verdict.success,
-    "unsafe_rate": lambda laid, r: r.verdict.unsafe,
-    "late_rate": lambda laid, r: r.verdict.late,
-    "messages_per_episode": lambda laid, r: laid.by_episode(r.coordination.messages, fill=0).sum(axis=1),
-}
-PER_DECISION: dict[str, Callable[[Table, Scored], Any]] = {  # values (n,), of which an episode has the mean
-    "latency_proxy_ms": lambda laid, r: r.coordination.latency_s * 1000,
-    "deadline_miss_rate": lambda laid, r: np.where(
-        np.isnan(r.coordination.latency_s), np.nan, r.coordination.deadline_missed
-    ),
-    "trigger_rate": lambda laid, r: r.coordination.triggered,
-    "effective_loss": lambda laid, r: np.where(r.coordination.triggered, r.coordination.loss, np.nan),
-    "observed_reply_loss": lambda laid, r: r.coordination.observed_loss,
-    "entropy_nats": lambda laid, r: r.coordination.entropy_nats,
-    "normalised_entropy": lambda laid, r: r.coordination.normalised_entropy,
-    "brier": lambda laid, r: brier(r.coordination.fused, safe_target(laid.safe)),
-    "negative_log_likelihood": lambda laid, r: negative_log_likelihood(r.coordination.fused, laid.safe),
-    "fallback_rate": lambda laid, r: r.coordination.own_failed,
-    "fusion_ms": lambda laid, r: r.coordination.fusion_s * 1000,
-    "merge_failed_rate": lambda laid, r: np.where(
-        r.coordination.on_time.any(axis=1) & r.point.asks_again, r.coordination.fusion_failed, np.nan
-    ),
-}
-METRICS = (*PER_EPISODE, *PER_DECISION)
+def scores(
+    world: World, grid: Grid, decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
+) -> list[Score]:
+    """Every metric of a run; `episodes` by place.
+
+    In the closed loop a seed may change what happens, so an episode's yes or no is a mean over seeds and its
+    interval Student's t, unless no seed changed any.
+    """
+    values = by_episode(metrics_of(world), grid, decisions, episodes)
+    latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
+    return [
+        *of_conditions(grid.conditions, values),
+        *of_latencies(grid, [latency_ms[places == n] for n in range(len(grid.conditions) * len(grid.seeds))]),
+        *_gains(grid.conditions, values[SUCCESS]),
+        *_of_answers(answers),
+    ]
 
 
-def summary(
-    spec: Spec, laid: Table, known: Answered, runs: Sequence[Scored], second: Merged | None = None
-) -> "pd.DataFrame":
-    """The long table of `summary.csv`."""
-    return long_table(spec, _estimates(spec, laid, known, runs, second))
+def of_conditions(conditions: Sequence[str], values: Mapping[str, Floats]) -> Iterator[Score]:
+    """Each metric (C, S, E) in each condition, over seeds and over episodes."""
+    for place, condition in enumerate(conditions):
+        for name, each in values.items():
+            yield _score(condition, name, over_seeds(name, each[place]), "seed means")
+            yield _score(condition, name, over_episodes(name, each[place]), "episodes")
+        total = values["messages_per_episode"][place].sum(axis=1)
+        yield _score(condition, "message_count", seed_interval(total), "seed means")
 
 
-def long_table(spec: Spec, estimates: Iterable[tuple[str, str, Estimate, str]]) -> "pd.DataFrame":
-    """Estimates, each a condition, a metric, its value and what its interval is over, in `COLUMNS`."""
-    import pandas as pd
-
-    rows = [
-        {
-            "model": spec.card.name, "prompt": spec.prompt.version, "answer": spec.answer,
-            "condition": condition, "metric": metric, "value": e.value, "ci_low": e.low, "ci_high": e.high,
-            "n": e.n, "n_excluded": e.n_excluded, "interval": interval,
-        }
-        for condition, metric, e, interval in estimates
-    ]  # fmt: skip
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
+    """Percentiles over all decisions of a seed, from those of each condition and seed, in that order."""
+    of_seeds = np.array([percentiles(each) for each in latency_ms])
+    for place, condition in enumerate(grid.conditions):
+        mine = of_seeds[place * len(grid.seeds) : (place + 1) * len(grid.seeds)]
+        for percent, values in zip(PERCENTILES, mine.T, strict=True):
+            estimate = in_range(LATENCY, seed_interval(values))
+            yield _score(condition, f"latency_p{percent}_ms", estimate, "seed means")
 
 
-def _estimates(
-    spec: Spec, laid: Table, known: Answered, runs: Sequence[Scored], second: Merged | None = None
-) -> Iterator[tuple[str, str, Estimate, str]]:
-    by_condition: dict[str, dict[str, Floats]] = {}
-    for point in spec.points:
-        mine = [r for r in runs if r.point == point]
-        by_seed = [by_episode(laid, r) for r in mine]
-        metrics = {name: np.stack([m[name] for m in by_seed]) for name in by_seed[0]}
-        by_condition[point.name] = metrics
-        for name, values in metrics.items():  # (seeds, episodes)
-            yield point.name, name, over_seeds(name, values), "seed means"
-            yield point.name, name, over_episodes(name, values), "episodes"
-        yield from (
-            (point.name, *found) for found in latency_percentiles([r.coordination.latency_s for r in mine])
-        )
-        total = np.array([float(r.coordination.messages.sum()) for r in mine])
-        yield point.name, "message_count", seed_interval(total), "seed means"
-    yield from gains(by_condition)
-    given = {
-        "ego": [row[0] for row in known.answers], "helper": [a for row in known.answers for a in row[1:]],
-        "merge": second.answers if second else [],
-    }  # fmt: skip
-    yield from of_answers(
-        statuses(known, second), {role: [a for a in all_ if a] for role, all_ in given.items()}
-    )
+def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
+    """The gain of each condition over `BASELINE`, from success (C, S, E)."""
+    if BASELINE in conditions:
+        for place, condition in enumerate(conditions):
+            if condition != BASELINE:
+                gain = success[place] - success[conditions.index(BASELINE)]
+                name = GAIN + BASELINE
+                yield _score(condition, name, seed_interval(gain.mean(axis=1)), "seed means")
+                yield _score(condition, name, episode_interval(gain.mean(axis=0)), "episodes")
 
 
-def gains(by_condition: Mapping[str, Mapping[str, Floats]]) -> Iterator[tuple[str, str, Estimate, str]]:
-    """What each condition gains over `BASELINE`; its `success_rate` is (seeds, episodes)."""
-    if BASELINE in by_condition:
-        for name, metrics in by_condition.items():
-            if name != BASELINE:
-                gain = metrics["success_rate"] - by_condition[BASELINE]["success_rate"]
-                yield name, f"success_gain_over_{BASELINE}", seed_interval(gain.mean(axis=1)), "seed means"
-                yield name, f"success_gain_over_{BASELINE}", episode_interval(gain.mean(axis=0)), "episodes"
-
-
-def of_answers(
-    verdicts: Mapping[str, Sequence[str]], answers: Mapping[str, Sequence[Answer]]
-) -> Iterator[tuple[str, str, Estimate, str]]:
+def _of_answers(answers: Sequence[Answer]) -> Iterator[Score]:
     """How answers were parsed, and how long they and their prompts are, by role."""
-    for role, each in verdicts.items():
+    by_role = {role: [answer for answer in answers if answer.role == role] for role in ROLES}
+    for role, given in by_role.items():
         for verdict in ("strict", "recovered", "failed"):
-            if each:
-                hits = np.array([float(v == verdict) for v in each])
-                yield ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers"
-    for role, given in answers.items():
+            if given:
+                hits = np.array([float(answer.verdict == verdict) for answer in given])
+                yield _score(ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers")
+    for role, given in by_role.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
-            counts = [a[what] for a in given if a[what] is not None]
+            counts = [value for answer in given if (value := getattr(answer, what)) is not None]
             if counts:
-                estimate = episode_interval(np.array(counts, dtype=float))
-                yield ALL, f"{what}_{role}", _in_range(what, estimate), "answers"
+                estimate = in_range(what, episode_interval(np.array(counts, dtype=float)))
+                yield _score(ALL, f"{what}_{role}", estimate, "answers")
 
 
-def by_episode(laid: Table, r: Scored, names: Iterable[str] = METRICS) -> dict[str, Floats]:
-    """Metrics by episode, (E,): a share or a mean over its decisions."""
+def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
+    """The episodes by place, with the columns computed from their decisions."""
+    ordered, places = grid.ordered(episodes), grid.places(decisions)
+    n = len(ordered)
 
-    def values(name: str) -> Floats:
-        if name in PER_EPISODE:
-            return np.asarray(PER_EPISODE[name](laid, r), dtype=float)
-        return known_mean(laid.by_episode(np.asarray(PER_DECISION[name](laid, r), dtype=float)), axis=1)
+    def total(values: Floats) -> list[int]:
+        return [int(total) for total in sum_by_place(values, places, n)]
 
-    return {name: values(name) for name in names}
+    def mean(name: str) -> list[Any]:
+        return [None if v != v else v for v in mean_by_place(decisions[name], places, n).tolist()]
 
-
-def latency_percentiles(latency_s: Sequence[Floats]) -> Iterator[tuple[str, Estimate, str]]:
-    """`PERCENTILES` over all decisions of a seed, from each seed's (n,), with an interval over seeds."""
-    known = [each[~np.isnan(each)] * 1000 for each in latency_s]
-    unknown = np.full(len(PERCENTILES), np.nan)
-    by_seed = np.array([np.percentile(each, PERCENTILES) if len(each) else unknown for each in known])
-    for percent, values in zip(PERCENTILES, by_seed.T, strict=True):
-        yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
-
-
-def over_seeds(name: str, values: Floats) -> Estimate:
-    """Interval over seeds of a metric's values (seeds, episodes)."""
-    return _in_range(name, seed_interval(known_mean(values, axis=1)))
-
-
-def over_episodes(name: str, values: Floats) -> Estimate:
-    """Interval over episodes of a metric's values (seeds, episodes)."""
-    each = known_mean(values, axis=0)
-    settled = each[~np.isnan(each)]
-    # Student's t would give 0 of 20 episodes an interval of no width.
-    if name in YES_OR_NO and np.isin(settled, (0.0, 1.0)).all():
-        return rate_interval(each)
-    return _in_range(name, episode_interval(each))
+    columns = {
+        "messages": total(decisions["messages"]),
+        "trigger_rate": mean("triggered"),
+        "latency_ms": [v and round(v, 3) for v in mean("latency_ms")],
+        "deadline_misses": total(decisions["deadline_missed"]),
+        "decisions": total(np.ones(len(places))),
+    }
+    if not np.isnan(decisions["acted"]).all():
+        columns["never_acted"] = total(1.0 - decisions["acted"])
+    return [
+        replace(episode, **dict(zip(columns, values, strict=True)))
+        for episode, *values in zip(ordered, *columns.values(), strict=True)
+    ]
 
 
-def _in_range(name: str, e: Estimate) -> Estimate:
-    """Nothing here is below 0 and no share above 1, which Student's t does not know."""
-    most = 1.0 if name.endswith(("_rate", "_loss", "_mass")) else np.inf
-    return replace(e, low=float(np.maximum(e.low, 0.0)), high=float(np.minimum(e.high, most)))
+def _score(condition: str, metric: str, e: Estimate, interval: str) -> Score:
+    value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
+    return Score(condition, metric, value, low, high, e.n, e.n_excluded, interval)

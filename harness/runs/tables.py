@@ -1,18 +1,15 @@
-"""A run as pandas tables, for who computes with one: `harness.load`. Columns: docs/files.md."""
+"""A run as pandas tables, for notebooks and scripts: `harness.load`. Columns: docs/files.md."""
 
-import csv
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
-from harness.core.errors import UserError, printable
-from harness.core.memory import uncollected
-from harness.evaluate.live_spec import FORMAT as DRIVE
-from harness.evaluate.spec import FORMAT as EVAL
-from harness.runs.folder import answers_of
+import msgspec
+
+from harness.runs.folder import Run, read, whole
+from harness.runs.records import Answer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,14 +20,12 @@ TEXT = (
     "fault",
 )  # fmt: skip
 MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")  # what a helper says beside its intent
-_BROKEN = (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, csv.Error)
-Row = dict[str, Any]
-T = TypeVar("T")
+PLACE = ["scene", "episode", "step", "danger"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """A finished run, frozen or live. A table is read when it is first asked for.
+    """A finished run, frozen or closed-loop. A table is read when it is first asked for.
 
     Every table raises UserError if its file is missing or broken.
 
@@ -41,6 +36,7 @@ class Tables:
 
     path: Path
     config: Mapping[str, Any] = field(repr=False)
+    _run: Run = field(repr=False)
 
     @cached_property
     def summary(self) -> "pd.DataFrame":
@@ -52,20 +48,39 @@ class Tables:
         """A row an episode, condition and seed: episodes.csv."""
         return self._csv("episodes.csv")
 
-    @property
+    @cached_property
     def decisions(self) -> "pd.DataFrame":
-        """A row a scene, condition and seed: what was decided, and from what."""
-        return self._rows[0]
+        """A row a decision point, condition and seed: decisions.parquet."""
+        return self._run.decisions.frame()
 
-    @property
+    @cached_property
     def answers(self) -> "pd.DataFrame":
-        """A row a scene and viewer, and a row a second answer of the ego (role `merge`): raw and as read."""
-        return self._rows[1]
+        """A row an answer: answers.jsonl, and where its decision point is."""
+        import numpy as np
+        import pandas as pd
+
+        answers, actions = self._run.answers, self.config["actions"]
+        columns = {
+            name: [getattr(answer, name) for answer in answers]
+            for name in Answer.__struct_fields__ if name not in ("heard", "repairs", "intent", "message")
+        }  # fmt: skip
+        unknown = (np.nan,) * len(actions)
+        intents = np.array([answer.intent or unknown for answer in answers]).reshape(-1, len(actions))
+        table = pd.DataFrame({
+            **columns,
+            "heard": ["+".join(answer.heard) for answer in answers],
+            "repairs": [" ".join(answer.repairs) for answer in answers],
+            **{f"intent_{action}": intents[:, place] for place, action in enumerate(actions)},
+            **{key: [(answer.message or {}).get(key) for answer in answers] for key in MESSAGE},
+        })  # fmt: skip
+        table = table.astype(dict.fromkeys(table.columns[table.isna().all()], float))
+        places = self.decisions[PLACE].drop_duplicates("scene").astype({"scene": str})
+        return places.merge(table, "right", "scene")
 
     def _csv(self, name: str) -> "pd.DataFrame":
         import pandas as pd
 
-        return _whole(
+        return whole(
             self.path / name,
             lambda file: pd.read_csv(
                 file,
@@ -76,30 +91,6 @@ class Tables:
             ),
         )
 
-    @cached_property
-    def _rows(self) -> "tuple[pd.DataFrame, pd.DataFrame]":
-        return _whole(self.path / "rows.jsonl", self._read_rows)
-
-    @uncollected()
-    def _read_rows(self, file: Path) -> "tuple[pd.DataFrame, pd.DataFrame]":
-        actions: Sequence[str] = self.config["actions"]
-        decisions: list[Row] = []
-        answers: list[Row] = []
-        with file.open(encoding="utf-8") as lines:
-            for row in map(json.loads, lines):
-                place = {key: row[key] for key in ("scene", "episode", "step", "danger")}
-                # What each action leads to is known of a frozen scene alone.
-                known = {
-                    f"{name}_{action}": value
-                    for name in ("safe", "delay_s") if name in row
-                    for action, value in zip(actions, row[name], strict=True)
-                }  # fmt: skip
-                decisions += ({**place, **_decision(d, actions), **known} for d in row["decisions"])
-                for viewers, answer in answers_of(row).items():
-                    viewer, _, heard = viewers.partition("+")
-                    answers.append({**place, "viewer": viewer, "heard": heard, **_answer(answer, actions)})
-        return _table(decisions), _table(answers)
-
 
 def load(run: Path) -> Tables:
     """A run by its folder.
@@ -107,57 +98,5 @@ def load(run: Path) -> Tables:
     Raises:
         UserError: it is no finished run, or one of another version.
     """
-    file = run / "run.json"
-    if not file.is_file():
-        raise UserError(
-            f"{printable(run)} is no finished run: it has no run.json; "
-            "give a folder made by `harness eval` or `harness drive`"
-        )
-    config: Any = _whole(file, lambda file: json.loads(file.read_text(encoding="utf-8")))
-    if not isinstance(config, dict) or config.get("format") not in (EVAL, DRIVE):
-        found = config.get("format") if isinstance(config, dict) else None
-        raise UserError(
-            f"{printable(file)} has format {printable(found)!r}; this harness reads {EVAL!r} and {DRIVE!r}"
-        )
-    return Tables(run, config)
-
-
-def _whole(file: Path, reader: Callable[[Path], T]) -> T:
-    try:
-        return reader(file)
-    except _BROKEN as error:
-        raise UserError(f"{printable(file)} cannot be read ({printable(error)}); run again") from None
-
-
-def _spread(name: str, values: Sequence[float] | None, actions: Sequence[str]) -> Row:
-    """A distribution as a column an action."""
-    known: Sequence[float | None] = values or [None] * len(actions)
-    return {f"{name}_{action}": p for action, p in zip(actions, known, strict=True)}
-
-
-def _decision(decision: Row, actions: Sequence[str]) -> Row:
-    first = {key: decision[key] for key in ("condition", "seed", "action")}
-    plain = {key: value for key, value in decision.items() if key not in ("fused", "messages")}
-    sent = {
-        f"{key}_{message['from']}": value
-        for message in decision["messages"]
-        for key, value in message.items() if key != "from"
-    }  # fmt: skip
-    return {**first, **plain, **_spread("fused", decision["fused"], actions), **sent}
-
-
-def _answer(answer: Row, actions: Sequence[str]) -> Row:
-    plain = {key: value for key, value in answer.items() if key not in ("intent", "message", "repairs")}
-    said = {key: (answer["message"] or {}).get(key) for key in MESSAGE}
-    repairs = " ".join(answer["repairs"])
-    return {**plain, "repairs": repairs, **_spread("intent", answer["intent"], actions), **said}
-
-
-def _table(rows: list[Row]) -> "pd.DataFrame":
-    import pandas as pd
-
-    # What is true, false or unknown stays so; numbers keep NaN, and so does what no row knows.
-    table = pd.DataFrame(rows).convert_dtypes(
-        convert_string=False, convert_integer=False, convert_floating=False
-    )
-    return table.astype(dict.fromkeys(table.columns[table.isna().all()], float))
+    source = read(run)
+    return Tables(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)

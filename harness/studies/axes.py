@@ -1,15 +1,17 @@
-"""What can be swept: one setting of the operating point, or the number of vehicles."""
+"""What can be swept, any setting of the operating point or the number of vehicles, and the grid points."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from harness.coordination.consensus import NAMES, RULES
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.consensus import POOLS, names
+from harness.coordination.operating_point import POINTS, SETTINGS, OperatingPoint, setting_of
 from harness.core.errors import UserError, printable, unknown
 
 MOST_POINTS = 1000
+CORE = "core"  # the panel that compares operating points
 
 Value = float | str
 
@@ -23,7 +25,7 @@ class Axis:
         label: what an axis of a figure says, with its unit.
         field: the operating point's setting; None for the number of vehicles.
         scale: what a value is multiplied by to be that setting.
-        usual: the grid if none is given.
+        usual: the grid if none is given; empty if one must be.
     """
 
     name: str
@@ -36,7 +38,13 @@ class Axis:
         """The operating point with this setting. Raises UserError where it is not allowed."""
         if self.field is None:
             return point
-        setting = value if isinstance(value, str) else value * self.scale
+        setting: object
+        if isinstance(value, str):
+            setting = setting_of(self.field, value)
+        else:
+            setting = scaled = value * self.scale
+            if isinstance(getattr(point, self.field), int) and scaled == int(scaled):
+                setting = int(scaled)
         # A given loss stands in place of one that follows the number of vehicles.
         freed = replace(point, density_coupled=False) if self.field == "loss" else point
         return replace(freed, **{self.field: setting})  # type: ignore[arg-type]
@@ -50,16 +58,18 @@ AXES = {
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
         Axis("latency", "nominal latency of the channel, ms", "latency_s", 1e-3, "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", "window_s", 1e-3, "150:400:25"),
-        Axis("consensus", "consensus", "consensus", 1.0, ",".join(RULES)),
+        Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS)),
     )
 }
 
 
 def axis_of(name: str) -> Axis:
-    """An axis by name. Raises UserError if there is none."""
-    if name not in AXES:
-        raise unknown("--over", name, AXES)
-    return AXES[name]
+    """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
+    if name in AXES:
+        return AXES[name]
+    if name not in SETTINGS:
+        raise unknown("--over", name, (*AXES, *SETTINGS))
+    return Axis(name, name.replace("_", " "), name, 1.0, "")
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
@@ -68,18 +78,20 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     Raises:
         UserError: it is none, or too long.
     """
+    if not text and not axis.usual:
+        raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
-    if axis.name == "consensus":
+    if axis.field and isinstance(getattr(POINTS["6g"], axis.field), str | bool):
         for part in parts:
-            if part not in NAMES:
-                raise unknown("--grid", part, NAMES)
+            if axis.field == "consensus" and part not in names():
+                raise unknown("--grid", part, names())
         return tuple(dict.fromkeys(parts))
-    found = [value for part in parts for value in _values(axis, part)]
-    if len(found) > MOST_POINTS:
-        raise UserError(f"--grid {printable(text)}: {len(found)} points; give {MOST_POINTS} or fewer")
-    if axis.field is None and any(value != int(value) or value < 1 for value in found):
+    values = [value for part in parts for value in _values(axis, part)]
+    if len(values) > MOST_POINTS:
+        raise UserError(f"--grid {printable(text)}: {len(values)} points; give {MOST_POINTS} or fewer")
+    if axis.field is None and any(value != int(value) or value < 1 for value in values):
         raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(values))
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:
@@ -91,6 +103,33 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
             raise ValueError
     except (ValueError, ZeroDivisionError):
         raise UserError(
-            f"--grid {printable(part)}: give numbers such as {axis.usual}, a list or from:to:step"
+            f"--grid {printable(part)}: give numbers such as {axis.usual or '0,1,2'}, a list or from:to:step"
         ) from None
     return [round(low + i * step, 10) for i in range(int(steps + 1e-9) + 1)]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One grid point of a panel.
+
+    Attributes:
+        condition: name of the operating point that it is a change of.
+        point: the operating point.
+        vehicles: how many, the ego included.
+        variable: what varies in the panel; empty where conditions are compared.
+        value: its value there.
+    """
+
+    condition: str
+    point: OperatingPoint
+    vehicles: int
+    variable: str = ""
+    value: Value | None = None
+
+
+def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
+    """The grid points, complete, for a manifest."""
+    return {
+        name: [{"value": s.value, "vehicles": s.vehicles, **asdict(s.point)} for s in settings]
+        for name, settings in panels.items()
+    }

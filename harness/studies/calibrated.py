@@ -10,26 +10,27 @@ the last leave time to mend them; the last one decides.
 The intents go through trigger, channel, consensus and scoring like any model's.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from harness.coordination.channel import Draws
-from harness.coordination.coordinate import fuse
-from harness.coordination.exchange import exchange
+from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
-from harness.evaluate.scoring import Scored, outcome
-from harness.evaluate.success import Table
-from harness.studies.entropies import ACTIONS, peaked, spread
+from harness.evaluate.walk import Decided, Due
+from harness.studies.play import Walked, walk_through
 
 VERSION = "2"
+ACTIONS = 3
+CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 STEPS = 6  # decisions an episode: 18 messages are three replies each
+INTENTS = tuple(field.name for field in fields(Intents))
 CHUNK = 2000  # episodes that are played together
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
@@ -89,18 +90,61 @@ class _Drawn:
     """E episodes of S decisions as n = E x S rows; H helpers.
 
     Attributes:
-        laid: which actions are safe; none is ever late.
-        known: what every vehicle intends, the ego as long as it guesses.
-        told: the ego's intent once it has heard the witness, (n, A).
+        right: the action that is right in each row's episode, (n,).
+        intents: what every vehicle intends, the ego as long as it guesses.
+        knowing: the ego's intent once it has heard the witness, (n, A).
         witness: which helper sees the danger, (n, H).
-        links: the channel's draws; a link is up or down for a whole episode.
+        draws: of the channel; a link is up or down for a whole episode.
     """
 
-    laid: Table
-    known: Intents
-    told: Floats
+    right: Ints
+    intents: Intents
+    knowing: Floats
     witness: Bools
-    links: Draws
+    draws: Draws
+
+
+class CalibratedWorld:
+    """Episodes whose moments are drawn: each step's, for all episodes at once.
+
+    An ego that has fused the witness's message knows from its next decision on. The last decision decides.
+    """
+
+    def __init__(self, drawn: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
+        self._drawn = drawn  # of each seed, with as many episodes as `numbers`
+        self._seed, self._episode = np.repeat(seeds, len(numbers)), np.tile(numbers, len(seeds))
+        self._step = -1
+        self._knows = np.zeros(len(self._seed), dtype=bool)
+        self.success: Bools = self._knows
+
+    def _now(self, of: Callable[[_Drawn], Any]) -> Any:
+        """Arrays of this step."""
+        return np.concatenate([of(d)[self._step :: STEPS] for d in self._drawn])
+
+    def observe(self) -> Sequence[int]:
+        """The episodes, while there are decisions to make."""
+        self._step += 1
+        return range(len(self._knows)) if self._step < STEPS else ()
+
+    def __call__(self, moments: Sequence[int]) -> Intents:
+        """What every vehicle intends at this step."""
+        now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in INTENTS))  # noqa: B023
+        return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
+
+    def fusion_call(self, moments: Sequence[int], codes: Ints) -> Callable[[Ints], FusionCall]:
+        """Nobody calls: no point of the study has its model fuse."""
+        return lambda at: lambda on_time: (np.empty((0, ACTIONS)), np.empty(0))
+
+    def due(self, point: OperatingPoint) -> Due:
+        """Every episode."""
+        draws = Draws(self._now(lambda d: d.draws.link), self._now(lambda d: d.draws.jitter))
+        return Due(np.arange(len(self._knows)), self._episode, self._seed, draws)
+
+    def step(self, decided: Sequence[Decided[int]]) -> None:
+        """Learn what was heard, and see whether the last action is the right one."""
+        [part] = decided
+        self._knows = self._knows | (part.result.on_time & self._now(lambda d: d.witness)).any(axis=1)
+        self.success = part.result.action == self._now(lambda d: d.right)
 
 
 class Calibrated:
@@ -117,7 +161,7 @@ class Calibrated:
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._draw = lru_cache(maxsize=6)(self._drawn)
+        self._draw = lru_cache(maxsize=32)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -130,23 +174,20 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
-        """Episodes of one seed with so many vehicles, the ego included, at one operating point.
-
-        They come `CHUNK` at a time, which bounds memory and keeps the arrays in the processor's cache.
-        """
+    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+        """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
         for first in range(0, self.episodes, CHUNK):
-            yield self._scored(point, vehicles, seed, first)
-
-    def _scored(self, point: OperatingPoint, vehicles: int, seed: int, first: int) -> tuple[Table, Scored]:
-        """An ego that has fused the witness's message knows from its next decision on."""
-        drawn = self._draw(seed, vehicles - 1, first)
-        heard = exchange(point, drawn.known, drawn.links)
-        # Who asks and who is heard depends on entropies, which knowing does not change.
-        told = np.any(heard.on_time & drawn.witness, axis=1).reshape(-1, STEPS)
-        knew = np.insert(np.logical_or.accumulate(told, axis=1)[:, :-1], 0, False, axis=1).reshape(-1, 1)
-        heard = replace(heard, own=np.where(knew, drawn.told, heard.own))
-        return drawn.laid, outcome(drawn.laid, point, seed, fuse(point, heard, drawn.known))
+            numbers = first + np.arange(min(CHUNK, self.episodes - first))
+            drawn = [self._draw(seed, vehicles - 1, first) for seed in seeds]
+            world = CalibratedWorld(drawn, seeds, numbers)
+            columns, places = walk_through(world, point, world, seeds, numbers)
+            success = world.success.reshape(len(seeds), len(numbers)).astype(float)
+            ends = {
+                "success_rate": success,
+                "unsafe_rate": 1.0 - success,
+                "late_rate": np.zeros_like(success),
+            }
+            yield Walked(numbers, ends, columns, places)
 
     def _drawn(self, seed: int, helpers: int, first: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""
@@ -170,22 +211,33 @@ class Calibrated:
         nats = np.where(witness, p.witness_nats, spread(p.others_nats, p.others_sd_nats, unsure))
         guessed, knew = (np.repeat(top, STEPS) for top in (guess, know))
         top = np.where(witness, knew[:, None], guessed[:, None])
-        known = Intents(
+        intents = Intents(
             own=peaked(ego_nats, guessed), helpers=peaked(nats, top), valid=np.ones((n, helpers), dtype=bool),
             distance_m=np.insert(np.where(witness, WITNESS_M, OTHERS_M), 0, EGO_M, axis=1),
             range_m=np.broadcast_to(FIRST_RANGE_M + RANGE_STEP_M * np.arange(helpers), (n, helpers)),
             payload_bits=np.full((n, helpers), PAYLOAD_BITS),
             inference_s=np.full((n, 1 + helpers), p.inference_s),
         )  # fmt: skip
-        laid = Table(
-            index=np.arange(n).reshape(e, STEPS), episodes=first + np.arange(e), seeds=np.full(e, seed),
-            safe=_safe(right), delay_s=np.zeros((n, ACTIONS)), allowance_s=0.0,
-        )  # fmt: skip
-        return _Drawn(laid, known, peaked(ego_nats, knew), witness, Draws(link, jitter))
+        return _Drawn(np.repeat(right, STEPS), intents, peaked(ego_nats, knew), witness, Draws(link, jitter))
 
 
-def _safe(right: Ints) -> Bools:
-    """Which action is safe at which decision, (n, A): all of them, until the last, where one is."""
-    table = np.ones((len(right), STEPS, ACTIONS), dtype=bool)
-    table[:, -1] = right[:, None] == np.arange(ACTIONS)
-    return table.reshape(-1, ACTIONS)
+def peaked(nats: Floats, top: Ints) -> Floats:
+    """Intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
+    entropies, shares = _by_entropy()
+    most = np.interp(nats, entropies, shares)[..., None]
+    return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
+
+
+@lru_cache(maxsize=1)
+def _by_entropy() -> tuple[Floats, Floats]:
+    share = np.linspace(1.0, 1 / ACTIONS, 4001)[1:-1]
+    rest = (1 - share) / (ACTIONS - 1)
+    return -share * np.log(share) - (1 - share) * np.log(rest), share
+
+
+def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
+    """Draws of a normal distribution, cut at `CUT` standard deviations either side, by its quantiles."""
+    from scipy.special import ndtr, ndtri
+
+    below = ndtr(-CUT)
+    return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))

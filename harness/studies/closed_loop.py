@@ -4,7 +4,6 @@ All grid points are conditions of one live run. Their episodes share worlds for 
 way (docs/decisions/0014), so a grid costs far less than its points one by one.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,50 +12,39 @@ import numpy as np
 
 from harness.coordination.channel import density_coupled_loss
 from harness.coordination.operating_point import POINTS, named_point
-from harness.core.files import write_whole
-from harness.evaluate.drive import run
-from harness.evaluate.live_spec import Drive
+from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.spec import Spec
+from harness.runs.records import Score
 from harness.studies import figures
-from harness.studies.axes import AXES, grid
-from harness.studies.episode_tables import write_table
-from harness.studies.play import METRICS
-from harness.studies.setting import CORE, Setting, described
+from harness.studies.axes import AXES, CORE, Setting, described, grid
+from harness.studies.folder import write, write_manifest
+from harness.studies.play import ENDS, PER_DECISION
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from harness.evaluate.evaluate import Evaluated
-
-FORMAT = "swarmdrive-closed-loop/1"
+SHOWN = (*ENDS, *PER_DECISION)
 VEHICLES = 4  # the ego and the scenario's three helpers
 RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
     """The paper's panels as conditions that are called by what they change; size has density-coupled loss."""
-    sizes = range(1, VEHICLES + 1)
-    return {
-        CORE: [Setting(name, point, VEHICLES) for name, point in POINTS.items()],
-        "size": [
-            Setting("6g", named_point(f"6g:max_helpers={n - 1},loss={_coupled(n):g}"), n, "size", n)
-            for n in sizes
-        ],
-        "loss": [
-            Setting("6g", named_point(f"6g:loss={float(v) / 100:g}"), VEHICLES, "loss", v)
-            for v in grid(AXES["loss"])
-        ],
-        "tau": [
-            Setting("6g", named_point(f"6g:tau_nats={v:g}"), VEHICLES, "tau", v) for v in grid(AXES["tau"])
-        ],
-    }
-
-
-def _coupled(vehicles: int) -> float:
-    return float(density_coupled_loss(np.array(vehicles)))
+    losses = density_coupled_loss(np.arange(1, VEHICLES + 1))
+    changes = (
+        *(("size", n, n, f"max_helpers={n - 1},loss={loss:g}") for n, loss in enumerate(losses, 1)),
+        *(("loss", VEHICLES, v, f"loss={float(v) / 100:g}") for v in grid(AXES["loss"])),
+        *(("tau", VEHICLES, v, f"tau_nats={v:g}") for v in grid(AXES["tau"])),
+    )
+    settings = {CORE: [Setting(name, point, VEHICLES) for name, point in POINTS.items()]}
+    for panel, vehicles, value, change in changes:
+        setting = Setting("6g", named_point(f"6g:{change}"), vehicles, panel, value)
+        settings.setdefault(panel, []).append(setting)
+    return settings
 
 
 def run_closed_loop(
-    spec: Drive, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
+    spec: Spec, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
 ) -> "pd.DataFrame":
     """Drive all grid points, and draw Figures A and B. What a kill left in `out` is gone on with.
 
@@ -73,36 +61,31 @@ def run_closed_loop(
     Returns:
         The summary: a row a grid point and metric.
     """
-    done = run(spec, out / RUN, (out / RUN).exists(), workers, progress, cache)
+    done = evaluate(spec, out / RUN, (out / RUN).exists(), progress, cache, workers=workers)
     grids = panels()
     summary = _summary(done, grids)
-    by_panel = {name: summary[summary.panel == name] for name in grids}
-    figures.save_all(figures.composite_a(by_panel[CORE]), out / "figure-a")
-    figures.save_all(figures.along([by_panel[name] for name in grids if name != CORE]), out / "figure-b")
-    write_table(summary, out / "conditions")
-    manifest = {
-        "format": FORMAT,
-        "run": RUN,
-        "panels": described(grids),
-        "versions": done.manifest["versions"],
-    }
-    write_whole(out / "closed-loop.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+    core, *sweeps = (summary[summary.panel == name] for name in grids)
+    drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps)}
+    write(out, drawn, {"conditions": summary})
+    manifest = {"run": RUN, "panels": described(grids), "versions": done.manifest.versions}
+    write_manifest(out, "closed-loop", manifest)
     return summary
 
 
-def _summary(done: "Evaluated", grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":
+def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":
     """The live run's figures as a study has them."""
     import pandas as pd
 
-    m, told = done.manifest, done.summary
-    source = f"{m['model']['name']} · {m['prompt']['version']} · {m['answer']}, driven"
-    told = told[told.metric.isin(METRICS) | told.metric.str.startswith(("latency_p", "collision"))]
-    by_point = dict(iter(told.groupby("condition")))
+    source = f"{done.manifest.variant}, driven"
+    by_point: dict[str, list[Score]] = {}
+    for score in done.scores:
+        if score.metric in SHOWN or score.metric.startswith(("latency_p", "collision")):
+            by_point.setdefault(score.condition, []).append(score)
     return pd.DataFrame([
         {
             "source": source, "panel": panel, "condition": s.condition, "variable": s.variable,
-            "value": s.value, "metric": r.metric, "mean": r.value, "ci_low": r.ci_low, "ci_high": r.ci_high,
+            "value": s.value, "metric": r.metric, "mean": r.value, "ci_low": r.low, "ci_high": r.high,
             "n": r.n, "interval": r.interval,
         }
-        for panel, settings in grids.items() for s in settings for r in by_point[s.point.name].itertuples()
+        for panel, settings in grids.items() for s in settings for r in by_point[s.point.name]
     ])  # fmt: skip

@@ -4,27 +4,33 @@ Runs on frozen scenes and live runs of the same model, prompt and answer mode ar
 episode by episode: the same layout, condition and seed of the channel's luck.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import asdict
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
+from harness.core.files import write_whole
 from harness.core.statistics import episode_interval
-from harness.evaluate.live_spec import FORMAT as DRIVEN
-from harness.evaluate.spec import FORMAT as FROZEN
-from harness.evaluate.success import table
-from harness.runs.folder import dataset_of, read
-from harness.runs.summary import over_episodes
+from harness.report.library import picture
+from harness.report.page import environment
+from harness.runs.folder import read
+from harness.runs.metrics import World, over_episodes
+from harness.runs.records import Variant
+from harness.studies import folder
+from harness.studies.figures import scatter
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WHO = ("model", "prompt", "answer")
+WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
+ENDS = ("", "_low", "_high")  # of the columns of an estimate
+TEMPLATES = Path(__file__).parent / "templates"
+SHOWN = 20  # ways to disagree that the page lists
 
 
 @dataclass(frozen=True)
@@ -55,14 +61,17 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
     """
     import pandas as pd
 
-    told: dict[str, list[pd.DataFrame]] = {FROZEN: [], DRIVEN: []}
+    by_world: dict[World, list[pd.DataFrame]] = {"frozen": [], "closed-loop": []}
     for run in runs:
-        kind, episodes = _episodes(run)
-        told[kind].append(episodes)
-    for kind, name in ((FROZEN, "frozen scenes (harness eval)"), (DRIVEN, "live episodes (harness drive)")):
-        if not told[kind]:
-            raise UserError(f"no run on {name} among {len(runs)} folders; give at least one of each kind")
-    frozen, closed = (pd.concat(told[kind], ignore_index=True) for kind in (FROZEN, DRIVEN))
+        world, episodes = _episodes(run)
+        by_world[world].append(episodes)
+    sources = {"frozen": "frozen scenes (harness eval)", "closed-loop": "live episodes (harness drive)"}
+    for world, tables in by_world.items():
+        if not tables:
+            raise UserError(
+                f"no run on {sources[world]} among {len(runs)} folders; give at least one of each kind"
+            )
+    frozen, closed = (pd.concat(tables, ignore_index=True) for tables in by_world.values())
     for each in (frozen, closed):
         if each.duplicated(list(KEY)).any():
             raise UserError("two of the runs have the same episodes; give one run of each model and prompt")
@@ -85,47 +94,30 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
     return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
 
 
-def _episodes(run: Path) -> "tuple[str, pd.DataFrame]":
-    """The kind of a run, and the result of each of its episodes."""
+def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
+    """The world of a run, and the result of each of its episodes."""
     import pandas as pd
 
-    try:
-        config: dict[str, Any] = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        kind = config["format"]
-        text = dict.fromkeys((*WHO, "condition", "failure"), str)
-        episodes = pd.read_csv(run / "episodes.csv", dtype=text, keep_default_na=False)
-        if kind == FROZEN:
-            laid = table(dataset_of(read(run)))
-            seeds = dict(zip(laid.episodes.tolist(), laid.seeds.tolist(), strict=True))
-            episodes["layout_seed"] = episodes["episode"].map(seeds)
-        elif kind != DRIVEN:
-            raise ValueError(f"format {kind}")
-        return kind, episodes[[*KEY, "success", "failure"]].astype({"success": bool})
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{printable(run)} is no finished run ({printable(error)}); give folders made by harness eval "
-            "and harness drive"
-        ) from None
+    run = read(path)
+    columns = ("condition", "seed", "layout_seed", "success", "failure")
+    rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
+    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(**asdict(run.manifest.variant))
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
     for place, group in both.groupby([*WHO, "condition"], sort=False):
         wide = group.pivot(index="seed", columns="layout_seed", values=["success_frozen", "success_closed"])
         frozen, closed = (wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed"))
-        told = {
+        estimates = {
             "frozen": over_episodes("success_rate", frozen),
             "closed": over_episodes("success_rate", closed),
             "difference": episode_interval((frozen - closed).mean(axis=0)),
             "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
         }
-        yield {
-            **dict(zip((*WHO, "condition"), place, strict=True)),
-            **{
-                f"{name}{end}": value for name, e in told.items()
-                for end, value in (("", e.value), ("_low", e.low), ("_high", e.high))
-            },
-            "n": group.layout_seed.nunique(),
-        }  # fmt: skip
+        row = dict(zip((*WHO, "condition"), place, strict=True))
+        for name, e in estimates.items():
+            row |= {f"{name}{end}": value for end, value in zip(ENDS, (e.value, e.low, e.high), strict=True)}
+        yield {**row, "n": group.layout_seed.nunique()}
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
@@ -138,3 +130,47 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
     places = [*WHO, "condition", "frozen_end", "closed_end"]
     counts = other.groupby(places, sort=False).size().rename("count").reset_index()
     return counts.sort_values("count", ascending=False, kind="stable")
+
+
+def write(result: Fidelity, out: Path) -> Path:
+    """Write `fidelity` and `episodes` as CSV and JSON Lines, the picture and the page, which is returned."""
+    rows = [shown(row) for row in result.table.to_dict("records")]
+    figure = scatter(result.table, [row["who"] for row in rows])
+    folder.write(out, {"fidelity": figure}, {"fidelity": result.table, "episodes": result.episodes})
+    page = environment(TEMPLATES).get_template("fidelity.html.j2").render(
+        figure=picture((out / "fidelity.svg").read_bytes()),
+        rows=rows,
+        headline=" ".join(headline(result)),
+        ways=disagreements(result.episodes).head(SHOWN).to_dict("records"),
+    )  # fmt: skip
+    write_whole(out / "index.html", page)
+    return out / "index.html"
+
+
+def headline(result: Fidelity) -> list[str]:
+    """The outcome in sentences: the rank correlation and the largest difference."""
+    rows: list[dict[Any, Any]] = result.table.to_dict("records")
+    worst = max(rows, key=lambda row: abs(row["difference"]))
+    points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
+    sentences = [
+        f"Largest difference, frozen minus closed: {points:+.1f} points [{low:+.1f}, {high:+.1f}], "
+        f"{worst['model']} {worst['prompt']} under {worst['condition']}, n = {worst['n']} episodes."
+    ]
+    if not np.isnan(result.rank):
+        models = f"{result.ranked} models and conditions"
+        sentences.insert(0, f"Spearman's rank correlation of {models}: {result.rank:.2f}.")
+    return sentences
+
+
+def shown(row: dict[Any, Any]) -> dict[str, str]:
+    """A row of the table as text; percent and points."""
+
+    def cell(name: str, sign: str = "") -> str:
+        value, low, high = (100 * row[f"{name}{end}"] for end in ENDS)
+        return f"{value:{sign}.1f} [{low:{sign}.1f}, {high:{sign}.1f}]"
+
+    return {
+        "who": " · ".join(str(row[name]) for name in WHO), "condition": str(row["condition"]),
+        "frozen": cell("frozen"), "closed": cell("closed"), "difference": cell("difference", "+"),
+        "agreement": cell("agreement"), "n": str(row["n"]),
+    }  # fmt: skip

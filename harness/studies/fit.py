@@ -10,8 +10,7 @@ part of the dangers that helpers watch.
 import numpy as np
 
 from harness.coordination.channel import density_coupled_loss
-from harness.studies.calibrated import FITTED_ON, Parameters
-from harness.studies.entropies import CUT
+from harness.studies.calibrated import CUT, FITTED_ON, Parameters
 from harness.studies.ledger import paper_numbers
 
 

@@ -21,6 +21,8 @@ METRICS = {
 CONDITIONS = {"single_local": "single-local", "swarm_v2x": "v2x", "swarm_6g": "6g"}
 BELOW, FROM = "below_", "from_"
 
+UNITS = {"count": "", "pct": ", %"}
+
 ASSUMED = {
     "core": "5 seeds x 1 500 episodes; the paper may mean 1 500 in all",
     "size": "N counts the ego; N = 5 to 7 are not in the paper; loss follows 0.6 + 3 (N - 2) %",
@@ -49,7 +51,7 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     fitted = {row for rows in FITTED_ON.values() for row in rows}
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for row in paper_numbers():
         low = float(row["paper_value"] or row["paper_low"])
         high = float(row["paper_value"] or row["paper_high"])
@@ -58,21 +60,21 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
         place |= {"paper_low": low, "paper_high": high}
         assumed = ASSUMED.get(row["id"], ASSUMED.get(row["panel"], ""))
         if row["condition"] not in CONDITIONS:
-            found.append({**place, "verdict": "cited", "kind": "cited", "assumed": row["note"]})
+            rows.append({**place, "verdict": "cited", "kind": "cited", "assumed": row["note"]})
             continue
         metric, scale, allowed = METRICS[row["metric"]]
         allowed *= low if row["metric"] == "latency" else 1.0
         for ours in _ours(summary, row, metric):
             mean, ci_low, ci_high = (float(ours[k]) * scale for k in ("mean", "ci_low", "ci_high"))
             difference = mean - min(max(mean, low), high)
-            found.append({
+            rows.append({
                 **place, "value": "" if ours["value"] is None else ours["value"],
                 "ours": mean, "ci_low": ci_low, "ci_high": ci_high, "difference": difference,
                 "allowed": allowed,
                 "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
                 "kind": "fitted" if row["id"] in fitted else "predicted", "assumed": assumed,
             })  # fmt: skip
-    return pd.DataFrame(found)
+    return pd.DataFrame(rows)
 
 
 def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
@@ -98,4 +100,37 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
     elif value:
         at = float(value) * (100 if row["variable"] == "loss" else 1)
         s = s[abs(s.value.astype(float) - at) < 1e-9]
-    return [{str(k): v for k, v in one.items()} for one in s.to_dict("records")]
+    return [{str(k): v for k, v in record.items()} for record in s.to_dict("records")]
+
+
+def tally(ledger: "pd.DataFrame") -> dict[str, int]:
+    """Numbers of the paper that can be run; how many of them have which verdict, and are predicted."""
+    ran = ledger[ledger.kind != "cited"]
+    total, misses = set(ran.id), set(ran[ran.verdict == "misses"].id)
+    unclear = set(ran[ran.verdict == "unclear"].id) - misses
+    return {
+        "total": len(total),
+        "within": len(total - misses - unclear),
+        "unclear": len(unclear),
+        "misses": len(misses),
+        "predicted": len(set(ran[ran.kind == "predicted"].id)),
+    }
+
+
+def shown(row: Any) -> dict[str, Any]:
+    """One row of the ledger as text."""
+    value = f" {row.value:g}" if isinstance(row.value, float) else ""
+    theirs = f"{row.paper_low:g}" + (f" to {row.paper_high:g}" if row.paper_high != row.paper_low else "")
+    cited = row.kind == "cited"
+    unit = UNITS.get(row.unit, f", {row.unit}")
+    return {
+        "id": row.id,
+        "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
+        "paper": theirs,
+        "ours": "" if cited else f"{row.ours:.1f} [{row.ci_low:.1f}, {row.ci_high:.1f}]",
+        "off": "" if cited else f"{row.difference:+.1f}",
+        "allowed": "" if cited else f"{row.allowed:.1f}",
+        "kind": row.kind,
+        "verdict": row.verdict,
+        "assumed": row.assumed,
+    }

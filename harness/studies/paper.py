@@ -1,13 +1,28 @@
-"""The paper's study as panels: operating points, swarm size, packet loss, entropy threshold."""
+"""`harness campaign paper`: operating points, swarm size, packet loss and entropy threshold, by the proxy."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from harness.coordination.operating_point import POINTS, OperatingPoint
-from harness.studies.axes import AXES, Value, grid
-from harness.studies.setting import Setting
+from harness.coordination.operating_point import POINTS
+from harness.core.files import write_whole
+from harness.evaluate.spec import versions
+from harness.report.library import picture
+from harness.report.page import environment
+from harness.studies import figures
+from harness.studies.axes import AXES, CORE, Setting, described, grid
+from harness.studies.calibrated import Calibrated
+from harness.studies.folder import write, write_manifest
+from harness.studies.ledger import ledger, shown, tally
+from harness.studies.play import joined, play
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+OFF = ("misses", "unclear")
 SEEDS = (0, 1, 2, 3, 4)
+TEMPLATES = Path(__file__).parent / "templates"
 VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 
@@ -32,16 +47,48 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     points = {name: replace(point, helper_rounds=True) for name, point in POINTS.items()}
     six = points["6g"]
     crowded = replace(six, helper_rounds=False, density_coupled=True)
+    sizes = [Setting("6g", crowded, int(n), "size", n) for n in grid(AXES["size"], "1:8")]
+    along = {
+        name: [Setting("6g", AXES[name].at(six, v), VEHICLES, name, v) for v in grid(AXES[name])]
+        for name in ("loss", "tau")
+    }
     return [
-        Panel("core", tuple(Setting(name, point, VEHICLES) for name, point in points.items()), core),
-        Panel("size", tuple(
-            Setting("6g", crowded, int(n), "size", n) for n in grid(AXES["size"], "1:8")
-        ), sweep),
-        Panel("loss", tuple(_along("loss", six, grid(AXES["loss"]))), sweep),
-        Panel("tau", tuple(_along("tau", six, grid(AXES["tau"]))), sweep),
-    ]  # fmt: skip
+        Panel(CORE, tuple(Setting(name, point, VEHICLES) for name, point in points.items()), core),
+        *(Panel(name, tuple(settings), sweep) for name, settings in {"size": sizes, **along}.items()),
+    ]
 
 
-def _along(name: str, point: OperatingPoint, values: Sequence[Value]) -> Iterator[Setting]:
-    for value in values:
-        yield Setting("6g", AXES[name].at(point, value), VEHICLES, name, value)
+def run_paper(panels: Sequence[Panel], out: Path, progress: Callable[[int], None]) -> "pd.DataFrame":
+    """Play the paper's panels with the calibrated proxy.
+
+    Writes `conditions`, `episodes` and `ledger` as CSV and JSON Lines, `study.json`, the Figures A and B as
+    SVG, PDF and PNG, and `index.html`.
+
+    Returns:
+        The ledger.
+    """
+    sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
+    played = [play(sources[p.episodes], p.name, p.settings, SEEDS, progress) for p in panels]
+    whole, (core, *sweeps) = joined(played), (p.summary for p in played)
+    numbers = ledger(whole.summary)
+    manifest = {
+        "study": "paper",
+        "seeds": list(SEEDS),
+        "episodes_per_seed": {p.name: p.episodes for p in panels},
+        "source": next(iter(sources.values())).manifest(),
+        "panels": described({p.name: p.settings for p in panels}),
+        "versions": versions(),
+    }
+    drawn = {"figure-a": figures.composite_a(core), "figure-b": figures.along(sweeps, best_band=True)}
+    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes, "ledger": numbers})
+    write_manifest(out, "study", manifest)
+    rows = [shown(row) for row in numbers.itertuples()]
+    page = environment(TEMPLATES).get_template("paper.html.j2").render(
+        manifest=manifest,
+        rows=rows,
+        off={v: [f"{r['id']}, {r['what']}: {r['off']}" for r in rows if r["verdict"] == v] for v in OFF},
+        pictures={stem: picture((out / f"{stem}.svg").read_bytes()) for stem in drawn},
+        **tally(numbers),
+    )  # fmt: skip
+    write_whole(out / "index.html", page)
+    return numbers

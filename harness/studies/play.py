@@ -1,27 +1,49 @@
-"""Plays a source of intents at every point of a panel, and tells what came of it with intervals."""
+"""Plays a source of intents at every point of a panel, and sums up with intervals."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import Floats
-from harness.core.statistics import Estimate
-from harness.evaluate.scoring import Scored
-from harness.evaluate.success import Table
-from harness.runs.summary import by_episode, latency_percentiles, over_episodes, over_seeds
-from harness.studies.episode_tables import EPISODE_METRICS, PLACE, of_episodes
-from harness.studies.setting import Setting
+from harness.core.arrays import Floats, Ints
+from harness.core.statistics import Estimate, seed_interval
+from harness.evaluate.walk import Ask, World, columns, walk
+from harness.runs.metrics import METRICS, PERCENTILES, of_decisions, over_episodes, over_seeds, percentiles
+from harness.studies.axes import Setting
 
 if TYPE_CHECKING:
     import pandas as pd
 
-METRICS = (
-    "success_rate", "unsafe_rate", "late_rate", "latency_proxy_ms", "deadline_miss_rate", "trigger_rate",
-    "messages_per_episode", "effective_loss", "observed_reply_loss",
+NAMES = ("source", "panel", "condition", "variable")
+PLACE = (*NAMES, "value")
+EPISODE_METRICS = (
+    "success_rate", "trigger_rate", "latency_proxy_ms", "messages_per_episode", "effective_loss",
 )  # fmt: skip
+ENDS = ("success_rate", "unsafe_rate", "late_rate")
+PER_DECISION = (
+    "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
+    "observed_reply_loss",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Walked:
+    """What a walk at one operating point came to, for some seeds and episodes of each.
+
+    Attributes:
+        episodes: their numbers, (E,).
+        ends: each of `ENDS`, (S, E).
+        columns: numbers of the decisions (n,) by name.
+        places: the episode of each decision, counted row by row in (S, E), (n,).
+    """
+
+    episodes: Ints
+    ends: Mapping[str, Floats]
+    columns: Mapping[str, Floats]
+    places: Ints
 
 
 class Source(Protocol):
@@ -32,23 +54,32 @@ class Source(Protocol):
         same_episodes: whether every seed plays the same episodes.
     """
 
+    name: str
     same_episodes: bool
-
-    @property
-    def name(self) -> str:
-        """What figures call it."""
-        ...
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
         ...
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
-        """Every decision at one operating point with one seed's luck, whole episodes at a time.
+    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+        """Walks at one operating point, some episodes at a time; every point has the same draws.
 
-        It is the same luck at every point.
+        `vehicles` is how many there are, the ego included: the nearest ones.
         """
         ...
+
+
+def walk_through(
+    world: World[Any], point: OperatingPoint, ask: Ask[Any], seeds: Sequence[int], episodes: Ints
+) -> tuple[dict[str, Floats], Ints]:
+    """The `columns` and `places` of a world's decisions; `episodes` (E,) ascending."""
+    decided = list(chain.from_iterable(walk(world, [point], ask)))
+    parts = [columns(part) for part in decided]
+    of_seed = {seed: place for place, seed in enumerate(seeds)}
+    row = np.array([of_seed[seed] for part in decided for seed in part.due.seed.tolist()])
+    column = np.searchsorted(episodes, np.concatenate([part.due.episode for part in decided]))
+    joint = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return joint, row * len(episodes) + column
 
 
 @dataclass(frozen=True)
@@ -84,40 +115,89 @@ def play(
     episodes: list[dict[str, Floats]] = []
     for setting in settings:
         place = (source.name, panel, setting.condition, setting.variable, setting.value)
-        told = [_told(source, setting, seed) for seed in seeds]
-        metrics = {name: np.stack([t[name] for t in told]) for name in METRICS}  # (seeds, episodes)
+        walked = list(source.walked(setting.point, setting.vehicles, seeds))
+        metrics = {name: np.hstack([w.ends[name] for w in walked]) for name in ENDS}
+        metrics |= {name: np.hstack([_metric(name, w, len(seeds)) for w in walked]) for name in PER_DECISION}
+        latency_ms = np.array([
+            percentiles(np.concatenate([_of_seed(w, n) for w in walked])) for n in range(len(seeds))
+        ])  # fmt: skip
         rows += [
             {**dict(zip(PLACE, place, strict=True)), "metric": metric, "mean": e.value, "ci_low": e.low,
              "ci_high": e.high, "n": e.n, "interval": interval}
-            for metric, e, interval in _estimates(source, metrics, [t["latency_s"] for t in told])
+            for metric, e, interval in _estimates(source, metrics, latency_ms)
         ]  # fmt: skip
+        numbers = np.concatenate([w.episodes for w in walked])
         episodes.append({name: metrics[name].ravel() for name in EPISODE_METRICS} | {
-            "seed": np.repeat(seeds, metrics["success_rate"].shape[1]),
-            "episode": np.concatenate([t["episode"] for t in told]),
+            "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
         })  # fmt: skip
         progress(1)
-    return Played(pd.DataFrame(rows), of_episodes(source.name, panel, settings, episodes))
+    return Played(pd.DataFrame(rows), _episode_table(source.name, panel, settings, episodes))
 
 
-def _told(source: Source, setting: Setting, seed: int) -> dict[str, Floats]:
-    """Each metric by episode, the episodes' numbers, and the latency of every decision."""
-    pieces: dict[str, list[Any]] = {}
-    for laid, made in source.scored(setting.point, setting.vehicles, seed):
-        found = {
-            **by_episode(laid, made, METRICS),
-            "episode": laid.episodes,
-            "latency_s": made.coordination.latency_s,
-        }
-        for name, values in found.items():
-            pieces.setdefault(name, []).append(values)
-    return {name: np.concatenate(values) for name, values in pieces.items()}
+def _metric(name: str, walked: Walked, seeds: int) -> Floats:
+    """A metric of the decisions by episode, (S, E)."""
+    n = len(walked.episodes)
+    return of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
+
+
+def _of_seed(walked: Walked, place: int) -> Floats:
+    """Latencies of the decisions of the seed at this place."""
+    return np.asarray(walked.columns["latency_ms"][walked.places // len(walked.episodes) == place])
 
 
 def _estimates(
-    source: Source, metrics: Mapping[str, Floats], latency_s: Sequence[Floats]
+    source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
     for name, values in metrics.items():
         yield name, over_seeds(name, values), "seed means"
         if source.same_episodes:
             yield name, over_episodes(name, values), "episodes"
-    yield from latency_percentiles(latency_s)
+    for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
+        yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
+
+
+def _episode_table(
+    source: str, panel: str, settings: Sequence[Setting], values: Sequence[Mapping[str, Floats]]
+) -> "pd.DataFrame":
+    """The table of a panel's episodes, from `EPISODE_METRICS`, `seed` and `episode` of each grid point, (n,).
+
+    Names are kept once.
+    """
+    import pandas as pd
+
+    column = {name: np.concatenate([of[name] for of in values]) for name in values[0]}
+    point = np.repeat(np.arange(len(settings)), [len(of["seed"]) for of in values])
+
+    def named(names: list[Any]) -> "pd.Categorical[Any]":
+        return pd.Categorical(names).take(point)
+
+    swept = [np.nan if s.value is None else s.value for s in settings]
+    kind = object if any(isinstance(v, str) for v in swept) else float
+    return pd.DataFrame({
+        "source": named([source] * len(settings)),
+        "panel": named([panel] * len(settings)),
+        "condition": named([s.condition for s in settings]),
+        "variable": named([s.variable for s in settings]),
+        "value": np.array(swept, dtype=kind)[point],
+        "seed": column["seed"],
+        "episode": column["episode"].astype(int),
+        "success": column["success_rate"].astype(bool),
+        "trigger_rate": column["trigger_rate"],
+        "latency_ms": column["latency_proxy_ms"].round(3),
+        "messages": column["messages_per_episode"].astype(int),
+        "effective_loss": column["effective_loss"].round(6),
+    })  # fmt: skip
+
+
+def joined(parts: Sequence[Played]) -> Played:
+    """What came of several panels or sources, one below the other; the names in episodes are kept once."""
+    import pandas as pd
+    from pandas.api.types import union_categoricals
+
+    tables = [part.episodes for part in parts]
+    names = {name: union_categoricals([table[name] for table in tables]) for name in NAMES}
+    rest = pd.concat([table.drop(columns=list(NAMES)) for table in tables], ignore_index=True)
+    return Played(
+        pd.concat([part.summary for part in parts], ignore_index=True),
+        pd.concat([pd.DataFrame(names), rest], axis=1),
+    )

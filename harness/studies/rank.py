@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -40,14 +41,15 @@ def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dic
     Raises:
         UserError: the dataset was built from another scenario than the one that would be driven.
     """
-    for what, here in settings().items():
-        if dataset.manifest[what] != here:
+    scenario = dataset.scenario
+    for what, here in settings(scenario).items():
+        if getattr(dataset.manifest, what) != here:
             raise UserError(
                 f"dataset {printable(dataset.path)} was built with other {what} than are driven here; "
                 "build it again to compare"
             )
     seeds = {s.record["episode"]: s.record["episode_seed"] for s in dataset.scenes}
-    live = spread(drive_all, seeds.values(), workers, progress)
+    live = spread(partial(drive_all, scenario), seeds.values(), workers, progress)
     return {
         driver: _standing(frozen_success(dataset, driver), np.array([o[driver].success for o in live]))
         for driver in DRIVERS

@@ -1,26 +1,37 @@
-"""A finished run as a source: its answers are coordinated again, and no model is asked."""
+"""A finished run as a source: its answers are coordinated again, and no model is asked what the run has."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 
-from harness.coordination.channel import Draws
+from harness.backends.base import AnswerMode, Backend
+from harness.backends.cache import cached, default_file
+from harness.backends.cards import Card
+from harness.backends.registry import open_backend
+from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import nearest
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import Bools
+from harness.core.arrays import Ints
+from harness.core.config import convert
 from harness.core.errors import UserError, printable
-from harness.evaluate.again import Asking, second_answers
-from harness.evaluate.intents import Answered, intents
-from harness.evaluate.merging import Merged, delivered
-from harness.evaluate.scoring import Scored, draw, score
-from harness.evaluate.success import Table, table
-from harness.evaluate.timing import PAPER, inference_s
-from harness.runs.folder import Run, dataset_of, read
-from harness.studies.setting import Setting
+from harness.core.files import alone, canonical_json
+from harness.dataset.load import Scene
+from harness.evaluate import latency as latencies
+from harness.evaluate.asking import Asker
+from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.spec import Spec
+from harness.prompts import versions
+from harness.runs.folder import dataset_of, read
+from harness.studies.play import Walked, walk_through
+
+# What fusion calls that none of the run's conditions needed say, and how long they take, in the run's folder.
+CALLS, TIMES = "fusion-calls.jsonl", "fusion-calls.json"
 
 
 class Stored:
@@ -37,59 +48,113 @@ class Stored:
 
     same_episodes = True
 
-    def __init__(self, folder: Path, latency: str | None = None) -> None:
-        self.run: Run = read(folder)
-        config = self.run.config
-        self.name = f"{config['model']['name']} · {config['prompt']['version']} · {self.run.answer}"
-        self.seeds = tuple(int(seed) for seed in config["seeds"])
-        self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in config["conditions"]}
-        rows = {row["scene"]: row for row in self.run.rows}
-        whole = dataset_of(self.run)
-        dataset = replace(whole, scenes=tuple(scene for scene in whole.scenes if scene.id in rows))
-        if len(dataset.scenes) != len(rows):
+    def __init__(
+        self, folder: Path, latency: str | None = None,
+        more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
+    ) -> None:  # fmt: skip
+        """A run. `more` is told how many fusion calls are owed, and `done` how many have an answer."""
+        self.run = read(folder)
+        if self.run.world != "frozen":
+            raise UserError(
+                f"{printable(folder)} was driven, and other decisions lead elsewhere; "
+                "give a folder made by `harness eval`"
+            )
+        manifest = self.run.manifest
+        self.name = str(manifest.variant)
+        self.seeds = manifest.seeds
+        self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+        mine, whole = self.run.decisions.scenes, dataset_of(self.run)
+        self._dataset = replace(whole, scenes=tuple(scene for scene in whole.scenes if scene.id in mine))
+        if len(self._dataset.scenes) != len(mine):
             raise UserError(f"{printable(folder)} has scenes that its dataset has not; make the run again")
-        by_id = {
-            f"{scene}/{viewer}": a for scene, row in rows.items() for viewer, a in row["answers"].items()
-        }
-        self._dataset = dataset
-        self._second: Merged | None = None
-        known = intents(dataset, by_id, self.run.answer, bool(config["thinking"]))
-        self._laid = table(dataset)
-        self._latency = PAPER if latency == "paper" else dict(config["latency"])
-        self._known = replace(known, inference_s=inference_s(self._latency, known.answers))
-        self.vehicles = self._known.distance_m.shape[1]
-        self._draw = lru_cache(maxsize=64)(self._drawn)
+        self.vehicles = max(len(scene.viewers) for scene in self._dataset.scenes)
+        own = latencies.kept(folder / TIMES) or manifest.latency
+        self._asker = Asker(
+            self._spec(), self._open, latencies.PAPER if latency == "paper" else own, folder / CALLS,
+            {answer.id: answer for answer in self.run.answers}, done, more,
+        )  # fmt: skip
+        self._world = lru_cache(maxsize=2)(partial(FrozenWorld, self._dataset))
+        self._intents: dict[str, Intents] = {}  # of each step, by the first of its scenes
 
     def manifest(self) -> dict[str, Any]:
         """The run, the digest of its dataset, and where its times come from."""
-        config = self.run.config
         return {
-            "name": self.name, "run": str(self.run.path), "dataset_sha256": config["dataset"]["sha256"],
-            "latency": self._latency,
+            "name": self.name, "run": str(self.run.path), "dataset_sha256": self._dataset.sha256,
+            "latency": msgspec.to_builtins(self._asker.latency),
         }  # fmt: skip
 
-    def prepare(self, settings: Iterable[Setting], seeds: Sequence[int], asking: Asking) -> None:
-        """Ask the model what these grid points need beyond the run's answers, if they need anything."""
-        asked_again = [s for s in settings if s.point.asks_again]
-        draws = [self._draw(seed) for seed in seeds]
-        codes = [delivered(self._with(s.vehicles), [s.point], draws) for s in asked_again]
-        if asked_again:
-            points, every = [s.point for s in asked_again], np.unique(np.concatenate(codes))
-            self._second, self._latency = second_answers(
-                self.run, self._dataset, self._known, points, every, self._latency, asking
+    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+        """All episodes, with the ego and so many of the nearest vehicles.
+
+        Raises:
+            UserError: the point has the run's model fuse, and it cannot.
+        """
+        replace(self._asker.spec, points=(point,))
+        world = self._world(tuple(seeds)).undecided()
+        columns, places = walk_through(world, point, _Nearest(self, vehicles - 1), seeds, world.numbers)
+        verdicts = world.verdicts(point)
+        ends = {
+            name: np.stack([getattr(verdict, field) for verdict in verdicts]).astype(float)
+            for name, field in (("success_rate", "success"), ("unsafe_rate", "unsafe"), ("late_rate", "late"))
+        }
+        yield Walked(world.numbers, ends, columns, places)
+
+    def intents(self, moments: Sequence[Scene]) -> Intents:
+        """What every vehicle intends, from the run's answers."""
+        if moments[0].id not in self._intents:
+            self._intents[moments[0].id] = self._asker(moments)
+        return self._intents[moments[0].id]
+
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
+        try:
+            with alone(self.run.path / f".{CALLS}.lock"):
+                before = self._asker.latency
+                call = self._asker.fusion_call(moments, codes)
+                if self._asker.latency != before:
+                    latencies.keep(self.run.path / TIMES, self._asker.latency)
+                return call
+        except BlockingIOError:
+            raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
+
+    def _spec(self) -> Spec:
+        """The evaluation that made the run, with all that decides its answers."""
+        manifest, shown = self.run.manifest, printable(self.run.path)
+        version = manifest.prompt["version"]
+        prompt = versions.load(version)
+        if prompt.sha256 != manifest.prompt["sha256"]:
+            raise UserError(
+                f"{shown}: prompt {printable(version)} has changed since; restore it or run again"
             )
+        return Spec(
+            convert(manifest.model, Card, f"{shown}: its model"), prompt, FrozenSource(self._dataset), (),
+            manifest.seeds, thinking=manifest.thinking, answer=cast("AnswerMode", manifest.answer),
+            batch_size=manifest.batch_size, dtype=manifest.dtype,
+        )  # fmt: skip
 
-    def scored(self, point: OperatingPoint, vehicles: int, seed: int) -> Iterator[tuple[Table, Scored]]:
-        """Every decision at one operating point, with the ego and so many of the nearest vehicles."""
-        known = self._with(vehicles)
-        yield self._laid, score(self._laid, known, point, seed, self._draw(seed), self._second)
+    def _open(self) -> Backend:
+        spec = self._asker.spec
+        backend = open_backend(spec.card, dtype=spec.dtype, batch_size=spec.batch_size)
+        stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(backend.identity()))
+        if now != stored:
+            other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
+            raise UserError(
+                f"{printable(self.run.path)}: the model is not what it was "
+                f"({printable(', '.join(other))}); run again"
+            )
+        return cached(backend, spec.card, default_file())
 
-    def _with(self, vehicles: int) -> Answered:
-        return replace(self._known, valid=self._known.valid & self._there(vehicles - 1))
 
-    def _there(self, helpers: int) -> Bools:
-        reach = np.nan_to_num(self._known.range_m, nan=np.inf)
-        return nearest(np.isfinite(reach), reach, helpers)
+class _Nearest:
+    """A run's intents, of which only the nearest helpers' count."""
 
-    def _drawn(self, seed: int) -> Draws:
-        return draw(self._laid, seed, self._known.valid.shape)
+    def __init__(self, stored: Stored, helpers: int) -> None:
+        self._stored, self._helpers = stored, helpers
+
+    def __call__(self, moments: Sequence[Scene]) -> Intents:
+        intents = self._stored.intents(moments)
+        reach = np.nan_to_num(intents.range_m, nan=np.inf)
+        return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
+
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
+        return self._stored.fusion_call(moments, codes)

@@ -1,6 +1,5 @@
 """`harness sweep`: stored answers at every point of a grid."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,19 +7,15 @@ from typing import TYPE_CHECKING
 
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
 from harness.evaluate.spec import versions
 from harness.studies import figures
-from harness.studies.axes import AXES, Axis, Value, grid
-from harness.studies.episode_tables import joined, write_table
-from harness.studies.play import Source, play
-from harness.studies.setting import CORE, Setting, described
+from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
+from harness.studies.folder import write, write_manifest
+from harness.studies.play import Source, joined, play
 from harness.studies.stored import Stored
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FORMAT = "swarmdrive-sweep/1"
 
 
 def settings(
@@ -38,7 +33,8 @@ def settings(
         )
     return tuple(
         Setting(name, axis.at(point, v), vehicles if axis.field else int(v), axis.name, v)
-        for name, point in ((name, point_of(sources, name)) for name in conditions)
+        for name in conditions
+        for point in (point_of(sources, name),)
         for v in values
     )
 
@@ -78,35 +74,26 @@ def run_sweep(
     Returns:
         The summary: a row a source, grid point and metric.
     """
-    import pandas as pd
-
     played = {
-        name: [
-            play(source, name, able, seeds, progress)
+        panel: [
+            play(source, panel, able, seeds, progress)
             for source in sources
-            # Who has no model cannot ask it again.
+            # The proxy has no model that could answer a fusion call.
             if (able := [s for s in points if isinstance(source, Stored) or not s.point.asks_again])
         ]
-        for name, points in panels.items()
+        for panel, points in panels.items()
     }
-    along = [
-        pd.concat([p.summary for p in made], ignore_index=True)
-        for name, made in played.items() if name != CORE
-    ]  # fmt: skip
-    summary = pd.concat([p.summary for made in played.values() for p in made], ignore_index=True)
-    episodes = joined([p.episodes for made in played.values() for p in made])
-    out.mkdir(parents=True, exist_ok=True)
-    figures.save_all(figures.along(along), out / "sweep")
-    for n, p in enumerate(played.get(CORE, ()), 1):
-        figures.save_all(figures.composite_a(p.summary), out / f"operating-points-{n}")
-    write_table(summary, out / "conditions")
-    write_table(episodes, out / "episodes")
+    whole = joined([part for parts in played.values() for part in parts])
+    along = [whole.summary[whole.summary.panel == panel] for panel in panels if panel != CORE]
+    drawn = {"sweep": figures.along(along)}
+    for n, part in enumerate(played.get(CORE, ()), 1):
+        drawn[f"operating-points-{n}"] = figures.composite_a(part.summary)
+    write(out, drawn, {"conditions": whole.summary, "episodes": whole.episodes})
     manifest = {
-        "format": FORMAT,
         "sources": [source.manifest() for source in sources],
         "seeds": list(seeds),
         "panels": described(panels),
         "versions": versions(),
     }
-    write_whole(out / "sweep.json", json.dumps(manifest, indent=1, allow_nan=False) + "\n")
-    return summary
+    write_manifest(out, "sweep", manifest)
+    return whole.summary

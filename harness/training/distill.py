@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,9 @@ from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, write_whole
 from harness.dataset.load import Dataset
 from harness.prompts.versions import Prompt
-from harness.training.card import model_card
 from harness.training.gguf_export import export
+from harness.training.model import save_tokenizer
 from harness.training.student import Progress, Student
-from harness.training.text import save_tokenizer
 from harness.training.train import STAGES, Plan
 
 
@@ -55,8 +54,8 @@ def distill(
     student = Student(dataset, prompts, plan, work, device)
     curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
-        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest["seed"],
-                    "episodes": dataset.manifest["episodes"], "scenes": len(dataset.scenes)},
+        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest.seed,
+                    "episodes": dataset.manifest.episodes, "scenes": len(dataset.scenes)},
         "prompts": {p.version: p.sha256 for p in prompts},
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),
@@ -94,3 +93,37 @@ def _begin(out: Path, settings: dict[str, Any]) -> Path:
             f"--out {shown} cannot be written ({error.strerror}); choose another folder"
         ) from None
     return work
+
+
+def model_card(name: str, facts: Mapping[str, Any]) -> str:
+    """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
+    data, plan, apart = facts["dataset"], facts["plan"], facts["held_out"]
+    losses = "\n".join(
+        f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
+        for stage, curve in facts["curves"].items()
+    )
+    return f"""# {name}
+
+A Qwen3 of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained from random weights
+by `harness distill` to imitate one planner in one scenario. It shows the harness with a real language model
+that fits beside the source; it says nothing about Qwen3-4B or any other model, and drives nothing but
+`occluded-intersection`.
+
+- Data: `{data["name"]}`, {data["episodes"]} episodes from seed {data["seed"]}, {data["scenes"]} scenes
+  (manifest sha256 `{data["sha256"]}`), prompts {", ".join(facts["prompts"])}; every viewer, and the ego with
+  messages.
+- Teacher: the scenes' outcome tables, as soft labels over the actions that turned out safe. A viewer that
+  cannot tell scenes apart learns their mean, so what is hidden makes it unsure.
+- Seed {plan["seed"]}, batches of {plan["batch"]}, Muon {plan["muon_lr"]:g} and AdamW {plan["adam_lr"]:g}.
+- Read-out on {apart["questions"]} questions of {apart["episodes"]} episodes held out: KL to the soft labels
+  {apart["kl_nats"]:.3f} nats; always answering the mean label would give {apart["kl_of_the_mean_nats"]:.3f}.
+
+| stage | sequences | first loss | last loss |
+|---|---|---|---|
+{losses}
+
+`alone` fits the probabilities of one letter an action and a report in words; `excerpts` before it does so
+on prompts that show nothing but the conflicts, `messages` after it with helpers' messages in the ego's
+prompt. `answers` is the JSON text, which states the read-out's own distribution. The losses are of different
+sums and compare within a stage only; curves are in `training.json`.
+"""

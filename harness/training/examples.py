@@ -1,4 +1,9 @@
-"""What each viewer of each scene is asked, and what it should have intended."""
+"""What each viewer of each scene is asked, and what the outcome table says it should have intended.
+
+Each safe action has the weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one
+has none. Where IDLE and FASTER come to the same (at the highest speed level) most goes to IDLE. A viewer that
+cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, Scene
-from harness.prompts.versions import Prompt
+from harness.prompts.versions import NO_WORDS, Prompt
 from harness.training.answers import message
-from harness.training.teacher import labels
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
+SOFTNESS_S = 0.25
+CALM = {"FASTER": 0.3}  # prior weight of an action, 1 if not named
 
 
 @dataclass(frozen=True)
@@ -35,21 +41,32 @@ class Question:
     label: Floats
 
 
+def labels(dataset: Dataset) -> Floats:
+    """Soft labels of every scene, (n, A); uniform where no action is safe."""
+    safe, delay_s = dataset.outcome_arrays()
+    prior = np.array([CALM.get(a, 1.0) for a in dataset.actions])
+    weight = np.where(safe, prior * np.exp(-np.nan_to_num(delay_s) / SOFTNESS_S), 0.0)
+    weight = np.where(safe.any(axis=1, keepdims=True), weight, 1.0)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
 def alone(dataset: Dataset, prompts: Sequence[Prompt]) -> Iterator[Question]:
     """Every viewer on its own."""
     for scene, label in zip(dataset.scenes, labels(dataset), strict=True):
         for viewer, graph in scene.record["graphs"].items():
             for prompt in prompts:
-                sent = prompt.render(graph, dataset.actions)
+                sent = prompt.render(graph, dataset.actions, words=dataset.scenario.words)
                 yield Question(_key(scene, viewer, prompt), prompt, graph, sent, label)
 
 
-def excerpts(questions: Sequence[Question], actions: tuple[str, ...]) -> Iterator[Question]:
+def excerpts(
+    questions: Sequence[Question], actions: tuple[str, ...], words: Mapping[str, str] = NO_WORDS
+) -> Iterator[Question]:
     """The same questions with nothing in them but the conflicts; those that have any."""
     for q in questions:
         if q.graph["conflicts"]:
             graph = {**q.graph, "nodes": [], "sectors": []}
-            yield replace(q, graph=graph, messages=q.prompt.render(graph, actions))
+            yield replace(q, graph=graph, messages=q.prompt.render(graph, actions, words=words))
 
 
 def with_messages(
@@ -60,14 +77,14 @@ def with_messages(
         graphs = scene.record["graphs"]
         ego, *helpers = scene.viewers
         for prompt in prompts:
-            lucky = luck.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
-            heard = [h for h, u in zip(helpers, lucky, strict=True) if u < ARRIVES]
-            said = [
+            draws = noise.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
+            heard = [
                 {"sender": h, **message(graphs[h], intents[_key(scene, h, prompt)], dataset.actions)}
-                for h in heard
+                for h, u in zip(helpers, draws, strict=True)
+                if u < ARRIVES
             ]
-            if said:
-                sent = prompt.render(graphs[ego], dataset.actions, said)
+            if heard:
+                sent = prompt.render(graphs[ego], dataset.actions, heard, dataset.scenario.words)
                 yield Question(f"{_key(scene, ego, prompt)}+m", prompt, graphs[ego], sent, label)
 
 
@@ -78,7 +95,7 @@ def split(dataset: Dataset, held_out: int) -> tuple[Dataset, Dataset]:
     parts: tuple[list[Scene], list[Scene]] = ([], [])
     for scene in dataset.scenes:
         parts[scene.record["episode"] in last].append(scene)
-    kept, apart = (Dataset(dataset.path, dataset.manifest, dataset.sha256, tuple(scenes)) for scenes in parts)
+    kept, apart = (replace(dataset, scenes=tuple(scenes)) for scenes in parts)
     return kept, apart
 
 

@@ -114,14 +114,14 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
     """Texts and types of all tokens, by id; rows of the embedding without a token are unused."""
     from gguf import TokenType
 
-    known = {i: (text, TokenType.NORMAL) for text, i in tokenizer["model"]["vocab"].items()}
+    tokens = {i: (text, TokenType.NORMAL) for text, i in tokenizer["model"]["vocab"].items()}
     for token in tokenizer["added_tokens"]:
         kind = TokenType.CONTROL if token["special"] else TokenType.USER_DEFINED
-        known[token["id"]] = (token["content"], kind)
-    if max(known) >= rows:
-        raise UserError(f"{shown}: its tokenizer has {max(known) + 1} tokens and the model only {rows}")
-    tokens = [known.get(i, (f"[PAD{i}]", TokenType.UNUSED)) for i in range(rows)]
-    return [text for text, _ in tokens], [int(kind) for _, kind in tokens]
+        tokens[token["id"]] = (token["content"], kind)
+    if max(tokens) >= rows:
+        raise UserError(f"{shown}: its tokenizer has {max(tokens) + 1} tokens and the model only {rows}")
+    by_row = [tokens.get(i, (f"[PAD{i}]", TokenType.UNUSED)) for i in range(rows)]
+    return [text for text, _ in by_row], [int(kind) for _, kind in by_row]
 
 
 def _tensors(

@@ -4,6 +4,7 @@ transformers in float32 is the reference. llama.cpp is held to it twice: with th
 exported on the spot, and with the GGUF file that the model's card names.
 """
 
+import json
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +19,8 @@ from harness.backends.cards import Card
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
-from harness.backends.transformers import checkpoint
 from harness.backends.transformers import engine as transformers_engine
+from harness.backends.weights import find_checkpoint
 from harness.core.arrays import Floats
 from harness.parsing.parse import parse
 from harness.training.gguf_export import export
@@ -53,8 +54,8 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What one engine made of the prompts.
+class Outputs:
+    """The outputs of one engine, a prompt at a time.
 
     Attributes:
         tokens: token ids of each json prompt.
@@ -85,69 +86,59 @@ def compare(
     Raises:
         UserError: weights that are not there or do not load; a checkpoint that no GGUF can hold.
     """
-    where = checkpoint.find(reference)
-    rows = checkpoint.vocabulary(where)
+    where = find_checkpoint(reference)
+    rows = int(json.loads((where / "config.json").read_bytes())["vocab_size"])  # padding included
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
-    known = _hear(plain(batch_size=1), asked, letters, rows)
+    expected = _outputs(plain(batch_size=1), asked, letters, rows)
     progress(1)
+    ids = [r.id for r in asked]
+    findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "f32.gguf"
         export(where, file, "F32")
         same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None)
         exact = partial(llama_backend.open, same, device="cpu")
         shipped = partial(llama_backend.open, gguf, device="cpu")
-        found = []
-        for label, through in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
-            found += _findings(label, asked, known, _hear(through(batch_size=1), asked, letters, rows))
+        alone: list[tuple[str, Callable[..., Backend], list[str]]] = [("transformers", plain, expected.texts)]
+        for label, engine in (("F32", exact), (gguf.quantisation or "GGUF", shipped)):
+            other = _outputs(engine(batch_size=1), asked, letters, rows)
+            if engine is exact:
+                alone.append(("llama.cpp F32", exact, other.texts))
+            logit = np.abs(expected.logits - other.logits).max(axis=1)
+            readout = np.abs(expected.readouts - other.readouts).max(axis=1)
+            findings += [
+                _equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, other.tokens),
+                _near(f"{label}: largest difference of a logit", MOST_LOGIT.get(label), ids, logit),
+                _equal(f"{label}: greedy text equal", LEAST_TEXTS, ids, expected.texts, other.texts),
+                _near(f"{label}: largest difference of a read-out", MOST_READOUT, ids, readout),
+            ]
             progress(1)
-        found.append(_company("transformers", plain, asked, known.texts))
-        progress(1)
-        found.append(_company("llama.cpp F32", exact, asked, None))
-        progress(1)
-    return found
+        for label, opened, texts in alone:
+            what = f"{label}: text equal in reversed batches of {BATCH}"
+            together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
+            findings.append(_equal(what, 1.0, ids, texts, together))
+            progress(1)
+    return findings
 
 
-def _hear(
+def _outputs(
     backend: LanguageModel | LlamaBackend, asked: Sequence[Request], letters: Sequence[Request], rows: int
-) -> Heard:
+) -> Outputs:
     tokens = [backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in asked]
     logits = np.concatenate([backend.next_log_probs([ids], rows) for ids in tokens])
-    read = [
+    readouts = [
         parse(c.text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
         for r, c in zip(letters, backend.complete(letters), strict=True)
     ]
-    return Heard(tokens, logits, _texts(backend, asked), np.array(read))
+    return Outputs(tokens, logits, _texts(backend, asked), np.array(readouts))
 
 
 def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
     return [c.text if c.error is None else f"error: {c.error}" for c in backend.complete(asked)]
 
 
-def _findings(label: str, asked: Sequence[Request], one: Heard, other: Heard) -> list[Finding]:
-    ids = [r.id for r in asked]
-    logit = np.abs(one.logits - other.logits).max(axis=1)
-    read = np.abs(one.readouts - other.readouts).max(axis=1)
-    return [
-        _equal(f"{label}: token ids equal", 1.0, ids, one.tokens, other.tokens),
-        _near(f"{label}: largest difference of a logit", MOST_LOGIT.get(label), ids, logit),
-        _equal(f"{label}: greedy text equal", LEAST_TEXTS, ids, one.texts, other.texts),
-        _near(f"{label}: largest difference of a read-out", MOST_READOUT, ids, read),
-    ]
-
-
-def _company(
-    label: str, opened: Callable[..., Backend], asked: Sequence[Request], alone: list[str] | None
-) -> Finding:
-    """Batches in reverse order, against one at a time."""
-    alone = alone or _texts(opened(batch_size=1), asked)
-    together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
-    return _equal(
-        f"{label}: text equal in reversed batches of {BATCH}", 1.0, [r.id for r in asked], alone, together
-    )
-
-
-def _equal(what: str, least: float, ids: Sequence[str], one: Sequence[Any], other: Sequence[Any]) -> Finding:
-    unlike = [f"{i}: {a!r} / {b!r}" for i, a, b in zip(ids, one, other, strict=True) if a != b]
+def _equal(what: str, least: float, ids: Sequence[str], a: Sequence[Any], b: Sequence[Any]) -> Finding:
+    unlike = [f"{i}: {x!r} / {y!r}" for i, x, y in zip(ids, a, b, strict=True) if x != y]
     share = 1 - len(unlike) / len(ids)
     return Finding(what, share, least, share >= least, len(ids), tuple(unlike[:SHOWN]))
 

@@ -66,8 +66,8 @@ def read(checkpoint: Path, shown: str) -> Saved:
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
     """Rope parameters, in a table of their own since transformers 5."""
-    found: Mapping[str, Any] = config.get("rope_parameters") or config
-    return found
+    parameters: Mapping[str, Any] = config.get("rope_parameters") or config
+    return parameters
 
 
 def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
@@ -94,8 +94,8 @@ def numbers(tensor: Any) -> NDArray[np.float32]:
     """A tensor of `gguf.utility.SafetensorsLocal` as float32, read only now."""
     data = tensor.mmap_bytes()
     if tensor.dtype == "BF16":  # which numpy has not; its bits are float32's upper half
-        found = (data.view("<u2").astype(np.uint32) << 16).view(np.float32)
+        values = (data.view("<u2").astype(np.uint32) << 16).view(np.float32)
     else:
-        found = data.view({"F32": "<f4", "F16": "<f2"}[tensor.dtype]).astype(np.float32)
-    shaped: NDArray[np.float32] = found.reshape(tensor.shape)
+        values = data.view({"F32": "<f4", "F16": "<f2"}[tensor.dtype]).astype(np.float32)
+    shaped: NDArray[np.float32] = values.reshape(tensor.shape)
     return shaped

@@ -16,8 +16,7 @@ from harness.prompts import readout
 from harness.prompts.versions import Prompt
 from harness.training.answers import answer, evidence
 from harness.training.examples import Question, alone, excerpts, kl_nats, split, with_messages
-from harness.training.model import new_model
-from harness.training.text import END, PAD, chat, train_tokenizer
+from harness.training.model import END, PAD, chat, new_model, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -36,7 +35,6 @@ class Student:
         self, dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, work: Path, device: str
     ) -> None:
         self.plan, self.work, self.prompts, self.actions = plan, work, prompts, dataset.actions
-        work.mkdir(parents=True, exist_ok=True)
         episodes = len({s.record["episode"] for s in dataset.scenes})
         self.data, self.held_out = split(dataset, max(1, round(episodes * HELD_OUT)))
         self.questions = list(alone(self.data, prompts))
@@ -98,25 +96,20 @@ class Student:
             )
         return heard
 
-    def excerpts_stage(self) -> list[Sample]:
-        """The read-out and the report of prompts that show nothing but conflicts."""
-        return self.reading(list(excerpts(self.questions, self.actions)))
-
-    def alone_stage(self) -> list[Sample]:
-        """Every viewer's read-out and report: what to look at, and how near it comes."""
-        return self.asked
-
-    def messages_stage(self) -> list[Sample]:
-        """The ego's read-out with messages, and as many of the first stage."""
-        return self.reading(self.heard) + self.some(self.asked, len(self.heard))
-
-    def answers_stage(self) -> list[Sample]:
-        """Texts, two thirds of them without messages, and read-outs."""
-        count, heard = self.plan.samples["answers"], self.reading(self.heard)
-        spoken = self.some(list(zip(self.questions, self.asked, strict=True)), count // 3)
-        spoken += self.some(list(zip(self.heard, heard, strict=True)), count // 6)
-        texts = self.writing([q for q, _ in spoken], self.read([sample for _, sample in spoken]))
-        return texts + self.some(self.asked + heard, int(REHEARSED * len(texts)))
+    def samples(self, stage: str) -> list[Sample]:
+        """What a stage learns from; the last two rehearse the read-outs of earlier ones."""
+        if stage == "excerpts":
+            return self.reading(list(excerpts(self.questions, self.actions, self.data.scenario.words)))
+        if stage == "alone":
+            return self.asked
+        with_heard = self.reading(self.heard)
+        if stage == "messages":
+            return with_heard + self.some(self.asked, len(self.heard))
+        count = self.plan.samples["answers"]
+        stated = self.some(list(zip(self.questions, self.asked, strict=True)), count // 3)
+        stated += self.some(list(zip(self.heard, with_heard, strict=True)), count // 6)
+        texts = self.writing([q for q, _ in stated], self.read([sample for _, sample in stated]))
+        return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
         """At most so many of them, drawn by the plan's seed, in their order."""
@@ -131,9 +124,8 @@ class Student:
             self.model.load_state_dict(state["model"])
             return [tuple(point) for point in state["curve"]]
         going = self.work / f"{name}.going.pt"
-        samples: list[Sample] = getattr(self, f"{name}_stage")()
         curve = run_stage(
-            self.model, samples, self.letters, self.plan.samples[name], self.plan,
+            self.model, self.samples(name), self.letters, self.plan.samples[name], self.plan,
             lambda n, loss: progress(name, n, loss), going,
         )  # fmt: skip
         save({"model": self.model.state_dict(), "curve": curve}, done)
@@ -154,8 +146,7 @@ class Student:
 
     def read(self, samples: Sequence[Sample]) -> Floats:
         """Read-outs of some samples, (n, A)."""
-        p: Floats = read_out(self.model, samples, self.letters)
-        return p
+        return read_out(self.model, samples, self.letters)
 
     def _sample(self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None) -> Sample:
         system, rest = chat(messages)

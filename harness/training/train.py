@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
+from harness.core.files import replacing
 from harness.training.muon import Muon
 
 STAGES = ("excerpts", "alone", "messages", "answers")
@@ -72,28 +74,22 @@ class Plan:
     seed: int = 0
 
 
-def optimizers(model: Any, plan: Plan) -> list[Any]:
-    """Muon for the matrices of the blocks, AdamW for the rest."""
-    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
-    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
-    return [
-        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
-        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
-    ]
-
-
 def run_stage(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], count: int, plan: Plan,
     progress: Callable[[int, float], None], going: Path,
 ) -> list[tuple[int, float]]:  # fmt: skip
-    """Train on `count` sequences drawn from `samples`, going on from the checkpoint `going` if there is one.
+    """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
 
     Returns:
         (sequences seen, mean loss since the last) along the way.
     """
     device = next(model.parameters()).device
-    opts = optimizers(model, plan)
-    base = [[group["lr"] for group in opt.param_groups] for opt in opts]
+    blocks = [p for n, p in model.named_parameters() if p.ndim == 2 and "embed" not in n]
+    rest = [p for n, p in model.named_parameters() if p.ndim != 2 or "embed" in n]
+    opts = [
+        Muon(blocks, lr=plan.muon_lr, weight_decay=0.05),
+        torch.optim.AdamW(rest, lr=plan.adam_lr, weight_decay=0.0, betas=(0.9, 0.98)),
+    ]
     batches = _batches(samples, count, plan)
     start, curve = 0, []
     if going.is_file():
@@ -108,9 +104,8 @@ def run_stage(
     kept_s = time.monotonic()
     for step in range(start, len(batches)):
         scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
-        for opt, rates in zip(opts, base, strict=True):
-            for group, rate in zip(opt.param_groups, rates, strict=True):
-                group["lr"] = rate * scale
+        for opt, rate in zip(opts, (plan.muon_lr, plan.adam_lr), strict=True):
+            opt.param_groups[0]["lr"] = rate * scale
         loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -138,7 +133,7 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
     order = np.concatenate([rng.permutation(len(samples)) for _ in range(epochs)])[:count]
     kinds = np.array([samples[i].kind for i in order])
     lengths = np.array([len(samples[i].ids) for i in order])
-    found = []
+    parts = []
     for kind in sorted(set(kinds)):
         of_kind = order[kinds == kind]
         size = lengths[kinds == kind]
@@ -148,8 +143,8 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
             part = part[np.argsort(size[start : start + window], kind="stable")]
             short = -len(part) % plan.batch
             part = np.concatenate([part, part[rng.integers(0, len(part), short)]])
-            found.append(part.reshape(-1, plan.batch))
-    batches = np.concatenate(found)
+            parts.append(part.reshape(-1, plan.batch))
+    batches = np.concatenate(parts)
     return batches[rng.permutation(len(batches))][: max(1, count // plan.batch)]
 
 
@@ -209,20 +204,19 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
     model.eval()
     device = next(model.parameters()).device
     weight = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
-    found = np.zeros((len(samples), len(letters)))
+    p = np.zeros((len(samples), len(letters)))
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
-    start = 0
-    while start < len(order):
-        kind = samples[order[start]].kind
-        some = [i for i in order[start : start + batch] if samples[i].kind == kind]
-        start += len(some)
-        with torch.no_grad():
+    for _, group in groupby(order, key=lambda i: samples[i].kind):
+        of_kind = list(group)
+        for start in range(0, len(of_kind), batch):
+            some = of_kind[start : start + batch]
             asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
-            hidden = hidden_states(model, asked)
-        last = torch.tensor([samples[i].answer_at - samples[i].shared - 1 for i in some], device=device)
-        logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
-        found[some] = torch.softmax(logits.detach().float(), -1).cpu().numpy()
-    return found
+            last = torch.tensor([len(s.ids) - s.shared - 1 for s in asked], device=device)
+            with torch.no_grad():
+                hidden = hidden_states(model, asked)
+                logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
+            p[some] = torch.softmax(logits.float(), -1).cpu().numpy()
+    return p
 
 
 def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
@@ -234,6 +228,5 @@ def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
 
 def save(state: dict[str, Any], path: Path) -> None:
     """Write a checkpoint, whole or not at all."""
-    part = path.with_suffix(".part")
-    torch.save(state, part)
-    part.replace(path)
+    with replacing(path) as part:
+        torch.save(state, part)

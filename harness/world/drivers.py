@@ -1,4 +1,4 @@
-"""Reference drivers: baselines that need no model and stand beside every model.
+"""Reference drivers: baselines for every model, which need none.
 
 `cruise` keeps going, `brake` always brakes, `local-view` plans with what the ego's sensors know and
 `full-view` plans with everything in view.
@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.world.planner import plan
+from harness.world.scenario import Scenario
 
 DRIVERS = ("cruise", "brake", "local-view", "full-view")
 PRIVILEGED = "full-view"  # the only one that may read the truth
@@ -15,14 +16,14 @@ PRIVILEGED = "full-view"  # the only one that may read the truth
 Graph = Mapping[str, Any]
 
 
-def choose(driver: str, graph: Graph, truth: Graph | None, actions: tuple[str, ...]) -> str:
+def choose(scenario: Scenario, driver: str, graph: Graph, truth: Graph | None) -> str:
     """The driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
     if driver == "cruise":
         return "IDLE"
     if driver == "brake":
         return "SLOWER"
     if driver == "local-view":
-        return plan(graph, actions)
+        return plan(scenario, graph)
     if truth is None:
         raise ValueError(f"driver {driver!r} reads the truth and was given none")
-    return plan(truth, actions)
+    return plan(scenario, truth)

@@ -1,5 +1,6 @@
 """How an episode ends, and who was to blame for a collision."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -7,21 +8,18 @@ import numpy as np
 from shapely import Polygon
 from shapely.ops import nearest_points
 
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.road import Path, PathKey
+from harness.world.scenario import Parameters
 from harness.world.state import VehicleState
 
 Result = Literal["running", "cleared", "late", "collision", "time_out", "off_road"]
 
 ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
-# Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
-PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
-            "own": {"straight": 1, "left": 0}, "oncoming": {"straight": 1, "left": 0}}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the ego.
+    """How an episode ended for the ego.
 
     Attributes:
         result: `cleared` (the only success), `collision`, or a forced failure: `time_out` (never cleared the
@@ -86,11 +84,11 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
     ]
 
 
-def fault(ego: VehicleState, other: VehicleState) -> str:
+def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path]) -> str:
     """Who should have given way: the one behind in a rear-end collision, else the one with less priority."""
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
         ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)
         return "ego" if ahead > 0 else "other"
-    mine, its = PRIORITY[ego.approach][ego.route], PRIORITY[other.approach][other.route]
-    return "ego" if mine < its else "other"
+    mine, its = paths[ego.approach, ego.route], paths[other.approach, other.route]
+    return "ego" if mine.priority < its.priority else "other"

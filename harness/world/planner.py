@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.world.road import crossings, paths
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.road import Road
+from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
 
+SHIFT = {"FASTER": 1, "SLOWER": -1, "IDLE": 0}  # what it plays through; it never changes lane
 HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
 LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
 MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
@@ -28,14 +29,15 @@ DISCS_M = np.array([-1.0, 0.0, 1.0]) * SIZES_M["car"][0] / 3
 DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
 
 
-def plan(graph: Mapping[str, Any], actions: tuple[str, ...], parameters: Parameters = Parameters()) -> str:
+def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     """The planner's meta-action for a scene graph."""
-    left = parameters.decisions - graph["step"]
-    ego = graph["ego"]
-    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, parameters)
+    p, road, ego = scenario.parameters, scenario.road(), graph["ego"]
+    actions = tuple(a for a in scenario.actions if a in SHIFT)
+    left = p.decisions - graph["step"]
+    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, p)
     gap = np.full(len(sequences), np.inf)
     for conflict in graph["conflicts"]:
-        gap = np.minimum(gap, least_gap(travelled, conflict))
+        gap = np.minimum(gap, least_gap(road, travelled, conflict))
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
     to_go = graph["ego"]["zone_m"] + 15.0
     arrival = (travelled < to_go).sum(axis=1) * STEP_S - 1e-3 * travelled[:, -1]
@@ -69,8 +71,7 @@ def rollouts(
     """
     levels = np.array(parameters.target_speeds_mps)
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
-    shift = {"FASTER": 1, "SLOWER": -1, "IDLE": 0}
-    moves = np.array([[shift[a] for a in s] for s in sequences])
+    moves = np.array([[SHIFT[a] for a in s] for s in sequences])
     speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
     travelled = np.empty((len(sequences), steps))
     gone = np.zeros(len(sequences))
@@ -90,18 +91,25 @@ def rollouts(
     return travelled
 
 
-def least_gap(travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
+def least_gap(road: Road, travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
     """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
     key = (conflict["sector"], conflict["route"])
-    mine, its, crossing = paths()["own", "straight"], paths()[key], crossings()[key]
+    mine, its, crossing = road.ego_path, road.paths[key], road.crossings[key]
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
     ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
     other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
-    # The ego's path is a line of constant x, so its discs differ in y alone.
-    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])[..., None] + DISCS_M
+    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])
     heading = its.headings_rad[np.searchsorted(its.arc_m, other_arc).clip(0, len(its.arc_m) - 1)]
-    other_x = np.interp(other_arc, its.arc_m, its.points[:, 0])[:, None] + np.cos(heading)[:, None] * DISCS_M
-    other_y = np.interp(other_arc, its.arc_m, its.points[:, 1])[:, None] + np.sin(heading)[:, None] * DISCS_M
-    squared = (crossing.x_m - other_x[:, None, :]) ** 2 + (ego_y[..., None] - other_y[:, None, :]) ** 2
-    nearest = np.sqrt(squared.min(axis=(1, 2, 3)))
+    other_x, other_y = (np.interp(other_arc, its.arc_m, along) for along in its.points.T)
+    # The ego's path is a line of constant x, so its discs differ in y alone. Of each of the other's discs the
+    # nearest is kept as it goes: arrays of all pairs would not fit into the processor's cache.
+    discs_y = [ego_y + disc for disc in DISCS_M]
+    squared = np.full(ego_y.shape, np.inf)
+    for disc in DISCS_M:
+        y = other_y + np.sin(heading) * disc
+        apart = np.abs(discs_y[0] - y)
+        for mine_y in discs_y[1:]:
+            np.minimum(apart, np.abs(mine_y - y), out=apart)
+        np.minimum(squared, apart**2 + (crossing.x_m - (other_x + np.cos(heading) * disc)) ** 2, out=squared)
+    nearest = np.sqrt(squared.min(axis=1))
     return np.asarray(nearest - 2 * DISC_RADIUS_M - MARGIN_M)

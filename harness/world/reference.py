@@ -1,4 +1,4 @@
-"""Live driving: reference drivers in the simulator, from start to outcome."""
+"""Reference drivers in closed loop, from start to outcome."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,15 +11,15 @@ from harness.core.statistics import Estimate, rate_interval
 from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph, truth_graph
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.scenario import Scenario
 from harness.world.world import World
 
 
 def decide(driver: str, world: World) -> str:
-    """A driver's meta-action in a live world."""
-    state = world.state()
-    seen = scene_graph(state, state.ego.id) if driver == "local-view" else {}
-    return choose(driver, seen, truth_graph(state) if driver == PRIVILEGED else None, world.actions)
+    """A driver's meta-action now."""
+    scenario, state = world.scenario, world.state()
+    seen = scene_graph(scenario, state, state.ego.id) if driver == "local-view" else {}
+    return choose(scenario, driver, seen, truth_graph(scenario, state) if driver == PRIVILEGED else None)
 
 
 def finish(world: World, driver: str) -> Outcome:
@@ -29,26 +29,28 @@ def finish(world: World, driver: str) -> Outcome:
     return world.outcome
 
 
-def drive(driver: str, seed: int) -> Outcome:
-    """One whole episode, not yet held against the full-view driver's time."""
-    return finish(World.start(seed), driver)
+def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
+    """One whole episode, not yet compared with the full-view driver's time."""
+    return finish(World.start(scenario, seed), driver)
 
 
-def drive_all(seed: int) -> dict[str, Outcome]:
+def drive_all(scenario: Scenario, seed: int) -> dict[str, Outcome]:
     """One episode by every driver; who clears it too long after the full-view driver is `late`."""
-    outcomes = {driver: drive(driver, seed) for driver in DRIVERS}
+    outcomes = {driver: drive(scenario, driver, seed) for driver in DRIVERS}
     reference = outcomes[PRIVILEGED]
-    return {driver: outcome.judged(reference, Parameters()) for driver, outcome in outcomes.items()}
+    return {driver: outcome.judged(reference, scenario.parameters) for driver, outcome in outcomes.items()}
 
 
-def check(episodes: int, seed: int, workers: int, progress: Callable[[int], None]) -> dict[str, Any]:
+def check(
+    scenario: Scenario, episodes: int, seed: int, workers: int, progress: Callable[[int], None]
+) -> dict[str, Any]:
     """Drive every reference driver through the same episodes.
 
     Returns:
         Per driver: success, collisions, late, time-outs and road departures as `Estimate`s (Wilson, n is
         episodes), collisions by fault, and how many crashes there were between other vehicles.
     """
-    outcomes = spread(drive_all, range(seed, seed + episodes), workers, progress)
+    outcomes = spread(partial(drive_all, scenario), range(seed, seed + episodes), workers, progress)
     return {driver: summary([o[driver] for o in outcomes]) for driver in DRIVERS}
 
 

@@ -1,48 +1,48 @@
-"""The four-way intersection as paths: where a vehicle on each approach can go, and where paths cross.
+"""A road as paths: where vehicles can go on it, where their ways cross, and what lies around.
 
 Frame: metres, x to the east, y to the *south* (highway-env's screen frame), headings in radians from +x
-towards +y. The ego comes from the south and goes north, so for it "left" is the west arm, "right" the east
-arm and "oncoming" the north arm. Lane width and radii are those of highway-env 1.12's `IntersectionEnv`;
-a test holds them against its road network.
+towards +y. The ego's path runs straight to the north.
 """
 
+from bisect import bisect_right
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from shapely import LineString, intersection
 
 from harness.core.arrays import Floats
 
-LANE_WIDTH_M = 4.0
-JUNCTION_M = 11.0  # from the centre to where approach lanes end
-ARM_M = 100.0  # length of an approach or exit lane
-LEFT_TURN_RADIUS_M = 13.0
-STEP_M = 0.25
-
-APPROACHES = ("own", "left", "oncoming", "right")  # south, west, north, east: highway-env's nodes o0..o3
-SECTORS = ("left", "right", "oncoming")  # where danger can come from
-ROUTES = ("straight", "left")
-EXITS = {"own": "exit-own", "left": "exit-left", "oncoming": "exit-ahead", "right": "exit-right"}
+PathKey = tuple[str, str]  # approach and route
+Lane = tuple[str, str, int]  # highway-env's name of it: two nodes, and a number from the left
 
 
 @dataclass(frozen=True)
 class Path:
-    """One way through the intersection.
+    """One way along the road, in sections: one a lane of highway-env.
 
     Attributes:
-        approach: the arm it starts on.
-        route: `straight` or `left`.
-        points: (n, 2) m, evenly spaced by about `STEP_M`.
+        approach: where it comes from.
+        route: what it does, such as `straight`. Who is to go `left` or `right` shows it.
+        points: (n, 2) m, evenly spaced.
         arc_m: (n,) distance along the path.
-        junction_m: arc lengths at which the junction is entered and left.
+        ends_m: arc lengths at which a section ends and the next begins; paths of one approach share the first
+            section.
+        roles: what each section is called in a scene graph.
+        lanes: the lane of each section.
+        priority: right of way; the higher one goes first.
     """
 
     approach: str
     route: str
     points: Floats
     arc_m: Floats
-    junction_m: tuple[float, float]
+    ends_m: tuple[float, ...]
+    roles: tuple[str, ...]
+    lanes: tuple[Lane, ...]
+    priority: int
 
     @cached_property
     def headings_rad(self) -> Floats:
@@ -68,51 +68,18 @@ class Path:
         nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
         return x, y, float(self.headings_rad[nearest])
 
+    def section(self, arc_m: float) -> int:
+        """The section that an arc length is in."""
+        return bisect_right(self.ends_m, arc_m)
+
     def lane_role(self, arc_m: float) -> str:
-        """`approach-…` before the junction, `junction`, then `exit-…`, named from the ego's seat."""
-        if arc_m < self.junction_m[0]:
-            return f"approach-{self.approach}"
-        if arc_m < self.junction_m[1]:
-            return "junction"
-        ahead = 2 if self.route == "straight" else 1
-        return EXITS[APPROACHES[(APPROACHES.index(self.approach) + ahead) % 4]]
-
-
-@lru_cache(maxsize=1)
-def paths() -> dict[tuple[str, str], Path]:
-    """Every path, by (approach, route)."""
-    built = {}
-    for corner, approach in enumerate(APPROACHES):
-        turn = np.pi / 2 * corner
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).round(12)
-        for route in ROUTES:
-            points = _southern(route) @ rotation.T
-            arc = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
-            inside = 2 * JUNCTION_M if route == "straight" else LEFT_TURN_RADIUS_M * np.pi / 2
-            built[approach, route] = Path(approach, route, points, arc, (ARM_M, ARM_M + inside))
-    return built
-
-
-def _southern(route: str) -> Floats:
-    """Points of a path that starts on the south arm."""
-    half, end = LANE_WIDTH_M / 2, JUNCTION_M + ARM_M
-    count = int(ARM_M / STEP_M)
-    approach = np.column_stack([np.full(count, half), np.linspace(end, JUNCTION_M, count, endpoint=False)])
-    if route == "straight":
-        inside = np.linspace(JUNCTION_M, -JUNCTION_M, int(2 * JUNCTION_M / STEP_M), endpoint=False)
-        leaving = np.linspace(-JUNCTION_M, -end, count + 1)
-        y = np.concatenate([inside, leaving])
-        return np.concatenate([approach, np.column_stack([np.full(len(y), half), y])])
-    angle = np.linspace(0, np.pi / 2, int(LEFT_TURN_RADIUS_M * np.pi / 2 / STEP_M), endpoint=False)
-    radius = LEFT_TURN_RADIUS_M
-    arc = np.column_stack([half - radius + radius * np.cos(angle), JUNCTION_M - radius * np.sin(angle)])
-    leaving = np.linspace(-JUNCTION_M, -end, count + 1)
-    return np.concatenate([approach, arc, np.column_stack([leaving, np.full(count + 1, -half)])])
+        """What the section at an arc length is called."""
+        return self.roles[self.section(arc_m)]
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where another path crosses the ego's: position and arc lengths along both, in metres."""
+    """Where another path meets the ego's: position and arc lengths along both, in metres."""
 
     x_m: float
     y_m: float
@@ -120,23 +87,72 @@ class Crossing:
     other_arc_m: float
 
 
-@lru_cache(maxsize=1)
-def crossings() -> dict[tuple[str, str], Crossing]:
-    """Conflict points with the ego's path (`own`, `straight`), by the other's (approach, route)."""
-    ego = paths()["own", "straight"]
+@dataclass(frozen=True)
+class Ground:
+    """What a picture shows of a road, in m to the east and to the *north*.
+
+    Attributes:
+        outline: (n, 2) its edge.
+        marks: centre lines, (n, 2) each.
+        stops: stop lines, (n, 2) each.
+        boxes: west-south and east-north corners (2, 2) of what labels keep off.
+    """
+
+    outline: Floats
+    marks: tuple[Floats, ...]
+    stops: tuple[Floats, ...]
+    boxes: tuple[Floats, ...]
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road, and what matters on it for the ego.
+
+    Attributes:
+        facts: what a frozen record says of it: texts, and numbers with their unit in the name.
+        paths: every path, by approach and route.
+        ego: the ego's path.
+        crossings: where the ego's path meets others, and so where conflicts are looked for.
+        zone_m: position of the conflict zone; distances to it weigh messages.
+        sectors: where danger can come from, and the points (k, 2) m that must be seen to know of it.
+        network: gives highway-env's network, always the same one; nobody writes to it.
+        ground: gives what a picture shows that reaches so many metres from the origin.
+    """
+
+    facts: Mapping[str, str | float]
+    paths: Mapping[PathKey, Path]
+    ego: PathKey
+    crossings: Mapping[PathKey, Crossing]
+    zone_m: tuple[float, float]
+    sectors: Mapping[str, Floats]
+    network: Callable[[], Any]
+    ground: Callable[[float], Ground]
+
+    @cached_property
+    def ego_path(self) -> Path:
+        """The ego's path."""
+        return self.paths[self.ego]
+
+    @cached_property
+    def zone_arc_m(self) -> float:
+        """Arc length at which the ego's path passes the conflict zone."""
+        return self.ego_path.project(*self.zone_m)[0]
+
+    @cached_property
+    def watched(self) -> Floats:
+        """(points, 2) m of all sectors, one after the other."""
+        return np.concatenate(list(self.sectors.values()))
+
+
+def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
+    """Where paths from elsewhere cross the ego's, by the other's approach and route."""
+    mine = paths[ego]
     found = {}
-    for key, path in paths().items():
-        if key[0] == "own":
+    for key, path in paths.items():
+        if key[0] == ego[0]:
             continue
-        point = intersection(LineString(ego.points), LineString(path.points))
+        point = intersection(LineString(mine.points), LineString(path.points))
         if point.geom_type == "Point":  # a path that merges into the ego's lane shares a line with it
             x, y = float(point.x), float(point.y)
-            found[key] = Crossing(x, y, ego.project(x, y)[0], path.project(x, y)[0])
+            found[key] = Crossing(x, y, mine.project(x, y)[0], path.project(x, y)[0])
     return found
-
-
-@lru_cache(maxsize=1)
-def conflict_zone() -> tuple[float, float]:
-    """Centroid (m, m) of the conflict points of the three dangers: what d_j of Eq. 2 is measured to."""
-    points = [crossings()[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
-    return float(np.mean([p.x_m for p in points])), float(np.mean([p.y_m for p in points]))

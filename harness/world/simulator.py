@@ -1,4 +1,4 @@
-"""The occluded intersection inside highway-env: its vehicles and its environment. The only importer.
+"""Vehicles on highway-env's roads, without its environments.
 
 Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits.
 
@@ -8,27 +8,20 @@ cost more than all of its arithmetic. A test drives both side by side.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from highway_env import utils
-from highway_env.envs.intersection_env import IntersectionEnv
-from highway_env.road.road import Road, RoadNetwork
+from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from harness.world.road import APPROACHES, Path, paths
-from harness.world.scenarios.occluded_intersection import Layout, Parameters, Spawn, layout
+from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, VehicleState
 
-NODES = {approach: n for n, approach in enumerate(APPROACHES)}
-
-
 NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highway-env finds no collision
-
-
+NOBODY_DRAWS = np.random.RandomState(0)  # highway-env wants one, and would seed it by the clock
 FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
 
 
@@ -36,7 +29,7 @@ class _Road(Road):  # type: ignore[misc]
     """Looks closer only at vehicles that are near enough to touch within the frame."""
 
     def step(self, dt: float) -> None:
-        """`Road.step`; the scenario has no objects that are no vehicles."""
+        """`Road.step`; no scenario has objects that are no vehicles."""
         for vehicle in self.vehicles:
             vehicle.step(dt)
         placed = [(v, *v.position.tolist(), v.diagonal / 2) for v in self.vehicles]
@@ -149,71 +142,31 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
         return float(min(max(super().speed_control(target_speed), least), most))
 
 
-class OccludedIntersectionEnv(IntersectionEnv):  # type: ignore[misc]
-    """highway-env's intersection with the scenario's vehicles, and no rule that makes anyone yield."""
-
-    parameters = Parameters()
-    layout: Layout
-    road: Road
-
-    @classmethod
-    def default_config(cls) -> dict[str, Any]:
-        """IntersectionEnv's configuration with the scenario's speeds and frequencies."""
-        p = cls.parameters
-        config: dict[str, Any] = super().default_config()
-        utils.update_config(
-            config,
-            {
-                "action": {
-                    "type": "DiscreteMetaAction",
-                    "longitudinal": True,
-                    "lateral": False,
-                    "target_speeds": list(p.target_speeds_mps),
-                },
-                "simulation_frequency": p.simulation_hz,
-                "policy_frequency": round(1 / p.decision_period_s),
-                "duration": p.time_limit_s,
-                "spawn_probability": 0.0,
-                "scaling": 4.0,
-                "episode_seed": 0,
-            },
+def populated(scenario: Scenario, layout: Layout) -> Any:
+    """highway-env's road with a layout's vehicles on it, the ego first."""
+    road, static = new_road(scenario), scenario.road()
+    for spawn in layout.spawns:
+        path = static.paths[spawn.approach, spawn.route]
+        section = path.section(spawn.arc_m)
+        lane = road.network.get_lane(path.lanes[section])
+        along = spawn.arc_m - (0.0, *path.ends_m)[section]
+        road.vehicles.append(
+            vehicle_on(road, scenario, spawn, section, lane.position(along, 0.0), lane.heading_at(along))
         )
-        config["observation"] = {"type": "AttributesObservation", "attributes": []}  # nobody looks at it
-        return config
-
-    def _make_road(self) -> None:
-        self.road = _Road(network=network(), np_random=self.np_random)
-
-    def _make_vehicles(self, n_vehicles: int = 0) -> None:
-        p = self.parameters
-        self.layout = layout(self.config["episode_seed"], p)
-        for spawn in self.layout.spawns:
-            self.road.vehicles.append(_spawned(self.road, spawn, p))
-        self.controlled_vehicles = self.road.vehicles[:1]
+    return road
 
 
-@lru_cache(maxsize=1)
-def network() -> RoadNetwork:
-    """highway-env's intersection. Every episode's is the same one, and nobody writes to it."""
-    env = OccludedIntersectionEnv.__new__(OccludedIntersectionEnv)
-    env.config = OccludedIntersectionEnv.default_config()
-    IntersectionEnv._make_road(env)
-    return env.road.network
-
-
-def _spawned(road: Road, spawn: Spawn, p: Parameters) -> ControlledVehicle:
-    path = paths()[spawn.approach, spawn.route]
-    section = int(np.searchsorted(path.junction_m, spawn.arc_m, side="right"))
-    lane = road.network.get_lane(_lanes(path)[section])
-    arc_in_lane = spawn.arc_m - (0.0, *path.junction_m)[section]
-    return vehicle_on(road, spawn, p, section, lane.position(arc_in_lane, 0.0), lane.heading_at(arc_in_lane))
+def new_road(scenario: Scenario) -> Any:
+    """highway-env's road, empty."""
+    return _Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
 
 
 def vehicle_on(
-    road: Road, spawn: Spawn, p: Parameters, section: int, position: Sequence[float], heading: float
+    road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float
 ) -> ControlledVehicle:
-    """A vehicle on the given section of its route: approach, junction or exit."""
-    route = _lanes(paths()[spawn.approach, spawn.route])
+    """A vehicle on the given section of its path."""
+    p = scenario.parameters
+    route = list(scenario.road().paths[spawn.approach, spawn.route].lanes)
     arguments = {
         "heading": heading,
         "speed": spawn.speed_mps,
@@ -232,16 +185,10 @@ def vehicle_on(
     return vehicle
 
 
-def spawn_of(v: VehicleState) -> Spawn:
+def spawn_of(scenario: Scenario, v: VehicleState) -> Spawn:
     """A vehicle in the midst of an episode, as if it began there."""
-    arc = paths()[v.approach, v.route].project(v.x_m, v.y_m)[0]
+    arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps)
-
-
-def _lanes(path: Path) -> list[tuple[str, str, int]]:
-    start = NODES[path.approach]
-    end = (start + (2 if path.route == "straight" else 1)) % 4
-    return [(f"o{start}", f"ir{start}", 0), (f"ir{start}", f"il{end}", 0), (f"il{end}", f"o{end}", 0)]
 
 
 def state_of(v: ControlledVehicle) -> VehicleState:

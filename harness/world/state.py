@@ -16,6 +16,11 @@ Part = Literal["ego", "helper", "other"]
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "truck": (10.0, 2.6)}  # length, width
 
 
+def indicator(route: str) -> str:
+    """What the turn indicator of a vehicle on a route shows."""
+    return route if route in ("left", "right") else "off"
+
+
 @dataclass(frozen=True)
 class VehicleState:
     """One vehicle at one moment, in the frame of `harness.world.road`.
@@ -28,8 +33,8 @@ class VehicleState:
         y_m: position of the centre, m to the south.
         heading_rad: from +x towards +y.
         speed_mps: speed along the heading.
-        approach: arm it started on.
-        route: `straight` or `left`.
+        approach: where its path comes from.
+        route: what its path does, such as `straight` or `left`.
         crashed: whether it has collided.
     """
 
@@ -43,6 +48,11 @@ class VehicleState:
     approach: str
     route: str
     crashed: bool = False
+
+    @property
+    def indicator(self) -> str:
+        """What its turn indicator shows."""
+        return indicator(self.route)
 
     @property
     def length_m(self) -> float:
@@ -106,7 +116,7 @@ class WorldState:
         time_s: simulated time since the start of the episode.
         target_speed_mps: what the ego's speed controller aims at.
         vehicles: in spawn order, the ego first.
-        buildings: what stands at the corners.
+        buildings: what blocks sight besides vehicles.
     """
 
     scenario: str

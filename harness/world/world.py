@@ -1,7 +1,7 @@
-"""The live world: one episode in the simulator, from its start to its outcome.
+"""The simulated world: one episode, from its start to its outcome.
 
-Frames are stepped here rather than by `env.step`, so that an episode ends in the frame in which it is
-decided.
+Frames are stepped here rather than by an environment's `step`, so that an episode ends in the frame in which
+it is decided.
 """
 
 import copy
@@ -14,9 +14,8 @@ import shapely
 
 from harness.core.arrays import Floats
 from harness.world.outcome import Outcome, fault, outline, striker
-from harness.world.road import JUNCTION_M
-from harness.world.scenarios.occluded_intersection import NAME as NAME
-from harness.world.simulator import OccludedIntersectionEnv, spawn_of, state_of, vehicle_on
+from harness.world.scenario import Layout, Scenario
+from harness.world.simulator import NOBODY_DRAWS, new_road, populated, spawn_of, state_of, vehicle_on
 from harness.world.state import WorldState, rectangle
 
 Snapshot = Mapping[str, Any]
@@ -25,20 +24,24 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class World:
-    """One live episode.
+    """One episode in the simulator.
 
     Attributes:
-        env: the highway-env environment.
+        scenario: whose episode it is.
         seed: seed of the episode's layout.
+        layout: how it began.
+        road: highway-env's road with its vehicles, the ego first.
         step: decisions taken so far.
         frame: frames simulated so far.
-        outcome: what has happened so far; its `ended` says whether the episode is decided.
-        hard_brakings: how often the ego has begun to brake harder than HARD_BRAKING_MPS2.
+        outcome: the outcome so far; its `ended` says whether the episode is decided.
+        hard_brakings: how often the ego began to brake harder than HARD_BRAKING_MPS2.
         braking_hard: whether it did so in the last frame.
     """
 
-    env: OccludedIntersectionEnv
+    scenario: Scenario
     seed: int
+    layout: Layout
+    road: Any
     step: int = 0
     frame: int = 0
     outcome: Outcome = field(default_factory=Outcome)
@@ -46,72 +49,67 @@ class World:
     braking_hard: bool = False
 
     @classmethod
-    def start(cls, seed: int) -> "World":
-        """The first moment of an episode."""
-        env = OccludedIntersectionEnv(config={"episode_seed": seed})
-        return cls(env, seed)
+    def start(cls, scenario: Scenario, seed: int) -> "World":
+        """The start of an episode."""
+        layout = scenario.layout(seed, scenario.parameters)
+        return cls(scenario, seed, layout, populated(scenario, layout))
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions by name, in the environment's order."""
-        return tuple(self.env.action_type.actions[n] for n in sorted(self.env.action_type.actions))
+        """Meta-actions by name, in highway-env's order."""
+        return self.scenario.actions
 
     @property
     def time_s(self) -> float:
         """Simulated time, counted in frames (highway-env's own clock drifts)."""
-        return self.frame / self.env.parameters.simulation_hz
+        return self.frame / self.scenario.parameters.simulation_hz
 
     def branch(self) -> "World":
         """A copy that goes its own way."""
-        shared = (self.env.road.network, self.env.layout)  # nobody writes to them
+        shared = (self.scenario, self.layout, self.road.network, NOBODY_DRAWS)  # nobody writes to them
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> Snapshot:
         """What `thaw` needs besides `state()` to go on exactly as this world would."""
-        vehicles = self.env.road.vehicles
+        vehicles = self.road.vehicles
         sections = [v.route.index(v.target_lane_index) for v in vehicles]
         return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
 
     @classmethod
-    def thaw(cls, state: WorldState, snapshot: Snapshot) -> "World":
+    def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
         """The world that `state` and `snapshot` were taken from, before its episode was decided."""
-        env = OccludedIntersectionEnv(config={"episode_seed": state.episode_seed})
-        vehicles = []
+        layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
-            vehicle = vehicle_on(
-                env.road, spawn_of(v), env.parameters, section, (v.x_m, v.y_m), v.heading_rad
-            )
+            spawn = spawn_of(scenario, v)
+            vehicle = vehicle_on(road, scenario, spawn, section, (v.x_m, v.y_m), v.heading_rad)
             vehicle.crashed = v.crashed
-            vehicles.append(vehicle)
+            road.vehicles.append(vehicle)
+        vehicles = road.vehicles
         ego = vehicles[0]
         ego.speed_index = snapshot["speed_index"]
         ego.target_speed = ego.index_to_speed(ego.speed_index)
-        env.layout = replace(env.layout, buildings=state.buildings)
-        env.road.vehicles = vehicles
-        env.controlled_vehicles = vehicles[:1]
-        env.define_spaces()  # binds the action type to the ego
         if snapshot["frame"]:
             # What touches is pushed apart in the next frame: highway-env's last act in every frame.
             for n, vehicle in enumerate(vehicles):
                 for other in vehicles[n + 1 :]:
-                    vehicle.handle_collisions(other, 1 / env.parameters.simulation_hz)
-        return cls(env, state.episode_seed, state.step, snapshot["frame"])
+                    vehicle.handle_collisions(other, 1 / scenario.parameters.simulation_hz)
+        layout = replace(layout, buildings=state.buildings)
+        return cls(scenario, state.episode_seed, layout, road, state.step, snapshot["frame"])
 
     def state(self) -> WorldState:
         """What is where, now."""
-        layout = self.env.layout
-        ego = self.env.road.vehicles[0]
+        vehicles = self.road.vehicles
         return WorldState(
-            NAME, self.seed, self.step, self.time_s, float(ego.target_speed),
-            tuple(state_of(v) for v in self.env.road.vehicles), layout.buildings,
+            self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
+            tuple(map(state_of, vehicles)), self.layout.buildings,
         )  # fmt: skip
 
     def act(self, action: str) -> None:
-        """Take a decision by name and live through the time until the next one is due.
+        """Take an action by name and simulate until the next decision is due.
 
         After the scenario's last decision the action is held until the episode is decided.
         """
-        p = self.env.parameters
+        p = self.scenario.parameters
         self.take(action)
         self.step += 1
         last = self.step >= p.decisions
@@ -120,25 +118,25 @@ class World:
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
-        self.env.action_type.act(self.env.action_type.actions_indexes[action])
+        self.road.vehicles[0].act(action)
 
     @property
     def speed_index(self) -> int:
         """Which of the scenario's target speeds the ego aims at."""
-        return int(self.env.road.vehicles[0].speed_index)
+        return int(self.road.vehicles[0].speed_index)
 
     def speed_index_after(self, action: str) -> int:
         """Which target speed the ego would aim at if it took an action now."""
-        ego = self.env.road.vehicles[0]
+        ego = self.road.vehicles[0]
         kept = dict(vars(ego))
         self.take(action)
-        found = self.speed_index
+        index = self.speed_index
         vars(ego).update(kept)
-        return found
+        return index
 
     def advance(self, until_frame: int) -> None:
-        """Live on until so many frames are simulated or the episode is decided."""
-        vehicles = self.env.road.vehicles
+        """Simulate until so many frames have passed or the episode is decided."""
+        vehicles = self.road.vehicles
         poses, speeds = [], [float(vehicles[0].speed)]
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
@@ -147,12 +145,12 @@ class World:
         if poses:
             least_m = least_gap_m(np.array(poses), vehicles, self.outcome.least_gap_m)
             self.outcome = replace(self.outcome, least_gap_m=least_m)
-            hard = -np.diff(speeds) * self.env.parameters.simulation_hz > HARD_BRAKING_MPS2
+            hard = -np.diff(speeds) * self.scenario.parameters.simulation_hz > HARD_BRAKING_MPS2
             self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
             self.braking_hard = bool(hard[-1])
 
     def _step(self) -> None:
-        p, road = self.env.parameters, self.env.road
+        p, road = self.scenario.parameters, self.road
         standing = {v.spawn.id for v in road.vehicles if v.crashed}
         road.act()
         road.step(1 / p.simulation_hz)
@@ -160,14 +158,15 @@ class World:
         ego, others = road.vehicles[0], road.vehicles[1:]
         crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
-            mine = state_of(ego)
+            mine, paths = state_of(ego), self.scenario.road().paths
             partner = min(map(state_of, others), key=lambda v: float(outline(mine).distance(outline(v))))
             crashed.discard(partner.id)
-            how = {"partner": partner.id, "striker": striker(mine, partner), "fault": fault(mine, partner)}
+            who, blamed = striker(mine, partner), fault(mine, partner, paths)
+            how = {"partner": partner.id, "striker": who, "fault": blamed}
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
             self.outcome = self.outcome.ending("off_road", self.time_s)
-        elif JUNCTION_M + p.cleared_m <= -ego.position[1]:
+        elif self.scenario.cleared(road.vehicles, p):
             self.outcome = self.outcome.ending("cleared", self.time_s)
         elif self.frame >= round(p.time_limit_s * p.simulation_hz):
             self.outcome = self.outcome.ending("time_out", self.time_s)

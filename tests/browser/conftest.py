@@ -4,12 +4,14 @@ import shutil
 
 import pytest
 from opening import FLAGS, WIDE, wait
-from playwright.sync_api import sync_playwright
 
 
 # A module's and no longer: while Playwright runs, so does its event loop, and other tests have their own.
 @pytest.fixture(scope="module")
 def browser():
+    pytest.importorskip("playwright", reason="needs the dev extra")
+    from playwright.sync_api import sync_playwright
+
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("no chromium here; `make test` installs it from Debian's packages")

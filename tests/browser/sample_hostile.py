@@ -1,10 +1,13 @@
 """Runs whose every text is an attack, and the attacks: each way into markup with each thing to do there."""
 
-import csv
-import json
-from dataclasses import asdict
+from dataclasses import replace
+
+from run_on_disk import configure, made_up
 
 from harness.coordination.operating_point import POINTS
+from harness.core.files import digest
+from harness.runs.folder import csv_text, read
+from harness.runs.records import FrozenScenes, Latency, Score
 
 WAYS_IN = (
     "{}", '">{}', "'>{}", "</td></tr></table>{}", "</title>{}", "</style>{}", "</script>{}", "</textarea>{}",
@@ -46,7 +49,10 @@ OTHERS = (
     "datum['constructor']",
     "signal:alert(1)",
 )
-PAYLOADS = tuple(way.format(deed) for way in WAYS_IN for deed in DEEDS) + OTHERS
+SPOKEN = (*(way.format(deed) for way in WAYS_IN for deed in DEEDS), *OTHERS)
+# No file of a run can hold a lone surrogate: in an answer it is replaced before it is written.
+PAYLOADS = tuple(text.encode("utf-8", "replace").decode() for text in SPOKEN)
+VERDICTS = ("strict", "recovered", "failed")
 
 
 class Attacker:
@@ -62,115 +68,76 @@ class Attacker:
 
 def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     """Make a run: its manifest says nothing but payload n, its answers and decisions say all in turn."""
-    mine, said = PAYLOADS[n], Attacker(n)
-    scenes = dataset.scenes[::8]
-    rows = [
-        {
-            "scene": s.id,
-            "episode": s.record["episode"],
-            "step": s.record["step"],
-            "danger": said(),
-            "answers": {v: _answer(said, s.record["graphs"][v]["role"]) for v in s.viewers},
-            "safe": [True, True, False],
-            "delay_s": [0.0, 0.0, None],
-            "decisions": [_decision(dataset.actions[2], name, s.viewers) for name in conditions],
-        }
-        for s in scenes
-    ]
-    config = {
-        "format": "swarmdrive-run/1",
-        "name": mine,
-        "created": mine,
-        "command": mine,
-        "model": {"name": mine, "engine": mine, mine: mine},
-        "identity": {mine: mine},
-        "prompt": {"version": mine, "sha256": mine},
-        "dataset": {"name": mine, "path": str(dataset.path), "sha256": dataset.sha256},
-        "actions": dataset.actions,
-        "answer": mine,
-        "conditions": [asdict(POINTS["6g"]) | {"name": name} for name in conditions],
-        "seeds": [0],
-        "latency": {"source": mine, "inference_s": {mine: 0.1}, "basis": mine},
-        "versions": {"harness": mine, mine: mine},
-    }
-    folder.mkdir(parents=True)
-    (folder / "run.json").write_text(json.dumps(config))
-    (folder / "rows.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    names = [name for name in conditions if "\ud800" not in name]  # which is no UTF-8
-    _table(
-        folder / "summary.csv",
-        (
-            "model",
-            "prompt",
-            "condition",
-            "metric",
-            "value",
-            "ci_low",
-            "ci_high",
-            "n",
-            "n_excluded",
-            "interval",
-        ),
-        [("m", "p", name, "success_rate", 0.5, 0.4, 0.6, 4, 0, "episodes") for name in names]
-        + [("m", "p", name, "latency_proxy_ms", 150, 149, 151, 4, 0, "episodes") for name in names]
-        + [("m", "p", "all", mine, 1, 1, 1, 4, 0, mine)] * ("\ud800" not in mine),
+    mine, said, dangers = PAYLOADS[n], Attacker(n), {}
+    world = FrozenScenes(
+        name=mine, sha256=dataset.sha256, scenes=3, episodes=3, limit=None, delay_allowance_s=1.0,
+        path=str(dataset.path),
+    )  # fmt: skip
+    made_up(
+        folder,
+        decision=lambda row: _decision(row, dangers.setdefault(row["scene"], said())),
+        episode=lambda row: row.update(danger=said()),
+        answer=lambda row: _answer(row, said, n),
+        points=[replace(POINTS["6g"], name=name) for name in conditions],
+        seeds=(0,),
+        episodes=3,
+        steps=1,
+        name=mine,
+        created=mine,
+        command=mine,
+        tags=[mine],
+        model={"name": mine, "engine": mine, mine: mine},
+        identity={mine: mine},
+        prompt={"version": mine, "sha256": mine, "released": mine},
+        world=world,
+        dtype=mine,
+        latency_source=mine,
+        latency=Latency("card", mine, 0.1, 0.1, n={mine: 1}),
+        versions={"harness": mine, mine: mine},
     )
-    _table(
-        folder / "episodes.csv",
-        ("condition", "seed", "episode", "success"),
-        [(name, 0, s.record["episode"], True) for name in names for s in scenes],
-    )
+    configure(folder, answer=mine)
+    run = read(folder)
+    scores = [*run.scores, Score("all", mine, 1.0, 1.0, 1.0, 4, 0, mine)]
+    text = csv_text(Score, scores, run.manifest.variant)
+    (folder / "summary.csv").write_text(text, encoding="utf-8")
     return folder
 
 
-def _table(file, head, rows):
-    with file.open("w", newline="", encoding="utf-8") as out:
-        csv.writer(out).writerows([head, *rows])
+def prompt_of(n, scene, viewer):
+    """What a viewer of run n was sent, an attack too."""
+    episode, vehicle = int(scene.partition("-")[0]), int(viewer.removeprefix("v"))
+    said = Attacker(n + 4 * (4 * episode + vehicle))
+    return [{"role": said(), "content": said()} for _ in range(2)]
 
 
-def _answer(said, role):
-    """Role, because it says which answers are the ego's; all else is free."""
-    return {
-        "role": role,
-        "raw": said(),
-        "finish_reason": said(),
-        "error": said(),
-        "status": said(),
-        "verdict": said(),
-        "repairs": [said()],
-        "detail": said(),
-        "intent": [0.2, 0.3, 0.5],
-        "mass": 0.9,
-        "message": {said(): said(), "evidence": said(), "risk": said()},
-        "prompt_tokens": 300,
-        "completion_tokens": 30,
-        "seconds": 0.1,
-    }
+def _answer(row, said, n):
+    """All but what is counted by: who answered, in which role, and how it was read."""
+    row.update(
+        raw=said(),
+        finish_reason=said(),
+        error=said(),
+        status=said(),
+        verdict=VERDICTS[said.turn % 3],
+        repairs=(said(), said()),
+        detail=said(),
+        intent=(0.2, 0.3, 0.5),
+        mass=0.9,
+        message={said(): said(), "evidence": said(), "risk": said()},
+        prompt_tokens=300,
+        completion_tokens=30,
+        seconds=0.1,
+        prompt_sha256=digest(prompt_of(n, row["scene"], row["viewer"])),
+    )
 
 
-def _decision(action, condition, viewers):
+def _decision(row, danger):
     """One reply in time, one lost, one late."""
-    return {
-        "condition": condition,
-        "seed": 0,
-        "entropy_nats": 0.9,
-        "triggered": True,
-        "messages": [
-            {
-                "from": viewer,
-                "delivered": k != 1,
-                "arrival_ms": None if k == 1 else 160.0 + 60.0 * k,
-                "on_time": k == 0,
-                "weight": 0.3,
-            }
-            for k, viewer in enumerate(viewers[1:])
-        ],
-        "own_weight": 0.4,
-        "own_failed": False,
-        "fused": [0.1, 0.2, 0.7],
-        "action": action,
-        "latency_ms": 150.0,
-        "deadline_missed": False,
-        "safe": False,
-        "delay_s": None,
-    }
+    row.update(
+        danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, safe=False,
+        delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7, safe_SLOWER=True, safe_IDLE=True,
+        safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0, delay_s_FASTER=None,
+    )  # fmt: skip
+    for k in range(3):
+        sent = {"delivered": k != 1, "on_time": k == 0, "weight": 0.3}
+        sent["arrival_ms"] = None if k == 1 else 160.0 + 60.0 * k
+        row.update({f"{name}_{k + 1}": value for name, value in sent.items()})

@@ -5,13 +5,12 @@ run under as many conditions; in answers they come in turn.
 """
 
 import csv
-import itertools
 import json
 
 import pytest
 from opening import wait
 from reading import Page, details, packed
-from sample_hostile import PAYLOADS, hostile
+from sample_hostile import PAYLOADS, hostile, prompt_of
 
 from harness.report.page import render, visible
 from harness.report.runs import gather
@@ -66,8 +65,8 @@ def attacked(request, small, tmp_path_factory):
         folders = [hostile(base / "0", small, 0, PAYLOADS)]
 
     def prompts(run):
-        turn = itertools.cycle(PAYLOADS)
-        return lambda scene, viewer, heard: [{"role": next(turn), "content": next(turn)} for _ in range(2)]
+        n = PAYLOADS.index(run.manifest.name)
+        return lambda scene, viewer, heard: prompt_of(n, scene.id, viewer)
 
     text = render(gather(folders), prompts)
     (base / "report.html").write_text(text, encoding="utf-8")

@@ -5,6 +5,10 @@ import re
 import sys
 
 import pytest
+
+pytest.importorskip("playwright", reason="needs the dev extra")
+pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
+
 from axe_playwright_python.sync_playwright import Axe
 from opening import NARROW, picture, wait
 from playwright.sync_api import expect

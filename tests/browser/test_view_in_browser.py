@@ -5,6 +5,10 @@ import subprocess
 import sys
 
 import pytest
+
+pytest.importorskip("playwright", reason="needs the dev extra")
+pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
+
 from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of

@@ -3,13 +3,17 @@
 import json
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from evaluating import live_spec_of, run, spec_of
 
 from harness import cli
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import Dataset
 from harness.runs.listing import runs
 
 Said = tuple[int, str, str]
@@ -26,13 +30,12 @@ def type_in(*args: str | Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, small_path: Path) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory, small: Dataset) -> Path:
     """A frozen run with a sweep in it, and a live one."""
     folder = tmp_path_factory.mktemp("made")
-    type_in("eval", "--dataset", small_path, "--seeds", "0:2", "--out", folder / "frozen")
+    run(spec_of(small), folder / "frozen")
     type_in("sweep", folder / "frozen", "--over", "tau", "--grid", "0.2,0.9")
-    type_in("drive", "--episodes", "1", "--seeds", "0", "--workers", "1", "--condition", "6g",
-            "--out", folder / "live")  # fmt: skip
+    run(live_spec_of(points=(POINTS["6g"],), seeds=(0,), episodes=1), folder / "live")
     return folder
 
 
@@ -94,7 +97,7 @@ def test_an_unfinished_run_says_resume(harness: Callable[..., Said], folder: Pat
     manifest = json.loads((folder / "live/run.json").read_text())
     shutil.rmtree(folder / "live")
     (folder / "live/.work").mkdir(parents=True)
-    begun = {"created": manifest["created"], "settings": manifest, "identity": ""}
+    begun = {"created": manifest["created"], "settings": manifest, "identity": "", "tags": []}
     (folder / "live/.work/config.json").write_text(json.dumps(begun))
     [one] = [one for one in runs(folder) if one.name == "live"]
     assert (one.kind, one.state, one.why, one.model) == ("drive", "unfinished", "--resume", "proxy")
@@ -109,7 +112,13 @@ def test_an_unfinished_run_says_resume(harness: Callable[..., Said], folder: Pat
         ("run.json", "[]"),
         ("run.json", "[" * 100_000),
         ("run.json", '{"format": "swarmdrive-run/9"}'),
-        ("run.json", '{"format": "swarmdrive-run/1", "created": "0001-01-01T00:00:00+14:00"}'),
+        ("run.json", '{"format": ["swarmdrive-run/2"]}'),
+        ("run.json", '{"format": "swarmdrive-run/2", "world": {"kind": "eval"}}'),
+        (
+            "run.json",
+            '{"format": "swarmdrive-run/2", "world": {"kind": "frozen"}, '
+            '"created": "0001-01-01T00:00:00+14:00"}',
+        ),
         ("run.json", "\udcff"),
         ("summary.csv", None),
         ("summary.csv", ""),
@@ -124,6 +133,24 @@ def test_a_broken_run_names_the_file_at_fault(folder: Path, file: str, text: str
         (folder / "frozen" / file).write_bytes(text.encode("utf-8", "surrogateescape"))
     [one] = [one for one in runs(folder) if one.name == "frozen"]
     assert (one.state, one.why, one.success) == ("broken", file, None)
+
+
+@pytest.mark.parametrize("old", ["swarmdrive-run/1", "swarmdrive-drive/1"])
+def test_a_run_of_an_older_format_is_broken_and_says_why(
+    old: str, folder: Path, harness: Callable[..., Said]
+) -> None:
+    changed(folder / "frozen/run.json", format=old)
+    [one] = [one for one in runs(folder) if one.name == "frozen"]
+    assert (one.kind, one.state, one.why) == ("run", "broken", "run.json: format of harness 0.1")
+    assert "broken: run.json: format of harness 0.1\n" in harness("ls", folder)[1]
+
+
+def test_listing_needs_no_array_and_no_table() -> None:
+    code = (
+        "import sys, harness.runs.listing; "
+        "print([m for m in ('numpy', 'pyarrow', 'msgspec', 'pandas') if m in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
 
 
 def test_a_broken_sweep_is_listed_as_such(folder: Path) -> None:

@@ -30,10 +30,15 @@ def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], 
 
 
 @pytest.mark.slow
-def test_campaigns_are_quiet(harness: Callable[..., Said]) -> None:
+def test_the_papers_campaign_is_quiet(harness: Callable[..., Said]) -> None:
     paper = ("campaign", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "paper", "--quiet")
     assert harness(*paper) == (0, "", "")
     assert Path("paper/index.html").is_file()
+
+
+@pytest.mark.slow
+def test_the_closed_loop_campaign_is_quiet(harness: Callable[..., Said]) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     assert harness("campaign", "closed-loop", *DRIVE, "--out", "closed", "--quiet") == (0, "", "")
     assert Path("closed/closed-loop.json").is_file()
 

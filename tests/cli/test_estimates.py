@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from harness.cli.estimates import interval
-from harness.runs.summary import over_episodes
+from harness.runs.metrics import over_episodes
 
 
 def test_an_interval_that_nobody_knows_is_a_dash():

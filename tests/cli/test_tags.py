@@ -8,7 +8,7 @@ import pytest
 from evaluating import FILES, run, spec_of
 
 from harness.dataset.load import Dataset
-from harness.evaluate.evaluate import evaluate
+from harness.evaluate.run import evaluate
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.runs.listing import runs
@@ -60,17 +60,17 @@ def test_a_run_goes_on_under_other_tags_and_keeps_those_it_was_begun_with(
     [begun] = runs(tmp_path)
     assert (begun.state, begun.tags) == ("unfinished", ("first",))
     done = run(spec_of(small, tags=("second", "first")), tmp_path / "tagged", resume=True)
-    assert done.manifest["tags"] == ["first", "second"]
+    assert done.manifest.tags == ("first", "second")
     plain = run(spec_of(small), tmp_path / "plain")
-    assert plain.manifest["tags"] == []
+    assert plain.manifest.tags == ()
     for file in FILES:
         assert (done.out / file).read_bytes() == (plain.out / file).read_bytes()
     assert compare(pair(done.out, plain.out)).settings == ()
 
 
-def test_a_run_without_tags_is_of_an_older_version(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_whose_manifest_has_no_tags_is_listed_as_broken(small: Dataset, tmp_path: Path) -> None:
     out = run(spec_of(small), tmp_path / "old").out
     manifest = json.loads((out / "run.json").read_text())
     del manifest["tags"]
     (out / "run.json").write_text(json.dumps(manifest))
-    assert [one.tags for one in runs(tmp_path)] == [()]
+    assert [(one.state, one.why, one.tags) for one in runs(tmp_path)] == [("broken", "run.json", ())]

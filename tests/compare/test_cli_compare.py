@@ -5,10 +5,10 @@ import re
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
-from changing import configure, ends, rewrite
+from changing import ends
+from run_on_disk import Row, change, configure
 
 from harness.report.compare.text import code
 
@@ -61,7 +61,7 @@ def test_rounding_decides_no_gate(runs: tuple[Path, Path], harness: Harness) -> 
     """A loss of 0.1 + 0.2 - 0.3 is none."""
 
     def undecided(run: Path, nats: float) -> None:
-        rewrite(run, lambda row: [d.update(entropy_nats=nats) for d in row["decisions"]])
+        change(run, decision=lambda row: row.update(entropy_nats=nats))
 
     undecided(runs[0], 0.3)
     undecided(runs[1], 0.1 + 0.2)
@@ -74,13 +74,14 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Pat
     config = json.loads((runs[0] / "run.json").read_text())
     name = "6g:consensus=median,window_s=0.4"
     config["conditions"][1]["name"] = name
+
+    def renamed(row: Row) -> None:
+        if row["condition"] == "6g":
+            row["condition"] = name
+
     for run in runs:
+        change(run, decision=renamed, episode=renamed)
         configure(run, conditions=config["conditions"])
-        for file in ("episodes.csv", "rows.jsonl"):
-            text = (run / file).read_text()
-            quoted = f'"{name}"'
-            old = ",6g," if file.endswith("csv") else '"6g"'
-            (run / file).write_text(text.replace(old, f",{quoted}," if file.endswith("csv") else quoted))
     code, out, _ = harness("compare", *runs, "--fail-if", f"{name}:success_rate >= 0")
     assert code == 1
     assert f"FAILED: {name}:success_rate >= 0 in {name} (+0)" in " ".join(out.split())
@@ -115,7 +116,7 @@ def test_a_gate_that_cannot_be_read_is_one_line(
 def test_a_gate_on_what_is_not_known_is_refused_and_does_not_pass(
     runs: tuple[Path, Path], harness: Harness
 ) -> None:
-    rewrite(runs[1], lambda row: [d.update(latency_ms=None) for d in row["decisions"]])
+    change(runs[1], decision=lambda row: row.update(latency_ms=None))
     code, out, err = harness("compare", *runs, "--fail-if", "latency_proxy_ms > 5")
     assert (code, out) == (2, "")
     assert "single-local has no such number in these runs" in err
@@ -136,7 +137,7 @@ def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: H
 
 def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harness) -> None:
     configure(worse[1], answer="constrained")
-    rewrite(worse[1], lambda row: row["answers"]["v1"].update(verdict="failed"))
+    change(worse[1], answer=lambda row: row["viewer"] == "v1" and row.update(verdict="failed"))
     code, out, err = harness("compare", *worse, "--show", "2", "--fail-if", "6g:late_rate > 0.1")
     assert (code, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -152,7 +153,7 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
 
 
 def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harness: Harness) -> None:
-    rewrite(worse[1], lambda row: row["answers"]["v2"].update(verdict="recovered"))
+    change(worse[1], answer=lambda row: row["viewer"] == "v2" and row.update(verdict="recovered"))
     told = json.loads(harness("compare", *worse, "--show", "1", "--json")[1], parse_constant=pytest.fail)
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
@@ -196,16 +197,16 @@ def hostile(worse: tuple[Path, Path]) -> tuple[Path, Path]:
     ends(worse[1], "6g", [["", HOSTILE, "", ""]] * 2)
     config = json.loads((worse[0] / "run.json").read_text())
     for run in worse:
-        scenes = config["dataset"] | {"name": HOSTILE}
-        configure(run, model=config["model"] | {"name": HOSTILE}, dataset=scenes)
+        scenes = config["world"] | {"name": HOSTILE}
+        configure(run, model=config["model"] | {"name": HOSTILE}, world=scenes)
     configure(worse[1], prompt=config["prompt"] | {"version": HOSTILE}, identity={HOSTILE: HOSTILE})
 
-    def spoil(row: dict[str, Any]) -> None:
+    def spoil(row: Row) -> None:
         row["scene"] += HOSTILE
 
-    rewrite(worse[0], spoil)
-    rewrite(worse[1], spoil)
-    rewrite(worse[1], lambda row: row["answers"]["v1"].update(verdict=HOSTILE))
+    for run in worse:
+        change(run, decision=spoil, answer=spoil)
+    change(worse[1], answer=lambda row: row["viewer"] == "v1" and row.update(verdict="failed"))
     return worse
 
 

@@ -2,25 +2,29 @@
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from changing import SEEDS, configure, ends, rewrite
+from changing import SEEDS, ends
+from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
-from evaluating import spec_of
+from run_on_disk import Row, change, configure, made_up
 
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.core.paired import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
-from harness.report.compare.difference import Comparison, Difference, Turned, compare
+from harness.report.compare.difference import Comparison, Difference, Flip, compare
+from harness.report.compare.gate import NAMES
 from harness.report.compare.pair import pair
-from harness.report.compare.table import LIVE_ENDS, LIVE_PER_EPISODE, METRICS
+from harness.runs.metrics import METRICS
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
+LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 
 
 def found(runs: tuple[Path, Path]) -> Comparison:
@@ -36,10 +40,9 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
     c = found(runs)
     assert (c.settings, c.answers) == ((), ())
     assert c.answers_in_both == {"ego": 24, "helper": 72}
-    live = {*LIVE_ENDS, *LIVE_PER_EPISODE, "fusion_ms", "merge_failed_rate"}
     for of in c.conditions:
         silent = {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
-        assert {d.metric for d in of.differences} == set(METRICS) - live - silent
+        assert {d.metric for d in of.differences} == set(NAMES) - LIVE - {"merge_failed_rate"} - silent
         for d in of.differences:
             assert (d.change.value, d.change.low, d.change.high) == (0, 0, 0)
             assert (d.a, d.change.n, d.change.n_excluded) == (d.b, 4, 0)
@@ -73,9 +76,9 @@ def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
     assert (change.low, change.high) == pytest.approx((0.25 - 1.5235, 0.25 + 1.5235), abs=1e-4)
     assert alone["unsafe_rate"].change.value == 0, "a collision less, and a time out more"
     assert alone["late_rate"].change.value == -0.25
-    assert c.conditions[0].gained == (Turned(0, SEEDS, "late", "success"),
-                                      Turned(1, SEEDS, "collision", "success"))  # fmt: skip
-    assert c.conditions[0].lost == (Turned(3, SEEDS, "success", "time_out"),)
+    assert c.conditions[0].gained == (Flip(0, SEEDS, "late", "success"),
+                                      Flip(1, SEEDS, "collision", "success"))  # fmt: skip
+    assert c.conditions[0].lost == (Flip(3, SEEDS, "success", "time_out"),)
     assert c.conditions[0].test == SuccessTest("mcnemar", p_value=1.0), "two against one is nothing"
     assert c.conditions[1].test == SuccessTest("mcnemar", p_value=2 / 2**4), "four of four, both sides"
 
@@ -88,26 +91,24 @@ def test_success_that_hangs_on_the_seed_is_resampled_by_episode(runs: tuple[Path
     c = found(runs)
     assert differences(c, "6g")["success_rate"].change.value == 0.25
     assert c.conditions[1].test == SuccessTest("bootstrap", low=0.0, high=0.5)
-    assert c.conditions[1].gained == (Turned(0, (0,), "late", "success"), Turned(3, (0,), "late", "success"))
+    assert c.conditions[1].gained == (Flip(0, (0,), "late", "success"), Flip(3, (0,), "late", "success"))
 
 
 def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> None:
     """10 ms more in episode 0 and one seed of two is 5 ms; episode 1 is unknown in B, and so left out."""
 
-    def slower(row: dict[str, Any]) -> None:
-        for d in row["decisions"]:
-            d["latency_ms"] = 100.0
-            if row["episode"] == 0 and d["seed"] == 0:
-                d["latency_ms"] = 110.0
-            if row["episode"] == 1:
-                d["latency_ms"] = None
+    def slower(row: Row) -> None:
+        row["latency_ms"] = 100.0
+        if row["episode"] == 0 and row["seed"] == 0:
+            row["latency_ms"] = 110.0
+        if row["episode"] == 1:
+            row["latency_ms"] = None
 
-    def steady(row: dict[str, Any]) -> None:
-        for d in row["decisions"]:
-            d["latency_ms"] = 900.0 if row["episode"] == 1 else 100.0
+    def steady(row: Row) -> None:
+        row["latency_ms"] = 900.0 if row["episode"] == 1 else 100.0
 
-    rewrite(runs[0], steady)
-    rewrite(runs[1], slower)
+    change(runs[0], decision=steady)
+    change(runs[1], decision=slower)
     d = differences(found(runs), "6g")["latency_proxy_ms"]
     assert (d.a, d.b) == pytest.approx((100, 100 + 5 / 3))
     assert d.change.value == pytest.approx(5 / 3)
@@ -118,46 +119,33 @@ def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> 
 def test_lost_replies_by_hand(runs: tuple[Path, Path]) -> None:
     """Episodes 0 and 1 ask two helpers at every decision. In B one of the replies is lost in episode 0."""
 
-    def heard(delivered: bool) -> Callable[[dict[str, Any]], None]:
-        def change(row: dict[str, Any]) -> None:
-            for d in row["decisions"]:
-                d["triggered"] = d["condition"] == "6g" and row["episode"] < 2
-                d["messages"] = [
-                    {"from": "v2", "delivered": True},
-                    {"from": "v3", "delivered": delivered or row["episode"] != 0},
-                ] if d["triggered"] else []  # fmt: skip
+    def heard(lost: float, loss: float) -> Callable[[Row], None]:
+        def heard(row: Row) -> None:
+            asked = row["condition"] == "6g" and row["episode"] < 2
+            observed = lost if row["episode"] == 0 else 0.0
+            row |= {"observed_loss": observed if asked else None, "effective_loss": loss if asked else None}
 
-        return change
+        return heard
 
-    rewrite(runs[0], heard(True))
-    rewrite(runs[1], heard(False))
+    change(runs[0], decision=heard(0.0, 0.012))
+    change(runs[1], decision=heard(0.5, 0.112))
     told = differences(found(runs), "6g")
     lost = told["observed_reply_loss"]
     assert (lost.a, lost.b, lost.change.value) == (0, 0.25, 0.25), "of episodes 0 and 1, half and nothing"
     assert (lost.change.n, lost.change.n_excluded) == (2, 2)
-    assert told["effective_loss"].b == pytest.approx(0.012), "the profile's"
-    config = json.loads((runs[1] / "run.json").read_text())
-    config["conditions"][1] |= {"loss": 0.112}
-    configure(runs[1], conditions=config["conditions"])
-    assert differences(found(runs), "6g")["effective_loss"].change.value == pytest.approx(0.1)
-    config["conditions"][1] |= {"loss": None, "density_coupled": True}
-    configure(runs[1], conditions=config["conditions"])
-    assert "effective_loss" not in differences(found(runs), "6g"), "no frozen row says how many there were"
+    assert told["effective_loss"].change.value == pytest.approx(0.1)
+    change(runs[1], decision=lambda row: row.update(effective_loss=None))
+    assert "effective_loss" not in differences(found(runs), "6g"), "one of the runs does not know it"
 
 
 def test_latency_percentiles_are_of_all_decisions_and_resampled_by_episode(runs: tuple[Path, Path]) -> None:
     """A takes 100 ms. In B episode 3 takes 200 ms in seed 0: a quarter of that seed's decisions."""
 
-    def steady(row: dict[str, Any]) -> None:
-        for d in row["decisions"]:
-            d["latency_ms"] = 100.0
+    def slow(row: Row) -> None:
+        row["latency_ms"] = 200.0 if row["episode"] == 3 and row["seed"] == 0 else 100.0
 
-    def slow(row: dict[str, Any]) -> None:
-        for d in row["decisions"]:
-            d["latency_ms"] = 200.0 if row["episode"] == 3 and d["seed"] == 0 else 100.0
-
-    rewrite(runs[0], steady)
-    rewrite(runs[1], slow)
+    change(runs[0], decision=lambda row: row.update(latency_ms=100.0))
+    change(runs[1], decision=slow)
     told = differences(found(runs), "6g")
     half, most = told["latency_p50_ms"], told["latency_p95_ms"]
     assert (half.a, half.b, half.change.value) == (100, 100, 0)
@@ -167,30 +155,24 @@ def test_latency_percentiles_are_of_all_decisions_and_resampled_by_episode(runs:
     assert half.change.high == 50, "twice and more often in a quarter of resamples"
 
 
-def test_what_only_driving_shows_by_hand(harness: Callable[..., Said]) -> None:
+def test_what_only_driving_shows_by_hand(tmp_path: Path) -> None:
     """Two episodes and one seed, ended by hand."""
-    drive = ("drive", "--model", "cruise", "--episodes", "2", "--seeds", "0", "--workers", "1")
-    for run in ("a", "b"):
-        assert harness(*drive, "--condition", "single-local", "--out", run, "--quiet")[0] == 0
     columns = ("success", "failure", "time_s", "fault", "least_gap_m", "hard_brakings", "skipped")
-    for run, ended in (
-        ("a", [("True", "", 4.0, "", 9.0, 0, 1), ("False", "collision", 2.0, "ego", 0.0, 1, 0)]),
-        ("b", [("False", "late", 7.0, "", 5.0, 2, 1), ("False", "time_out", 10.0, "", 3.0, 3, 2)]),
+    for name, ended in (
+        ("a", [(True, "", 4.0, None, 9.0, 0, 1), (False, "collision", 2.0, "ego", 0.0, 1, 0)]),
+        ("b", [(False, "late", 7.0, None, 5.0, 2, 1), (False, "time_out", 10.0, None, 3.0, 3, 2)]),
     ):
-        with Path(run, "episodes.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        for row, end in zip(rows, ended, strict=True):
-            row |= dict(zip(columns, map(str, end), strict=True))
-        with Path(run, "episodes.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    told = differences(found((Path("a"), Path("b"))), "single-local")
-    assert {name: (told[name].a, told[name].b) for name in (*LIVE_ENDS, *LIVE_PER_EPISODE)} == {
+
+        def end(row: Row, ended: Sequence[Any] = ended) -> None:
+            row |= dict(zip(columns, ended[row["episode"]], strict=True)) | {"other_crashes": 0}
+
+        made_up(tmp_path / name, episode=end, closed_loop=True, episodes=2, steps=5, seeds=(0,))
+    told = differences(found((tmp_path / "a", tmp_path / "b")), "single-local")
+    assert {name: (told[name].a, told[name].b) for name in LIVE} == {
         "collision_rate": (0.5, 0), "at_fault_rate": (0.5, 0), "time_out_rate": (0, 0.5),
         "off_road_rate": (0, 0), "time_to_clear_s": (4, 7), "least_gap_m": (4.5, 4),
         "hard_brakings_per_episode": (0.5, 2.5), "other_crashes_per_episode": (0, 0),
-        "decisions_per_episode": (5.5, 5.5), "skipped_per_episode": (0.5, 1.5),
+        "decisions_per_episode": (5, 5), "skipped_per_episode": (0.5, 1.5),
         "never_acted_per_episode": (0, 0),
     }  # fmt: skip
     assert told["time_to_clear_s"].change.n_excluded == 1, "the one that cleared in neither run"
@@ -201,12 +183,11 @@ def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path
     """B replays A, with one ego's answer and two helpers' made unreadable or a little broken."""
     said = {"00000-0/v1": "no idea", "00000-0/v2": "no idea", "00001-2/v3": "fence"}
 
-    def spoil(row: dict[str, Any]) -> None:
-        for viewer, answer in row["answers"].items():
-            how = said.get(f"{row['scene']}/{viewer}")
-            answer["raw"] = f"```json\n{answer['raw']}\n```" if how == "fence" else how or answer["raw"]
+    def spoil(row: Row) -> None:
+        how = said.get(f"{row['scene']}/{row['viewer']}")
+        row["raw"] = f"```json\n{row['raw']}\n```" if how == "fence" else how or row["raw"]
 
-    rewrite(runs[1], spoil)
+    change(runs[1], answer=spoil)
     points = (POINTS["single-local"], POINTS["6g"])
     replayed = evaluate(spec_of(small, f"replay:{runs[1]}", points=points, seeds=SEEDS), Path(runs[1], "new"))
     c = found((runs[0], replayed.out))
@@ -256,11 +237,14 @@ def test_one_episode_has_differences_and_no_interval(small_path: Path, tmp_path:
             assert d.change.low != d.change.low
 
 
-def test_live_runs_are_compared_with_live_runs(harness: Callable[..., Said], runs: tuple[Path, Path]) -> None:
-    drive = ("drive", "--episodes", "2", "--seeds", "0:2", "--workers", "1", "--condition", "6g")
+def test_live_runs_are_compared_with_live_runs(
+    runs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    points = (POINTS["6g"],)
     for model in ("cruise", "local-view"):
-        assert harness(*drive, "--model", model, "--out", model)[0] == 0
-    assert harness(*drive, "--model", "cruise", "--first-seed", "7", "--out", "other")[0] == 0
+        evaluate(live_spec_of(model, points=points), Path(model))
+    evaluate(live_spec_of("cruise", points=points, first_seed=7), Path("other"))
     c = found((Path("cruise"), Path("local-view")))
     with Path("local-view/summary.csv").open() as file:
         own = {
@@ -269,7 +253,7 @@ def test_live_runs_are_compared_with_live_runs(harness: Callable[..., Said], run
         }  # fmt: skip
     told = differences(c, "6g")
     unheard = {"effective_loss", "observed_reply_loss", "merge_failed_rate"}
-    assert set(METRICS) - set(told) == {"brier", "negative_log_likelihood"} | unheard
+    assert set(NAMES) - set(told) == {"brier", "negative_log_likelihood"} | unheard
     for name, d in told.items():
         if not d.change.n_excluded:  # a summary leaves nothing out for another run's sake
             assert d.b == pytest.approx(float(own[name]), abs=1e-3)
@@ -282,7 +266,7 @@ def test_live_runs_are_compared_with_live_runs(harness: Callable[..., Said], run
 def test_what_cannot_be_compared_is_refused(
     runs: tuple[Path, Path], small: Dataset, tmp_path: Path, harness: Callable[..., Said]
 ) -> None:
-    build(tmp_path / "data", 1, 7, 1, lambda done: None)
+    build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
     points = (POINTS["6g"],)
     other = evaluate(spec_of(load(tmp_path / "data"), points=points, seeds=SEEDS), tmp_path / "other").out
     luck = evaluate(spec_of(small, points=points, seeds=(0, 2)), tmp_path / "luck").out
@@ -291,7 +275,7 @@ def test_what_cannot_be_compared_is_refused(
         (other, "not of the same scenes (small "),
         (luck, "have different seeds ([0, 1] and [0, 2])"),
         (v2x, "have no condition in common (single-local, 6g and v2x)"),
-        (tmp_path / "nowhere", "is no run: it has no run.json"),
+        (tmp_path / "nowhere", "is no finished run: it has no run.json"),
     ):
         code, out, err = harness("compare", runs[0], run)
         assert (code, out, err.count("\n")) == (2, "", 1)
@@ -303,19 +287,14 @@ def test_what_cannot_be_compared_is_refused(
     [
         lambda run: (run / "episodes.csv").write_text("model,prompt\n"),
         lambda run: (run / "episodes.csv").unlink(),
-        lambda run: (run / "episodes.csv").write_text(
-            "\n".join((run / "episodes.csv").read_text().splitlines()[:-1])
-        ),
-        lambda run: (run / "episodes.csv").write_text(
-            (run / "episodes.csv").read_text().replace("True", "perhaps")
-        ),
-        lambda run: (run / "episodes.csv").write_text((run / "episodes.csv").read_text().replace("6g", "7g")),
-        lambda run: configure(run, dataset="small"),
+        lambda run: (run / "decisions.parquet").write_text("PAR1"),
+        lambda run: (run / "answers.jsonl").write_bytes(b"\xff"),
+        lambda run: configure(run, world="small"),
         lambda run: configure(run, seeds=["x"]),
         lambda run: configure(run, conditions=[{"name": "6g", "wheels": 4}]),
-        lambda run: rewrite(run, lambda row: row.update(decisions=[{}])),
-        lambda run: rewrite(run, lambda row: row["answers"].update(v1={})),
-        lambda run: rewrite(run, lambda row: row["decisions"][0].update(latency_ms=float("inf"))),
+        lambda run: configure(run, format="swarmdrive-run/1"),
+        lambda run: change(run, decision=lambda row: row.update(latency_ms=float("inf"))),
+        lambda run: change(run, answer=lambda row: row.update(verdict="good")),
     ],
 )
 def test_a_damaged_run_is_one_line(

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from harness.core.statistics import known_mean
 from harness.report.compare.percentiles import Decided, differences
-from harness.runs.summary import PERCENTILES
+from harness.runs.metrics import PERCENTILES
 
 DECISIONS = st.lists(
     st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])), max_size=12
@@ -22,8 +22,8 @@ def laid(made: list[tuple[int, float]]) -> Decided:
 def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
     data: st.DataObject, n: int
 ) -> None:
-    sides = [[laid(data.draw(DECISIONS)) for _ in range(n)] for _ in "ab"]
-    found = list(differences(*sides, 4))
+    first, second = sides = [[laid(data.draw(DECISIONS)) for _ in range(n)] for _ in "ab"]
+    found = list(differences(first, second, 4))
     by_seed, met = [], set()
     for one, other in zip(*sides, strict=True):
         known = [{int(p) for p, v in zip(*side, strict=True) if v == v} for side in (one, other)]

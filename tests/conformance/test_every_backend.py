@@ -13,7 +13,7 @@ from misbehaving import completion, serving
 
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
-from harness.backends.registry import missing, open_backend
+from harness.backends.registry import BUILT_IN, capabilities, missing, open_backend
 from harness.core.files import digest
 from harness.dataset.load import load
 from harness.evaluate.asking import requests
@@ -32,9 +32,10 @@ def model_free() -> list[str]:
     return [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
 
 
+WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weights]
 ENGINES = [
     *((name, "json") for name in (*model_free(), "replay", "openai")),
-    *((engine, answer) for engine in cards.WEIGHTED for answer in get_args(AnswerMode)),
+    *((engine, answer) for engine in WITH_WEIGHTS for answer in get_args(AnswerMode)),
 ]
 
 
@@ -48,7 +49,7 @@ def case(
     if model == "replay":
         run(spec_of(data, seeds=(0,)), folder / "run")
         model = f"replay:{folder / 'run'}"
-    if model in cards.WEIGHTED:
+    if model in WITH_WEIGHTS:
         if find_spec("torch") is None or find_spec("transformers") is None:
             pytest.skip("needs the transformers extra")
         import tiny_qwen3
@@ -72,13 +73,13 @@ def case(
     asked = list(requests(spec, data.scenes[:5]))
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
-    device = "cpu" if spec.card.engine in cards.WEIGHTED else None
+    device = "cpu" if spec.card.engine in WITH_WEIGHTS else None
     yield Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:
-    tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *cards.WEIGHTED}
-    assert tried == set(cards.Engine.__args__)
+    tried = {cards.load(name).engine for name in model_free()} | {"replay", "openai", *WITH_WEIGHTS}
+    assert tried == set(BUILT_IN)
     assert all(missing(cards.load(name)) is None for name in model_free())
 
 
@@ -134,6 +135,6 @@ def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) 
 def test_its_identity_is_json_and_stays_the_same(case: Case) -> None:
     identity = case.backend.identity()
     assert json.loads(json.dumps(identity, allow_nan=False)) == identity
-    assert identity["engine"] in cards.Engine.__args__
+    assert identity["engine"] in BUILT_IN
     case.backend.complete(case.asked[:1])
     assert case.backend.identity() == identity

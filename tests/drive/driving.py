@@ -1,30 +1,36 @@
-"""Live runs as tests make them: the real parts, or the real parts around answers from a script."""
+"""The closed loop as tests walk it: the real parts, or the real parts around answers from a script."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
-from evaluating import says
+from evaluating import live_spec_of, says
 
-from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
-from harness.evaluate.live import drive
-from harness.evaluate.live_spec import Drive, spec_of
-from harness.prompts import versions as prompts
-from harness.runs.driven_record import Row
+from harness.evaluate.asking import Asker
+from harness.evaluate.live_world import LiveSource, LiveWorld
+from harness.evaluate.spec import Spec
+from harness.evaluate.walk import table, walk
+from harness.runs import folder
+from harness.runs.decisions import Decisions
+from harness.runs.metrics import Grid
+from harness.runs.records import Answer, Decision, Episode, Latency
+from harness.runs.summary import counted
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # layout seeds
 ALONE = POINTS["single-local"]
 
 
 class Script:
-    """A backend whose answers are a function of who is asked when; `merged` is any second answer."""
+    """A backend whose answers are a function of who is asked when; `fused` is any answer to a fusion call."""
 
     def __init__(
-        self, line: Callable[[str, int], Sequence[float]], merged: Sequence[float] = (0.0, 1.0, 0.0)
+        self, line: Callable[[str, int], Sequence[float]], fused: Sequence[float] = (0.0, 1.0, 0.0)
     ) -> None:
-        self.line, self.merged = line, merged
+        self.line, self.fused = line, fused
         self.asked: list[str] = []
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
@@ -32,11 +38,25 @@ class Script:
 
     def _say(self, request: Request) -> Completion:
         self.asked.append(request.id)
-        p = self.line(request.view["viewer"], request.view["step"]) if request.view else self.merged
+        p = self.line(request.view["viewer"], request.view["step"]) if request.view else self.fused
         return Completion(request.id, says(p, request.role), None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
         return {"engine": "script"}
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What a run has of some episodes: decisions as written, episodes by place, answers in a run's order."""
+
+    decisions: Decisions
+    episodes: list[Episode]
+    answers: list[Answer]
+
+    @property
+    def moments(self) -> int:
+        """How many distinct moments somebody decided in."""
+        return len(self.decisions.scenes)
 
 
 def spec(
@@ -44,29 +64,37 @@ def spec(
     points: Sequence[OperatingPoint] = tuple(POINTS.values()),
     seeds: Sequence[int] = (0, 1),
     **options: Any,
-) -> Drive:
-    return spec_of(cards.resolve(model), prompts.load("v2"), tuple(points), tuple(seeds), **options)
+) -> Spec:
+    return live_spec_of(model, points=tuple(points), seeds=tuple(seeds), **options)
 
 
 def driven(
-    of: Drive, episodes: Sequence[int] = (0,), backend: Backend | None = None, infer_s: float | None = None
-) -> tuple[list[Row], list[Row]]:
-    """Moments and episodes."""
+    of: Spec, episodes: Sequence[int] = (0,), backend: Backend | None = None, infer_s: float | None = None
+) -> Driven:
+    """Walk some episodes of the closed loop, every inference taking `infer_s`, or what the card says."""
+    assert isinstance(of.source, LiveSource)
     inference_s = of.card.latency.inference_s if infer_s is None else infer_s
-    latency = {
-        "source": "card",
-        "inference_s": dict.fromkeys(("ego", "helper"), inference_s),
-        "merge_s": inference_s,
-        "basis": "test",
-    }
-    return drive(of, backend or open_backend(of.card, batch_size=of.batch_size), latency, episodes)
+    opened = backend or open_backend(of.card, batch_size=of.batch_size)
+    asker = Asker(of, lambda: opened, Latency("card", "test", inference_s, inference_s, inference_s))
+    world = LiveWorld(of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
+    decisions = table(
+        list(chain.from_iterable(walk(world, of.points, asker))), world.columns(), of.actions
+    ).rounded()
+    grid = Grid(tuple(point.name for point in of.points), of.seeds, tuple(episodes))
+    return Driven(
+        decisions,
+        counted(grid, decisions, world.episodes()),
+        folder.ordered(asker.answers.values(), decisions),
+    )
 
 
-def decisions(moments: Sequence[Row], condition: str, seed: int = 0) -> dict[int, Row]:
+def decisions(made: Driven, condition: str, seed: int = 0) -> dict[int, Decision]:
     """An episode's decisions by step, where there is but one layout."""
-    return {
-        row["step"]: {**made, "scene": row["scene"]}
-        for row in moments
-        for made in row["decisions"]
-        if (made["condition"], made["seed"]) == (condition, seed)
-    }
+    every = made.decisions.records(0, len(made.decisions))
+    return {d.step: d for d in every if (d.condition, d.seed) == (condition, seed)}
+
+
+def column(made: Driven, name: str, condition: str, seed: int = 0) -> dict[int, Any]:
+    """A column of the table, by step; None where unknown."""
+    rows = made.decisions.table.select(["step", "condition", "seed", name]).to_pylist()
+    return {r["step"]: r[name] for r in rows if (r["condition"], r["seed"]) == (condition, seed)}

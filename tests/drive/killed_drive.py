@@ -4,12 +4,11 @@ import sys
 from pathlib import Path
 
 from driving import spec
-
-from harness.evaluate.drive import run
+from evaluating import run
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
     from killed_run import die_before
 
     die_before(int(sys.argv[2]))
-    run(spec("cruise", seeds=(0,), episodes=17), Path(sys.argv[1]), False, 1, lambda done: None)
+    run(spec("cruise", seeds=(0,), episodes=17), Path(sys.argv[1]))

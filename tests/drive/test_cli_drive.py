@@ -16,7 +16,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert "n = 2 episodes (layout seeds 5 to 6) × 2 channel seeds" in out
     code, out, _ = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json")
     found = json.loads(out)
-    assert (code, found["manifest"]["first_seed"]) == (0, 5)
+    assert (code, found["manifest"]["world"]["first_seed"]) == (0, 5)
     [success] = [
         row["value"] for row in found["summary"]
         if (row["condition"], row["metric"], row["interval"]) == ("6g", "success_rate", "episodes")

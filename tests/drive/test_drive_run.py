@@ -10,16 +10,17 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from driving import spec
+from evaluating import FILES
 
 from harness.core.errors import UserError
-from harness.evaluate.drive import run
+from harness.evaluate.run import evaluate
+from harness.runs.formats import FORMAT
 
-FILES = ("rows.jsonl", "episodes.csv", "summary.csv")
 HERE = Path(__file__).parent
 
 
 def folder_of(of, out, workers=1, resume=False, done=None):
-    run(of, out, resume, workers, [].append if done is None else done.append)
+    evaluate(of, out, resume, [].append if done is None else done.append, workers=workers)
     return {name: (out / name).read_bytes() for name in FILES}
 
 
@@ -35,15 +36,15 @@ def whole(tmp_path_factory):
 def test_a_run_holds_what_was_driven_and_enough_to_drive_it_again(whole):
     assert {p.name for p in whole.iterdir()} == {*FILES, "run.json"}
     manifest = json.loads((whole / "run.json").read_text())
-    assert manifest["format"] == "swarmdrive-drive/1"
-    assert manifest["latency"]["inference_s"] == {"ego": 0.145, "helper": 0.145}
+    assert manifest["format"] == FORMAT
+    assert (manifest["latency"]["ego_s"], manifest["latency"]["helper_s"]) == (0.145, 0.145)
     assert "--episodes 10 --first-seed 0 --seeds 0,1" in manifest["command"]
-    assert manifest["scenario"]["parameters"]["simulation_hz"] == 50
+    assert manifest["world"]["scenario"]["parameters"]["simulation_hz"] == 50
     with (whole / "episodes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 10 * 3 * 2
     places = [(int(r["episode"]), r["condition"], int(r["seed"])) for r in rows]
-    assert places == [(e, c, s) for e in range(10) for c in ("single-local", "v2x", "6g") for s in (0, 1)]
+    assert places == [(e, c, s) for c in ("single-local", "v2x", "6g") for s in (0, 1) for e in range(10)]
     assert {r["partner"] != "" for r in rows if r["failure"] == "collision"} == {True}
 
 
@@ -72,22 +73,21 @@ def test_workers_and_batches_change_no_byte(whole, tmp_path, workers, batch_size
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path):
     cruise = spec("cruise", seeds=(0,), episodes=17)  # three chunks
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     resumed = 0
-    for n in (8, 22, 26, 40):
+    for n in (6, 20, 38, 60, 78):  # before the settings are kept, in chunks, before a table, tidying up
         out = tmp_path / f"at-{n}"
         command = [sys.executable, str(HERE / "killed_drive.py"), str(out), str(n)]
         killed = subprocess.run(command, env=environment, capture_output=True, check=False)
         assert killed.returncode == -9, killed.stderr
         if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
             with pytest.raises(UserError, match="add --resume to go on"):
-                run(cruise, out, False, 1, lambda done: None)
+                evaluate(cruise, out, False, lambda done: None)
             with pytest.raises(UserError, match="begun with another seeds"):
-                run(spec("cruise", seeds=(1,), episodes=17), out, True, 1, lambda done: None)
+                evaluate(spec("cruise", seeds=(1,), episodes=17), out, True, lambda done: None)
             resumed += 1
         assert folder_of(cruise, out, resume=True) == expected
         assert {p.name for p in out.iterdir()} == {*FILES, "run.json"}
@@ -96,12 +96,12 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
 
 def test_a_finished_run_is_not_driven_over(whole):
     with pytest.raises(UserError, match="already holds a finished run"):
-        run(spec(episodes=10), whole, False, 1, lambda done: None)
-    again = run(spec(episodes=10), whole, True, 1, lambda done: pytest.fail("driven again"))
-    assert again.manifest["episodes"] == 10
+        evaluate(spec(episodes=10), whole, False, lambda done: None)
+    again = evaluate(spec(episodes=10), whole, True, lambda done: pytest.fail("driven again"))
+    assert again.manifest.world.episodes == 10
 
 
 def test_a_model_that_is_not_there_leaves_nothing_behind(tmp_path):
     with pytest.raises(UserError, match="no such"):
-        run(spec("replay:/nowhere"), tmp_path / "run", False, 1, lambda done: None)
+        evaluate(spec("replay:/nowhere"), tmp_path / "run", False, lambda done: None)
     assert list(tmp_path.iterdir()) == []

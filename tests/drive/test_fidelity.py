@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -38,6 +39,7 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
     found = fidelity(runs)
     assert len(found.table) == 3 * 3
     assert len(found.episodes) == 3 * 3 * 2 * 4
+    row: Any
     for row in found.table.itertuples():
         frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))
         assert row.frozen == pytest.approx(frozen.mean())
@@ -92,5 +94,5 @@ def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable
     Path("torn/episodes.csv").write_text("model,prompt\n")
     code, out, err = harness("fidelity", runs[0], "torn")
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "torn is no finished run" in err
+    assert "torn/episodes.csv is broken (" in err
     assert not Path("reports").exists()

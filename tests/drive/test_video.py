@@ -1,19 +1,19 @@
 """A driven episode, played again and drawn."""
 
-import json
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-import imageio_ffmpeg
 import pandas as pd
 import pytest
-from driving import FROM_LEFT, spec
+from driving import FROM_LEFT
+from evaluating import live_spec_of, run
 from PIL import Image, ImageSequence
+from run_on_disk import made_up
 
 from harness.cli import main
 from harness.core.errors import UserError
-from harness.evaluate.drive import run
 from harness.evaluate.replay import find, stills
 from harness.report.drawing.video import write_video
 
@@ -21,11 +21,12 @@ from harness.report.drawing.video import write_video
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("driven") / "run"
-    run(spec(episodes=3, first_seed=FROM_LEFT), folder, False, 1, lambda done: None)
+    run(live_spec_of(episodes=3, first_seed=FROM_LEFT), folder)
     return folder
 
 
 def test_an_episode_played_again_ends_as_it_did(out):
+    row: Any
     for row in pd.read_csv(out / "episodes.csv", keep_default_na=False).itertuples():
         seen = list(stills(find(out, row.episode, row.condition, row.seed)))
         assert seen[-1].state.time_s == row.time_s
@@ -62,6 +63,7 @@ def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, tmp_path, monkey
 
 
 def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
     assert typed(monkeypatch, capsys, "video", out, 0, "--out", film) == (0, f"wrote {film}\n", "")
     assert film.read_bytes()[4:8] == b"ftyp"
@@ -98,6 +100,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
 
 
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"
@@ -115,12 +118,9 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
         ((out, 3, None, None), "give 0 to 2"),
         ((out, 0, "5g", None), "unknown condition '5g'"),
         ((out, 0, None, 9), "unknown seed '9'"),
-        ((tmp_path, 0, None, None), "is no run.* made by `harness drive`"),
+        ((tmp_path, 0, None, None), "is no finished run.* or `harness drive`"),
     ):
         with pytest.raises(UserError, match=says):
             find(*arguments)
-    frozen = tmp_path / "frozen"
-    frozen.mkdir()
-    (frozen / "run.json").write_text(json.dumps({"format": "swarmdrive-run/1"}))
-    with pytest.raises(UserError, match=r"has format 'swarmdrive-run/1'.* made by `harness drive`"):
-        find(frozen, 0, None, None)
+    with pytest.raises(UserError, match=r"was made by `harness eval`; give a folder made by `harness drive`"):
+        find(made_up(tmp_path / "frozen"), 0, None, None)

@@ -8,9 +8,11 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
@@ -48,12 +50,26 @@ def tables_of(run: Path) -> dict[str, Table]:
         `messages`: the same and a helper that was asked.
     """
     manifest = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    lines = (run / "rows.jsonl").read_text(encoding="utf-8").splitlines()
-    scenes = _numbered(map(json.loads, lines))
     actions = manifest["actions"]
-    held = {name: manifest[name] for name in SETTINGS if name in manifest}
+    scenes = _numbered(_scenes_of(run, actions))
+    latency, world = manifest["latency"], manifest["world"]
+    # What no decision needs is declared all the same.
+    needed = latency["source"] == "paper" or world["kind"] == "closed-loop" or any(
+        condition["consensus"] == "ego-prompt" for condition in manifest["conditions"]
+    )  # fmt: skip
+    told = {
+        **world, **manifest,
+        "latency": {
+            "source": latency["source"], "basis": latency["basis"],
+            "inference_s": {"ego": latency["ego_s"], "helper": latency["helper_s"]},
+            **({"merge_s": latency["fusion_s"]} if needed else {}),
+        },
+    }  # fmt: skip
+    held = {name: told[name] for name in SETTINGS if name in told}
     return {
-        "settings": [{"name": name, "value": text(value)} for name, value in _flat(held, "")],
+        "settings": sorted(
+            ({"name": name, "value": text(value)} for name, value in _flat(held, "")), key=itemgetter("name")
+        ),
         "scenes": [_cells(_scene(scene, actions)) for scene in scenes],
         "answers": [_cells(row) for scene in scenes for row in _answers(scene, actions)],
         "decisions": [_cells(_decision(scene, made, actions)) for scene, made in _made(scenes)],
@@ -63,6 +79,54 @@ def tables_of(run: Path) -> dict[str, Table]:
             for message in sorted(made["messages"], key=lambda message: message["from"])
         ],
     }
+
+
+def _scenes_of(run: Path, actions: list[str]) -> Iterator[dict[str, Any]]:
+    """The decision points of a run, each with its answers and what was decided."""
+    lines = (run / "answers.jsonl").read_text(encoding="utf-8").splitlines()
+    answers: dict[str, dict[str, Any]] = {}
+    for answer in map(json.loads, lines):
+        key = "+".join((answer.pop("viewer"), *answer.pop("heard")))
+        answers.setdefault(answer.pop("scene"), {})[key] = answer
+    of_scenes: dict[str, list[dict[str, Any]]] = {}
+    for row in pq.read_table(run / "decisions.parquet").to_pylist():
+        of_scenes.setdefault(row["scene"], []).append(row)
+    for name, rows in of_scenes.items():
+        first = rows[0]
+        outcomes = (
+            {what: [first[f"{what}_{action}"] for action in actions] for what in ("safe", "delay_s")}
+            if first["acted"] is None
+            else {}
+        )
+        yield {
+            **{key: first[key] for key in ("scene", "episode", "step", "danger")}, **outcomes,
+            "answers": answers.get(name, {}), "decisions": [_made_of(row, actions) for row in rows],
+        }  # fmt: skip
+
+
+def _made_of(row: dict[str, Any], actions: list[str]) -> dict[str, Any]:
+    """A decision, its messages in a list."""
+    spread = {f"{what}_{action}" for what in ("fused", "safe", "delay_s") for action in actions}
+    of_messages = ("delivered", "on_time", "arrival_ms", "weight")
+    messages = []
+    for place in range(1, 1 + sum(name.startswith("helper_") for name in row)):
+        spread |= {f"{what}_{place}" for what in ("helper", *of_messages)}
+        if row[f"helper_{place}"] is not None:
+            of_place = {what: row[f"{what}_{place}"] for what in of_messages}
+            messages.append({"from": row[f"helper_{place}"], **of_place})
+    plain = {name: value for name, value in row.items() if name not in spread}
+    for name in ("scene", "episode", "step", "danger", "messages"):
+        del plain[name]
+    failed = plain.pop("fusion_failed")
+    plain["merge_failed"] = None if failed is None else float(failed)
+    fused = [row[f"fused_{action}"] for action in actions]
+    return {**plain, "fused": fused, "messages": messages}
+
+
+def place(row: Row) -> tuple[Any, ...]:
+    """Where a line of `episodes.csv` or `summary.csv` stands, whatever order the program writes them in."""
+    numbers = (int(row.get(name) or 0) for name in ("seed", "episode"))
+    return row["condition"], row.get("metric", ""), row.get("interval", ""), *numbers
 
 
 def text(value: Any) -> str:

@@ -3,13 +3,14 @@ from sample_run import write_run
 
 from harness.dataset.build import build
 from harness.dataset.load import load
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
     """Two episodes, 12 decisions: a danger from the right, and one from the left."""
     out = tmp_path_factory.mktemp("report") / "two"
-    build(out, episodes=2, seed=5, workers=1, progress=lambda done: None)
+    build(SCENARIO, out, episodes=2, seed=5, workers=1, progress=lambda done: None)
     return load(out)
 
 

@@ -1,73 +1,91 @@
 """Which decisions a report shows."""
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 from hypothesis import given
 from hypothesis import strategies as st
+from run_on_disk import made_up
 
+from harness.coordination.operating_point import POINTS
 from harness.report import choose
-from harness.runs.folder import Run
+from harness.runs.folder import read
 
 
-def pick(rows, n):
-    return choose.pick(rows, choose.failures(Run(None, {}, (), rows)), n)
-
-
-def row(episode, actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict", avoidable=True):
+def point(actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict", avoidable=True):
     """A decision point in two conditions."""
-    return {
-        "episode": episode,
-        "safe": [avoidable, False, False],
-        "answers": {"v1": {"verdict": verdict}},
-        "decisions": [
-            {"condition": str(n), "seed": 0, "action": a, "safe": s}
-            for n, (a, s) in enumerate(zip(actions, safe, strict=True))
-        ],
-    }
+    return actions, safe, verdict, avoidable
 
 
-def test_telling_decisions_come_with_the_reason_and_an_even_sample_fills_up():
-    rows = [row(n) for n in range(100)]
-    rows[10] = row(10, safe=(True, False))
-    rows[20] = row(20, actions=("IDLE", "SLOWER"))
-    rows[30] = row(30, verdict="recovered")
-    rows[31] = row(31, verdict="failed")
-    chosen = pick(rows, 8)
-    why = {c.row["episode"]: c.why for c in chosen if c.why != "even sample"}
-    assert why == {
-        10: "first failure",
-        20: "conditions disagree",
-        30: "answer not strict",
-        31: "answer not strict",
-    }
-    assert [c.row["episode"] for c in chosen if c.why == "even sample"] == [0, 26, 52, 76]
+def run_of(out, episodes):
+    """A run of episodes, each a list of decision points, all as long."""
+    points = {f"{e:05d}-{step}": p for e, course in enumerate(episodes) for step, p in enumerate(course)}
+    conditions = ("single-local", "6g")
+
+    def decision(row):
+        actions, safe, _, avoidable = points[row["scene"]]
+        place = conditions.index(row["condition"])
+        row |= {"action": actions[place], "safe": safe[place], "safe_SLOWER": avoidable, "safe_IDLE": False}
+
+    def answer(row):
+        row["verdict"] = points[row["scene"]][2]
+
+    return read(made_up(
+        out, decision, answer=answer, points=[POINTS[name] for name in conditions], seeds=(0,),
+        episodes=len(episodes), steps=len(episodes[0]), helpers=0,
+    ))  # fmt: skip
 
 
-def test_only_the_first_failure_of_an_episode_is_one_and_none_where_nothing_was_safe():
-    rows = [row(1, safe=(False, False), avoidable=False)] + [row(1, safe=(False, False))] * 2 + [row(2)] * 2
-    assert [c.why == "first failure" for c in pick(rows, 5)] == [False, True, False, False, False]
+def pick(run, n):
+    """Episode and step of what is chosen."""
+    return [tuple(map(int, scene.split("-"))) for scene in choose.pick(run, choose.failures(run), n)]
 
 
-def test_a_run_full_of_failures_still_shows_ordinary_decisions():
-    rows = [row(n, safe=(n > 50, True)) for n in range(100)]
-    assert [c.why for c in pick(rows, 40)].count("first failure") == 10
+def test_telling_decisions_are_chosen_and_an_even_sample_fills_up(tmp_path):
+    episodes = [[point()] for _ in range(100)]
+    failure, disagreement, recovered, failed = 10, 20, 30, 31
+    episodes[failure] = [point(safe=(True, False))]
+    episodes[disagreement] = [point(actions=("IDLE", "SLOWER"))]
+    episodes[recovered] = [point(verdict="recovered")]
+    episodes[failed] = [point(verdict="failed")]
+    chosen = [episode for episode, _ in pick(run_of(tmp_path / "run", episodes), 8)]
+    telling, sample = {failure, disagreement, recovered, failed}, {0, 26, 52, 76}
+    assert chosen == sorted(telling | sample)
 
 
-ROWS = st.lists(
-    st.builds(
-        row,
-        st.integers(0, 5),
-        st.tuples(*[st.sampled_from(["IDLE", "SLOWER"])] * 2),
-        st.tuples(st.booleans(), st.booleans()),
-        st.sampled_from(["strict", "recovered", "failed"]),
-        st.booleans(),
-    ),
-    max_size=40,
+def test_only_the_first_failure_of_an_episode_is_one_and_none_where_nothing_was_safe(tmp_path):
+    fails = [point(safe=(False, False), avoidable=False), *[point(safe=(False, False))] * 2]
+    run = run_of(tmp_path / "run", [fails, [point()] * 3])
+    assert choose.failures(run) == {"00000-1": 0}
+
+
+def test_a_run_full_of_failures_still_shows_ordinary_decisions(tmp_path):
+    run = run_of(tmp_path / "run", [[point(safe=(n > 50, True))] for n in range(100)])
+    failures = choose.failures(run)
+    assert len(failures) == 51
+    chosen = choose.pick(run, failures, 40)
+    # A quarter are chosen as failures, and 30 are spread over the other 90, of which 49 are ordinary.
+    assert set(choose._spread(list(failures), 10)) <= set(chosen)
+    assert len([scene for scene in chosen if scene not in failures]) == 16
+
+
+POINTS_AS_DRAWN = st.builds(
+    point,
+    st.tuples(*[st.sampled_from(["IDLE", "SLOWER"])] * 2),
+    st.tuples(st.booleans(), st.booleans()),
+    st.sampled_from(["strict", "recovered", "failed"]),
+    st.booleans(),
+)
+EPISODES = st.integers(1, 8).flatmap(
+    lambda steps: st.lists(st.lists(POINTS_AS_DRAWN, min_size=steps, max_size=steps), min_size=1, max_size=5)
 )
 
 
-@given(ROWS, st.integers(4, 50))
-def test_as_many_as_asked_for_each_once_in_the_runs_order_and_always_the_same(rows, n):
-    chosen = [id(c.row) for c in pick(rows, n)]
-    order = [id(r) for r in rows]
-    assert chosen == sorted(set(chosen), key=order.index)
-    assert len(chosen) == min(n, len(rows))
-    assert chosen == [id(c.row) for c in pick(rows, n)]
+@given(EPISODES, st.integers(4, 50))
+def test_as_many_as_asked_for_each_once_in_the_runs_order_and_always_the_same(episodes, n):
+    with TemporaryDirectory() as folder:
+        run = run_of(Path(folder) / "run", episodes)
+        chosen = pick(run, n)
+        assert chosen == sorted(set(chosen))
+        assert len(chosen) == min(n, sum(map(len, episodes)))
+        assert chosen == pick(run, n)

@@ -1,9 +1,8 @@
 """Prompts and models side by side."""
 
-import json
-
 import numpy as np
 import pytest
+from run_on_disk import answers_of, rows_of
 from sample_run import write_run
 
 from harness.report import matrix, statistics
@@ -40,9 +39,8 @@ def test_runs_without_episodes_in_common_are_not_marked():
 
 @pytest.fixture(scope="session")
 def both(run, dataset, tmp_path_factory):
-    other = write_run(tmp_path_factory.mktemp("matrix") / "other", dataset, model="other")
-    config = json.loads((other / "run.json").read_text())
-    (other / "run.json").write_text(json.dumps(config | {"prompt": {"version": "v1", "sha256": "00" * 32}}))
+    prompt = {"version": "v1", "sha256": "00" * 32}
+    other = write_run(tmp_path_factory.mktemp("matrix") / "other", dataset, model="other", prompt=prompt)
     return gather([run, other])
 
 
@@ -71,21 +69,22 @@ def test_runs_of_one_name_are_told_apart(run, dataset, tmp_path):
     assert gather([run, run]).names == ("rule-of-thumb · v2",)
 
 
-def test_every_decision_and_reply_is_counted_once(run):
+def test_every_decision_and_reply_is_counted_once(run, dataset):
     found = read(run)
-    decided = [d for row in found.rows for d in row["decisions"]]
-    laid = statistics.decisions(found)
-    assert len(laid.unsafe) == len(decided)
-    judged = sum(any(row["safe"]) for row in found.rows) * 9
-    assert sum(row["n"] for row in statistics.reliability(found, laid)) == judged
-    assert sum(row["n"] for row in statistics.errors(found, laid)) == judged
+    rows = rows_of(run)
+    safe, _ = dataset.outcome_arrays()
+    assert len(rows) == len(dataset.scenes) * 9
+    judged = int(safe.any(axis=1).sum()) * 9
+    assert sum(row["n"] for row in statistics.reliability(found)) == judged
+    assert sum(row["n"] for row in statistics.errors(found)) == judged
     replies = statistics.replies(found)
-    assert sum(row["count"] for row in replies) == sum(len(d["messages"]) for d in decided)
-    arrived = sum(m["delivered"] for d in decided for m in d["messages"])
-    assert sum(row["count"] for row in statistics.arrivals(found)) == arrived
-    answers = [a for row in found.rows for a in row["answers"].values()]
+    assert sum(row["count"] for row in replies) == sum(row["messages"] for row in rows)
+    arrived = sum(row[f"delivered_{place}"] is True for row in rows for place in (1, 2, 3))
+    assert sum(row["count"] for row in statistics.arrivals(found)) == arrived > 0
+    answers = answers_of(run)
+    assert len(answers) == sum(len(scene.viewers) for scene in dataset.scenes)
     assert sum(row["count"] for row in statistics.statuses(found)) == len(answers)
-    read_out = [a for a in answers if a["role"] == "ego" and a["intent"]]
+    read_out = [a for a in answers if a.role == "ego" and a.intent]
     assert sum(row["count"] for row in statistics.entropies(found)) == len(read_out)
 
 

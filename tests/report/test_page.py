@@ -3,23 +3,35 @@
 import base64
 import hashlib
 import json
+import math
 import shutil
-from dataclasses import replace
+import subprocess
+import sys
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import typer
+from evaluating import spec_of
+from msgspec import structs
 from reading import Page, details, packed
+from run_on_disk import answers_of, change, configure, rows_of
 from sample_run import write_run
 from typer.testing import CliRunner
 
+from harness.backends.base import Completion
 from harness.cli.report import command
 from harness.core.errors import UserError
+from harness.core.files import digest
+from harness.evaluate.asking import answer_of, requests
+from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import headline, latency_source
-from harness.runs.folder import Score, read
+from harness.runs.folder import csv_text, read
+from harness.runs.records import Latency, Score
 
 V2 = prompts.load("v2")
 
@@ -33,14 +45,16 @@ def written(*folders, prompts=prompts_of):
     return render(gather(list(folders)), prompts)
 
 
+def greeting(viewer):
+    return [{"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}]
+
+
 @pytest.fixture(scope="session")
-def text(run):
-    return written(
-        run,
-        prompts=told(lambda viewer: [
-            {"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}
-        ]),
-    )  # fmt: skip
+def text(run, tmp_path_factory):
+    """The page of a run that was asked with a greeting."""
+    greeted = shutil.copytree(run, tmp_path_factory.mktemp("greeted") / "sample")
+    change(greeted, answer=lambda a: a.update(prompt_sha256=digest(greeting(a["viewer"]))))
+    return written(greeted, prompts=told(greeting))
 
 
 @pytest.fixture(scope="session")
@@ -53,41 +67,66 @@ def opened(text):
     return details(text)
 
 
-def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened):
-    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
-    assert list(opened) == [row["scene"] for row in rows]
-    for row in rows:
-        detail = opened[row["scene"]]
+def by_scene(run):
+    """Decisions and answers of each decision point."""
+    found = {row["scene"]: ([], {}) for row in rows_of(run)}
+    for row in rows_of(run):
+        found[row["scene"]][0].append(row)
+    for answer in answers_of(run):
+        found[answer.scene][1][answer.viewer] = answer
+    return found
+
+
+def messages_in(row):
+    """A decision's messages, as a page has them."""
+    columns = {"delivered": "delivered", "on_time": "on_time", "arrival_ms": "arrival_ms", "weight": "weight"}
+    return [
+        {"from": row[f"helper_{n}"], **{name: row[f"{column}_{n}"] for name, column in columns.items()}}
+        for n in (1, 2, 3)
+        if row[f"helper_{n}"]
+    ]
+
+
+def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, dataset):
+    every = by_scene(run)
+    assert list(opened) == list(every) == [scene.id for scene in dataset.scenes]
+    for scene, (rows, answers) in every.items():
+        detail = opened[scene]
         [found] = detail["runs"]
-        assert {a["viewer"]: a["raw"] for a in found["answers"]} == {
-            v: a["raw"] for v, a in row["answers"].items()
-        }
+        assert {a["viewer"]: a["raw"] for a in found["answers"]} == {v: a.raw for v, a in answers.items()}
         again = {
             (d["condition"], seed): (d["action"], d["fused"], d["messages"])
             for d in found["decisions"] for seed in d["seeds"]
         }  # fmt: skip
         assert again == {
-            (d["condition"], d["seed"]): (d["action"], d["fused"], d["messages"]) for d in row["decisions"]
+            (row["condition"], row["seed"]): (
+                row["action"],
+                [row[f"fused_{action}"] for action in dataset.actions],
+                messages_in(row),
+            )
+            for row in rows
         }
-        assert [o["safe"] for o in detail["outcomes"]] == row["safe"]
-        assert set(detail["world"]["viewers"]) == set(row["answers"])
+        assert [o["safe"] for o in detail["outcomes"]] == [
+            rows[0][f"safe_{action}"] for action in dataset.actions
+        ]
+        assert set(detail["world"]["viewers"]) == set(answers)
 
 
-def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, text):
+def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, text, dataset):
     index = json.loads(packed(text, "index"))
     [of] = index["runs"]
-    rows = [json.loads(line) for line in (run / "rows.jsonl").read_text().splitlines()]
     keys = [(c, s) for c in of["conditions"] for s in of["seeds"]]
-    for n, row in enumerate(rows):
-        made = {(d["condition"], d["seed"]): d for d in row["decisions"]}
+    for n, (rows, answers) in enumerate(by_scene(run).values()):
+        made = {(row["condition"], row["seed"]): row for row in rows}
+        avoidable = any(rows[0][f"safe_{action}"] for action in dataset.actions)
         for k, key in enumerate(keys):
             at = n * len(keys) + k
             assert index["actions"][int(of["acted"][at])] == made[key]["action"]
             assert of["asked"][at] == str(int(made[key]["triggered"]))
-            good = not any(row["safe"]) or made[key]["safe"]
+            good = not avoidable or made[key]["safe"]
             assert of["ended"][at] in ("sdn" if good else "u")
         statuses = {s for k, s in enumerate(index["statuses"]) if of["statuses"][n] & 1 << k}
-        assert statuses == {a["status"] for a in row["answers"].values()}
+        assert statuses == {a.status for a in answers.values()}
 
 
 def test_what_was_read_in_a_recovered_answer_is_marked(opened):
@@ -106,24 +145,29 @@ def prompts_in(opened):
 
 def test_prompts_are_those_given_and_none_where_none_are(run, opened):
     assert "I am v3." in prompts_in(opened)
-    bare = details(written(run))  # the sample's prompt is nobody's
-    assert prompts_in(bare) == []
-    assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
+    # The sample's prompt is nobody's, and it was asked with another than this greeting.
+    for bare in (details(written(run)), details(written(run, prompts=told(greeting)))):
+        assert prompts_in(bare) == []
+        assert all(a["prompt"] is None for d in bare.values() for a in d["runs"][0]["answers"])
 
 
 def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, tmp_path):
-    change = {"label_mass": 0.25, "retries": 2, "cached": True}
-    run = write_run(tmp_path / "run", dataset, change=lambda scene, viewer, answer: {**answer, **change})
-    before = written(run)
-    assert "prompt v2, answers json" in Page(before).text  # as runs of older versions, which name none
-    config = json.loads((run / "run.json").read_text())
-    config |= {"answer": "readout", "cached_answers": 48, "prompt": {"version": "v2", "sha256": V2.sha256}}
-    (run / "run.json").write_text(json.dumps(config))
+    said = {"label_mass": 0.25, "retries": 2, "cached": True}
+
+    def as_read_out(answer):
+        scene = next(scene for scene in dataset.scenes if scene.id == answer.scene)
+        shown = V2.render(scene.record["graphs"][answer.viewer], dataset.actions)
+        return structs.replace(answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said)
+
+    run = write_run(tmp_path / "run", dataset, change=as_read_out)
+    assert "prompt v2, answers json" in Page(written(run)).text
+    prompt = {"version": "v2", "sha256": V2.sha256, "released": True}
+    configure(run, answer="readout", cached_answers=48, prompt=prompt)
     after = written(run)
     assert "prompt v2, answers readout" in Page(after).text
     assert "48 answers came from the cache" in Page(after).text
     found = details(after)
-    assert all(a.items() >= change.items() for d in found.values() for a in d["runs"][0]["answers"])
+    assert all(a.items() >= said.items() for d in found.values() for a in d["runs"][0]["answers"])
     asked = [text for text in prompts_in(found) if text.startswith("EGO")]
     assert asked
     assert all(f"Answer with one letter: A {dataset.actions[0]}" in text for text in asked)
@@ -173,7 +217,7 @@ def test_the_same_runs_give_the_same_page(run):
 def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_path):
     brave = write_run(
         tmp_path / "brave", dataset, model="brave",
-        change=lambda s, v, answer: answer | {"intent": [0.02, 0.08, 0.9]} if answer["intent"] else answer,
+        change=lambda answer: structs.replace(answer, intent=answer.intent and (0.02, 0.08, 0.9)),
     )  # fmt: skip
     text = written(run, brave)
     found = Page(text).text
@@ -185,7 +229,7 @@ def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_pat
 
 
 def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tmp_path):
-    swept = changed(run, tmp_path, "run.json", lambda t: t)
+    swept = copied(run, tmp_path)
     (tmp_path / "secret.svg").write_text("<svg>secret</svg>")
     for name in ("sweep-tau", "sweep-out"):
         (swept / name).mkdir()
@@ -197,7 +241,7 @@ def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tm
 
 
 def test_runs_on_other_scenes_are_not_reported_together(run, dataset, tmp_path):
-    other = changed(run, tmp_path, "run.json", lambda t: t.replace(dataset.sha256, "f" * 64))
+    other = edited(run, tmp_path, "run.json", lambda t: t.replace(dataset.sha256, "f" * 64))
     with pytest.raises(UserError, match="are not of the same scenes") as error:
         gather([run, other])
     assert "report them apart" in str(error.value)
@@ -208,18 +252,27 @@ def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
     assert (visible(None), visible(True), visible(0.5)) == ("–", "yes", 0.5)
 
 
-def test_a_lone_surrogate_in_an_answer_does_not_break_the_page(dataset, tmp_path):
-    run = write_run(tmp_path / "run", dataset, change=lambda s, v, answer: answer | {"raw": "\ud800"})
-    assert {a["raw"] for d in details(written(run)).values() for a in d["runs"][0]["answers"]} == {"\ud800"}
+def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset):
+    [request] = list(requests(spec_of(dataset), dataset.scenes[:1]))[:1]
+    answer = answer_of(request, Completion(request.id, "I\ud800", None, None, "stop", None, 1))
+    assert answer.raw == "I?"
 
 
-def scored(run, *scores):
-    return replace(run, scores=tuple(Score(*s, n=2, n_excluded=0, interval="episodes") for s in scores))
+def scored(run, tmp_path, *scores):
+    """The run with another summary."""
+    found = [
+        Score(condition, metric, value, low, high, 2, 0, "episodes")
+        for condition, metric, value, low, high in scores
+    ]
+    copy = copied(run, tmp_path)
+    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.variant))
+    return read(copy)
 
 
-def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run):
+def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("6g", "success_rate", 0.94, 0.88, 0.97),
         ("6g", "latency_proxy_ms", 151.4, 151.0, 151.8),
@@ -232,9 +285,10 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
     )
 
 
-def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run):
+def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("v2x", "success_rate", 0.70, 0.60, 0.78),
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
@@ -242,9 +296,10 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run):
     assert headline(found).endswith("a gap of 2.0 points (-3.0 to 7.0 points), which may be chance.")
 
 
-def test_where_nothing_beats_driving_alone_the_headline_says_so(run):
+def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
     found = scored(
-        read(run),
+        run,
+        tmp_path,
         ("single-local", "success_rate", 0.7, None, None),
         ("6g", "success_rate", 0.7, None, None),
     )
@@ -256,11 +311,11 @@ def test_where_nothing_beats_driving_alone_the_headline_says_so(run):
     ("latency", "words"),
     [
         (
-            {"source": "card", "inference_s": {"ego": 0.145, "helper": 0.2}, "basis": "cited"},
+            Latency("card", "cited", 0.145, 0.2),
             "ego 145 ms, helper 200 ms; stated by the model card, not measured here (cited)",
         ),
         (
-            {"source": "measured", "inference_s": None, "basis": "batch 1"},
+            Latency("measured", "batch 1", None, None),
             "each answer has its own time; measured where it ran, one answer at a time (batch 1)",
         ),
     ],
@@ -269,10 +324,13 @@ def test_the_source_of_latency_in_words(latency, words):
     assert latency_source(latency) == words
 
 
-def changed(run, tmp_path, name, edit):
-    """A copy of a run with one file edited."""
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
+def copied(run, tmp_path):
+    return shutil.copytree(run, tmp_path / "copy")
+
+
+def edited(run, tmp_path, name, edit):
+    """A copy of a run with one text file edited."""
+    copy = copied(run, tmp_path)
     (copy / name).write_text(edit((copy / name).read_text()))
     return copy
 
@@ -282,34 +340,104 @@ def changed(run, tmp_path, name, edit):
     [
         (
             "run.json",
-            lambda t: t.replace("swarmdrive-run/1", "swarmdrive-run/9"),
+            lambda t: t.replace("swarmdrive-run/2", "swarmdrive-run/9"),
             "has format 'swarmdrive-run/9'",
+        ),
+        (
+            "run.json",
+            lambda t: t.replace("swarmdrive-run/2", "swarmdrive-run/1"),
+            "has format 'swarmdrive-run/1', .*harness 0.1 reads it: run again, or install that version",
         ),
         ("run.json", lambda t: "[]", "has format 'None'"),
         ("run.json", lambda t: t[:50], "run.json is broken"),
-        ("run.json", lambda t: t.replace('"seeds"', '"seed"'), "run.json lacks seeds"),
-        ("rows.jsonl", lambda t: t[:-40], "rows.jsonl line 12 is broken"),
-        ("rows.jsonl", lambda t: "", "holds no decisions"),
-        ("rows.jsonl", lambda t: t.replace('"scene": "00000-0"', '"scene": "x"'), "has scene 'x'"),
-        ("summary.csv", lambda t: t.replace("ci_low", "low"), "summary.csv is broken"),
+        ("run.json", lambda t: t.replace('"seeds"', '"seed"'), "run.json is broken .*`seeds`"),
+        ("run.json", lambda t: t.replace("brakes", r"\ud800"), "run.json is broken"),
+        ("answers.jsonl", lambda t: t[:-40], "answers.jsonl is broken"),
+        ("answers.jsonl", lambda t: t.replace('"verdict"', '"said"'), "answers.jsonl is broken .*`verdict`"),
+        ("answers.jsonl", lambda t: t.replace('"strict"', '"stern"'), "answers.jsonl is broken .*'stern'"),
+        ("answers.jsonl", lambda t: t.replace("would", r"\ud800"), "answers.jsonl is broken"),
+        ("answers.jsonl", lambda t: t.replace('"intent":[', '"intent":[0.0,'), "has 4 probabilities"),
+        ("decisions.parquet", lambda t: t[:-40], "decisions.parquet is broken"),
+        ("decisions.parquet", lambda t: "", "decisions.parquet is broken"),
+        ("summary.csv", lambda t: t.replace("ci_low", "low"), "summary.csv is broken .*ci_low"),
         (
-            "rows.jsonl",
-            lambda t: t.replace('"v2x"', '"v3x"'),
-            "line 1 is broken .a decision of 'v3x' with seed 0",
+            "episodes.csv",
+            lambda t: t.replace("layout_seed", "layout"),
+            "episodes.csv is broken .*layout_seed",
         ),
-        ("rows.jsonl", lambda t: t.replace('"action": "', '"action": "X'), "line 1 is broken .a decision of"),
-        ("rows.jsonl", lambda t: t.replace('"verdict"', '"said"'), "line 1 is broken .verdict missing"),
-        ("rows.jsonl", lambda t: t.replace('"on_time"', '"when"'), "is broken .on_time missing"),
     ],
 )
 def test_a_broken_run_is_one_line_that_names_the_file(run, tmp_path, name, edit, message):
+    copy = copied(run, tmp_path)
+    data = (copy / name).read_bytes().decode("latin-1")
+    (copy / name).write_bytes(edit(data).encode("latin-1"))
     with pytest.raises(UserError, match=message) as error:
-        written(changed(run, tmp_path, name, edit))
+        written(copy)
+    assert "\n" not in str(error.value)
+
+
+def set_in_first(name, value):
+    """Changes a column of the first decision."""
+
+    def decision(row):
+        if (row["scene"], row["condition"], row["seed"]) == ("00000-0", "v2x", 0):
+            row[name] = value
+
+    return decision
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda d: d.take(np.arange(0)),
+            "decisions.parquet is broken .not every decision of episodes.csv is there",
+        ),
+        (lambda d: d.take(range(1, len(d))), "broken .not every decision of episodes.csv is there"),
+        (lambda d: d.take([0, *range(len(d))]), "broken .a decision is there twice"),
+    ],
+)
+def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
+    copy = copied(run, tmp_path)
+    change(read(run).decisions).write(copy / "decisions.parquet")
+    with pytest.raises(UserError, match=message) as error:
+        written(copy)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("decision", "message"),
+    [
+        (
+            lambda row: row.update(scene="x") if row["scene"] == "00000-0" else None,
+            "decisions.parquet has scene 'x', which its dataset has not; make the run again",
+        ),
+        (set_in_first("condition", "v3x"), "decisions.parquet is broken .unknown condition 'v3x'"),
+        (set_in_first("seed", 9), "decisions.parquet is broken .a decision of another seed or episode"),
+        (set_in_first("action", "XIDLE"), "decisions.parquet is broken .unknown action 'XIDLE'"),
+        (set_in_first("action", None), "decisions.parquet is broken .action is unknown in some rows"),
+        (set_in_first("latency_ms", math.inf), "decisions.parquet is broken .latency_ms is infinite"),
+    ],
+)
+def test_a_broken_decision_is_one_line_that_names_the_file(run, tmp_path, decision, message):
+    copy = copied(run, tmp_path)
+    change(copy, decision)
+    with pytest.raises(UserError, match=message) as error:
+        written(copy)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("column", ["on_time_1", "fused_IDLE", "triggered"])
+def test_a_missing_column_is_named(run, tmp_path, column):
+    copy = copied(run, tmp_path)
+    pq.write_table(read(run).decisions.table.drop_columns([column]), copy / "decisions.parquet")
+    with pytest.raises(UserError, match=rf"decisions.parquet is broken .it lacks {column}") as error:
+        written(copy)
     assert "\n" not in str(error.value)
 
 
 def test_a_run_on_another_dataset_than_lies_there_is_refused(run, tmp_path):
-    other = changed(run, tmp_path, "run.json", lambda t: t.replace('"sha256": "', '"sha256": "0'))
+    other = edited(run, tmp_path, "run.json", lambda t: t.replace('"sha256": "', '"sha256": "0'))
     with pytest.raises(UserError, match=r"is not the one that .* was made on"):
         gather([other])
 
@@ -322,10 +450,20 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     assert done.output == f"wrote {out}\n"
     assert out.is_file()
     for arguments, message in (
-        ([tmp_path], r"is no run: it has no run.json"),
+        ([tmp_path], r"is no finished run: it has no run.json"),
         ([run, "--out", tmp_path], "is a folder; name a file in it"),
         ([run, "--out", out / "page.html"], "cannot be written"),
         ([run, run.parent], "2 runs and no --out; name the file to write"),
     ):
         with pytest.raises(UserError, match=message):
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+
+
+def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(run, tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from harness.cli.report import write;"
+        f"write([Path({str(run)!r})], Path({str(tmp_path / 'page.html')!r}), quiet=True);"
+        "print(sorted({'matplotlib', 'highway_env', 'gymnasium', 'pandas', 'torch'} & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert said.stdout == "[]\n"

@@ -6,6 +6,7 @@ import pytest
 
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 FIRST_SEED = 178  # left, none, left, right, left, oncoming
 
@@ -13,7 +14,7 @@ FIRST_SEED = 178  # left, none, left, right, left, oncoming
 @pytest.fixture(scope="session")
 def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("built") / "small-v1"
-    build(folder, 6, FIRST_SEED, 1, lambda done: None)
+    build(SCENARIO, folder, 6, FIRST_SEED, 1, lambda done: None)
     return folder
 
 

@@ -81,7 +81,7 @@ def test_a_damaged_dataset_is_told_line_by_line_with_exit_code_1(harness, small_
     lines = out.splitlines()
     assert (code, err) == (1, "")
     assert lines[0] == "scenes.jsonl: changed, its sha256 is not the manifest's"
-    assert lines[1].startswith("scenes.jsonl line 37 at $: 'behaviour' is a required property")
+    assert lines[1] == "scenes.jsonl line 37: record has no episode; add it"
     assert lines[-2:] == [
         "scenes.jsonl line 38: cut off",
         "scenes.jsonl: 38 decision points, the manifest says 36",

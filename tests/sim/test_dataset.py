@@ -20,6 +20,7 @@ from harness.dataset.load import find, load
 from harness.dataset.verify import check
 from harness.world.perception.graph import scene_graph
 from harness.world.reference import finish
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
 FIRST_SEED = 178
@@ -46,7 +47,7 @@ def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_a
     assert not (out / "manifest.json").exists()
     finished = len(list(out.glob(".building/0*.jsonl")))
     progress = []
-    build(out, 6, FIRST_SEED, 2, progress.append)
+    build(SCENARIO, out, 6, FIRST_SEED, 2, progress.append)
     assert (progress[0], sum(progress)) == (finished, 6)
     assert contents(out) == contents(small_folder)
 
@@ -55,13 +56,13 @@ def test_a_build_begun_with_other_settings_is_not_continued(tmp_path):
     (tmp_path / "begun" / ".building").mkdir(parents=True)
     (tmp_path / "begun" / ".building" / "config.json").write_text("{}")
     with pytest.raises(UserError, match="begun with other settings"):
-        build(tmp_path / "begun", 1, 0, 1, lambda done: None)
+        build(SCENARIO, tmp_path / "begun", 1, 0, 1, lambda done: None)
 
 
 def test_a_finished_dataset_is_not_built_over(small_folder):
     before = contents(small_folder)
     with pytest.raises(UserError, match="already holds a finished dataset"):
-        build(small_folder, 6, FIRST_SEED, 1, lambda done: None)
+        build(SCENARIO, small_folder, 6, FIRST_SEED, 1, lambda done: None)
     assert contents(small_folder) == before
 
 
@@ -71,7 +72,7 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
     (tmp_path / "file").write_text("mine")
     for name, why in {"notes": "other files", "file": "is a file", "a b": "cannot name a dataset"}.items():
         with pytest.raises(UserError, match=why):
-            build(tmp_path / name, 1, 0, 1, lambda done: None)
+            build(SCENARIO, tmp_path / name, 1, 0, 1, lambda done: None)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "mine.txt", "notes"]
 
 
@@ -80,7 +81,7 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
 
 def test_a_built_dataset_is_sound_and_has_all_its_decision_points(small, small_folder):
     assert check(small_folder) == []
-    assert (small.manifest["episodes"], small.manifest["decisions"], len(small.scenes)) == (6, 36, 36)
+    assert (small.manifest.episodes, small.manifest.decisions, len(small.scenes)) == (6, 36, 36)
     assert [s.id for s in small.scenes[:7]] == [f"00000-{n}" for n in range(6)] + ["00001-0"]
     assert {s.record["episode_seed"] for s in small.scenes} == set(range(FIRST_SEED, FIRST_SEED + 6))
 
@@ -89,7 +90,7 @@ def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
     for scene in small.scenes[::5]:
         assert scene.viewers == ("v1", "v2", "v3", "v4")
         for viewer in scene.viewers:
-            graph = scene_graph(scene.state, viewer)
+            graph = scene_graph(SCENARIO, scene.state, viewer)
             assert canonical_json(graph) == canonical_json(scene.record["graphs"][viewer])
 
 
@@ -101,7 +102,7 @@ def test_no_graph_says_minus_zero(small):
 def test_outcomes_in_a_record_are_what_its_thawed_state_comes_to(small):
     for scene in (small.scenes[2], small.scenes[27], small.scenes[34]):
         for action in small.actions:
-            world = World.thaw(scene.state, scene.record["snapshot"])
+            world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
             world.act(action)
             outcome = finish(world, "full-view")
             row = scene.record["outcomes"][action]
@@ -172,7 +173,7 @@ def test_one_driver_leads_until_the_guard_acts_and_then_full_view_does(small):
     ],
 )
 def test_a_share_of_one_is_always_and_of_none_is_never(behaviour, reasons):
-    records = freeze(179, 0, behaviour)  # no danger: there the guard only stops a late SLOWER
+    records = freeze(SCENARIO, 179, 0, behaviour)  # no danger: there the guard only stops a late SLOWER
     assert {record["behaviour"]["reason"] for record in records} <= reasons
     assert records[0]["behaviour"]["reason"] in reasons - {"guard"}
 
@@ -323,7 +324,7 @@ def test_a_record_that_is_not_what_it_should_be_is_named_by_line_and_never_used(
         load(copy)
 
 
-HOSTILE_MANIFESTS = {
+HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "a path upwards": {"files": {"../../etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "an absolute path": {"files": {"/etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
     "a folder": {"files": {"..": "0" * 64, "scenes.jsonl": "0" * 64}},

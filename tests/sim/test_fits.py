@@ -1,13 +1,17 @@
-"""The quick yes to a record is never a yes that JSON Schema would not give."""
+"""What is read of a dataset is what its published JSON Schemas allow, as released and as written today."""
 
 import copy
+import json
 from typing import Any
 
+import msgspec
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+from jsonschema.validators import extend
 
-from harness.dataset.load import Dataset
-from harness.dataset.schema import fits_record, record_validator
+from harness.dataset.load import Dataset, find
+from harness.dataset.schema import Manifest, manifest_schema, record_schema, record_type
 
 LEAF = (
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.sampled_from(["v1", "left"])
@@ -25,14 +29,67 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [p for key, inner in pairs for p in ((*path, key), *places(inner, (*path, key)))]
 
 
-def test_it_says_yes_to_every_frozen_record(small: Dataset):
-    assert all(map(fits_record(small.actions), (scene.record for scene in small.scenes)))
+RELEASED = find("occluded-intersection-v1")
+TYPES = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
+WholeNumbers: Any = extend(Draft202012Validator, type_checker=TYPES)  # to which 1.0 is no integer
+
+
+def released_schema(name: str) -> Any:
+    return json.loads((RELEASED / f"{name}.schema.json").read_text())
+
+
+def fits(value: Any, kind: type) -> bool:
+    try:
+        msgspec.json.decode(json.dumps(value), type=kind)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def test_the_published_schemas_are_schemas_and_allow_what_is_released(small: Dataset):
+    record = json.loads((RELEASED / "scenes.jsonl").read_text().partition("\n")[0])
+    manifest = json.loads((RELEASED / "manifest.json").read_text())
+    for schema, value in ((record_schema(small.scenario), record), (manifest_schema(), manifest)):
+        Draft202012Validator.check_schema(schema)
+        WholeNumbers(schema).validate(value)
+
+
+def test_every_frozen_record_fits(small: Dataset):
+    assert all(fits(scene.record, record_type(small.scenario)) for scene in small.scenes)
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
-def test_where_it_says_yes_to_a_changed_record_so_does_json_schema(small: Dataset, data: st.DataObject):
-    record = copy.deepcopy(data.draw(st.sampled_from(small.scenes)).record)
+def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
+    record = changed(data.draw(st.sampled_from(small.scenes)).record, data)
+    now = WholeNumbers(record_schema(small.scenario))
+    if WholeNumbers(released_schema("scene")).is_valid(record):
+        assert now.is_valid(record)
+    if now.is_valid(record):
+        assert fits(record, record_type(small.scenario))
+    whose = (record.get("behaviour"), record.get("outcomes"))
+    if fits(record, record_type(small.scenario)):  # what the actions are stands in the manifest
+        actions = {whose[0]["action"], *whose[1]}
+        assert now.is_valid(record) == (actions == set(small.actions))
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_a_changed_manifest_fits_where_the_published_schema_says_so(data: st.DataObject):
+    manifest = changed(json.loads((RELEASED / "manifest.json").read_text()), data)
+    valid = WholeNumbers(manifest_schema()).is_valid(manifest)
+    if WholeNumbers(released_schema("manifest")).is_valid(manifest):
+        assert valid
+    repeated = isinstance(manifest.get("actions"), list) and len(manifest["actions"]) > len(
+        set(map(str, manifest["actions"]))
+    )
+    if not repeated and "scenes.jsonl" in (manifest.get("files") or ()):
+        assert fits(manifest, Manifest) == valid
+
+
+def changed(value: Any, data: st.DataObject) -> Any:
+    """A copy with one value changed, taken out or added."""
+    record = copy.deepcopy(value)
     *way, last = data.draw(st.sampled_from(places(record)))
     holder = record
     for key in way:
@@ -44,5 +101,4 @@ def test_where_it_says_yes_to_a_changed_record_so_does_json_schema(small: Datase
         holder["unknown"] = data.draw(ANY_JSON)
     else:
         holder[last] = data.draw(ANY_JSON)
-    if fits_record(small.actions)(record):
-        assert record_validator(small.actions).is_valid(record)
+    return record

@@ -71,9 +71,14 @@ def arrays(episode):
     return safe, np.where(safe, delay_s, np.nan), avoidable | safe
 
 
+def judged(episode):
+    safe, delay_s, avoidable = arrays(episode)
+    return judge(safe, delay_s, avoidable, 1.0)
+
+
 @given(decisions)
 def test_exactly_one_verdict_holds(episode):
-    found = judge(*arrays(episode), 1.0)
+    found = judged(episode)
     assert int(found.success) + int(found.unsafe) + int(found.late) == 1
 
 
@@ -91,7 +96,7 @@ def test_adding_delay_never_turns_failure_into_success(episode, which, frames):
 def test_the_order_of_decisions_changes_nothing(episode, random):
     shuffled = list(episode)
     random.shuffle(shuffled)
-    before, after = judge(*arrays(episode), 1.0), judge(*arrays(shuffled), 1.0)
+    before, after = judged(episode), judged(shuffled)
     assert (before.success, before.unsafe, before.late) == (after.success, after.unsafe, after.late)
 
 

@@ -3,26 +3,27 @@
 from harness.world.drivers import DRIVERS
 from harness.world.outcome import Outcome
 from harness.world.reference import check, drive_all, summary
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():
-    outcomes = drive_all(6)  # a danger from the left
+    outcomes = drive_all(SCENARIO, 6)  # a danger from the left
     assert outcomes["cruise"].result == "collision"
     assert outcomes["full-view"].result == "cleared"
     assert outcomes["brake"].result == "time_out"
 
 
 def test_who_clears_too_long_after_the_full_view_driver_is_late():
-    outcomes = drive_all(6)
+    outcomes = drive_all(SCENARIO, 6)
     assert outcomes["local-view"].result == "late"
     assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
 
 
 def test_a_check_counts_every_episode_once_for_any_number_of_workers():
     done = []
-    alone = check(4, 5, 1, done.append)
+    alone = check(SCENARIO, 4, 5, 1, done.append)
     assert sum(done) == 4
-    assert check(4, 5, 2, lambda n: None) == alone
+    assert check(SCENARIO, 4, 5, 2, lambda n: None) == alone
     for driver in DRIVERS:
         ends = [alone[driver][end] for end in ("success", "collision", "late", "time_out", "off_road")]
         assert sum(e.value for e in ends) == 1.0

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from harness.world.outcome import Outcome, fault, outline, striker
-from harness.world.scenarios.occluded_intersection import Parameters
+from harness.world.scenarios.occluded_intersection import SCENARIO, Parameters
 from harness.world.state import VehicleState
 
 NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
@@ -39,7 +39,7 @@ def test_who_hit_whom(hit):
     other, who, blamed = HITS[hit]
     assert outline(EGO).intersects(outline(other))
     assert striker(EGO, other) == who
-    assert fault(EGO, other) == blamed
+    assert fault(EGO, other, SCENARIO.road().paths) == blamed
 
 
 def test_nobody_strikes_in_a_side_swipe():

@@ -10,6 +10,7 @@ from harness.core.files import canonical_json
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.rays import blocked_by, first_hits, sweep
 from harness.world.perception.sensors import detect
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import Building, VehicleState, WorldState
 from harness.world.world import World
 
@@ -173,15 +174,15 @@ def draws_of(vehicle, n=200):
 
 def test_positions_are_forward_and_to_the_left_and_headings_counter_clockwise():
     # The ego looks north; a car 20 m ahead and 6 m to the left drives east, to the ego's right.
-    (node,) = truth_graph(scene(other(-4.0, 32.0, heading=EAST)))["nodes"]
+    (node,) = truth_graph(SCENARIO, scene(other(-4.0, 32.0, heading=EAST)))["nodes"]
     assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (20.0, 6.0, -90)
-    (node,) = truth_graph(scene(other(2.0, 72.0, heading=WEST)))["nodes"]
+    (node,) = truth_graph(SCENARIO, scene(other(2.0, 72.0, heading=WEST)))["nodes"]
     assert (node["forward_m"], node["left_m"], node["heading_deg"]) == (-20.0, 0.0, 90)
 
 
 def test_a_conflict_has_the_arc_lengths_and_times_of_both():
     # The ego at y 52 has 50 m to the crossing at (2, 2); a car at x −38 has 40 m at 10 m/s.
-    graph = truth_graph(scene(other(-38.0, 2.0, heading=EAST, speed=10.0)))
+    graph = truth_graph(SCENARIO, scene(other(-38.0, 2.0, heading=EAST, speed=10.0)))
     (conflict,) = graph["conflicts"]
     assert (conflict["with"], conflict["sector"], conflict["route"]) == ("v5", "left", "straight")
     assert conflict["point"] == {"forward_m": 50.0, "left_m": 0.0}
@@ -190,20 +191,22 @@ def test_a_conflict_has_the_arc_lengths_and_times_of_both():
 
 
 def test_a_standing_car_has_an_arc_length_and_no_time():
-    (conflict,) = truth_graph(scene(other(-38.0, 2.0, heading=EAST, speed=0.0)))["conflicts"]
+    (conflict,) = truth_graph(SCENARIO, scene(other(-38.0, 2.0, heading=EAST, speed=0.0)))["conflicts"]
     assert conflict["other"] == {"arc_m": 40.0, "time_s": None, "speed_mps": 0.0}
 
 
 def test_an_oncoming_car_is_a_conflict_only_if_it_turns_left():
     straight = other(-2.0, -40.0, heading=SOUTH, approach="oncoming")
-    assert truth_graph(scene(straight))["conflicts"] == []
-    (conflict,) = truth_graph(scene(replace(straight, route="left")))["conflicts"]
+    assert truth_graph(SCENARIO, scene(straight))["conflicts"] == []
+    (conflict,) = truth_graph(SCENARIO, scene(replace(straight, route="left")))["conflicts"]
     assert (conflict["sector"], conflict["route"]) == ("oncoming", "left")
 
 
 def test_a_car_that_has_passed_the_conflict_point_is_none():
-    assert truth_graph(scene(other(10.0, 2.0, heading=EAST)))["conflicts"] == []
-    assert truth_graph(scene(other(6.0, 2.0, heading=EAST)))["conflicts"] != []  # its tail is still there
+    assert truth_graph(SCENARIO, scene(other(10.0, 2.0, heading=EAST)))["conflicts"] == []
+    assert (
+        truth_graph(SCENARIO, scene(other(6.0, 2.0, heading=EAST)))["conflicts"] != []
+    )  # its tail is still there
 
 
 def test_lanes_are_named_from_the_egos_seat_and_off_the_road_there_is_none():
@@ -215,13 +218,13 @@ def test_lanes_are_named_from_the_egos_seat_and_off_the_road_there_is_none():
         "off-lane": other(30.0, 30.0),
     }
     for lane, vehicle in lanes.items():
-        assert truth_graph(scene(vehicle))["nodes"][0]["lane"] == lane
+        assert truth_graph(SCENARIO, scene(vehicle))["nodes"][0]["lane"] == lane
 
 
 def test_a_helper_judges_the_egos_conflicts_from_its_own_seat():
     helper = replace(other(30.0, 2.0, heading=EAST, vehicle="v2"), part="helper")
     danger = other(-38.0, 2.0, heading=EAST)
-    graph = scene_graph(scene(helper, danger), "v2")
+    graph = scene_graph(SCENARIO, scene(helper, danger), "v2")
     (conflict,) = graph["conflicts"]
     assert (graph["role"], conflict["with"], conflict["sector"]) == ("helper", "v5", "left")
     assert conflict["ego"] == {"arc_m": 50.0, "time_s": 3.6}  # by the request, so without noise
@@ -231,7 +234,7 @@ def test_a_helper_judges_the_egos_conflicts_from_its_own_seat():
 
 def test_a_sector_behind_a_building_is_occluded_by_it_and_an_open_one_is_not():
     corner = Building("b1", west_m=-70.0, north_m=8.0, east_m=-8.0, south_m=70.0)
-    sectors = {s["sector"]: s for s in scene_graph(scene(buildings=[corner]), "v1")["sectors"]}
+    sectors = {s["sector"]: s for s in scene_graph(SCENARIO, scene(buildings=[corner]), "v1")["sectors"]}
     assert sectors["left"]["occluded"]
     assert sectors["left"]["by"] == ["b1"]
     assert sectors["left"]["seen_share"] < 0.5
@@ -240,7 +243,7 @@ def test_a_sector_behind_a_building_is_occluded_by_it_and_an_open_one_is_not():
 
 def test_a_reported_truck_hides_a_stretch_of_a_sector_and_is_named():
     truck = other(-2.0, -20.0, heading=SOUTH, kind="truck", approach="oncoming")
-    sectors = {s["sector"]: s for s in scene_graph(scene(truck), "v1")["sectors"]}
+    sectors = {s["sector"]: s for s in scene_graph(SCENARIO, scene(truck), "v1")["sectors"]}
     assert sectors["oncoming"]["by"] == ["v5"]
     assert sectors["oncoming"]["seen_share"] < 1.0
 
@@ -255,16 +258,16 @@ def without(state, vehicle):
 def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
     hidden = 0
     for seed in range(24):
-        world = World.start(seed)
+        world = World.start(SCENARIO, seed)
         for action in ("IDLE", "SLOWER", "IDLE", "FASTER", "IDLE"):
             state = world.state()
             for viewer in (state.ego, *state.helpers):
-                graph = scene_graph(state, viewer.id)
+                graph = scene_graph(SCENARIO, state, viewer.id)
                 listed = {node["id"] for node in graph["nodes"]} | {viewer.id, state.ego.id}
                 for v in state.vehicles:
                     if v.id not in listed:
                         hidden += 1
-                        less = scene_graph(without(state, v.id), viewer.id)
+                        less = scene_graph(SCENARIO, without(state, v.id), viewer.id)
                         assert canonical_json(less) == canonical_json(graph), (
                             seed,
                             state.step,
@@ -280,18 +283,18 @@ def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
 def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_does_not_see_it():
     hidden_steps = 0
     for seed in range(24):
-        world = World.start(seed)
-        danger = world.env.layout.danger_id
+        world = World.start(SCENARIO, seed)
+        danger = world.layout.danger_id
         if danger is None:
             continue
         harmless = world.branch()
-        vehicles = harmless.env.road.vehicles
+        vehicles = harmless.road.vehicles
         vehicles[:] = [v for v in vehicles if v.spawn.id != danger]
         for _ in range(4):
-            graph = scene_graph(world.state(), "v1")
+            graph = scene_graph(SCENARIO, world.state(), "v1")
             if danger not in {node["id"] for node in graph["nodes"]}:
                 hidden_steps += 1
-                assert canonical_json(scene_graph(harmless.state(), "v1")) == canonical_json(graph)
+                assert canonical_json(scene_graph(SCENARIO, harmless.state(), "v1")) == canonical_json(graph)
             world.act("IDLE")
             harmless.act("IDLE")
     assert hidden_steps > 40
@@ -299,11 +302,11 @@ def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_doe
 
 def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
     for seed in (1, 6, 10, 11):
-        world = World.start(seed)
+        world = World.start(SCENARIO, seed)
         for _ in range(4):
             state = world.state()
             for viewer in (state.ego, *state.helpers):
-                graph = scene_graph(state, viewer.id)
+                graph = scene_graph(SCENARIO, state, viewer.id)
                 known = {node["id"] for node in graph["nodes"]}
                 assert {c["with"] for c in graph["conflicts"]} <= known
                 hiding = {name for s in graph["sectors"] for name in s["by"]}
@@ -314,14 +317,17 @@ def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
 def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions_before():
     dangers = hidden = helped = 0
     for seed in range(40):
-        world = World.start(seed)
-        danger = world.env.layout.danger_id
+        world = World.start(SCENARIO, seed)
+        danger = world.layout.danger_id
         if danger is None:
             continue
         world.act("IDLE")
         world.act("IDLE")
         state = world.state()
-        views = [{n["id"] for n in scene_graph(state, v.id)["nodes"]} for v in (state.ego, *state.helpers)]
+        views = [
+            {n["id"] for n in scene_graph(SCENARIO, state, v.id)["nodes"]}
+            for v in (state.ego, *state.helpers)
+        ]
         dangers += 1
         hidden += danger not in views[0]
         helped += any(danger in view for view in views[1:])

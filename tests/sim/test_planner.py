@@ -8,18 +8,18 @@ import pytest
 from harness.world.drivers import DRIVERS, choose
 from harness.world.perception.graph import truth_graph
 from harness.world.planner import DISC_RADIUS_M, MARGIN_M, STEP_S, least_gap, plan, rollouts
-from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
 
-P = Parameters()
+P, ACTIONS = SCENARIO.parameters, SCENARIO.actions
 EGO = VehicleState("v1", "car", "ego", 2.0, 44.0, -np.pi / 2, 14.0, "own", "straight")  # 42 m before (2, 2)
 
 CLOSE = replace(EGO, y_m=24.0)  # 22 m before
 
 
 def graph(*others, ego=EGO, target_mps=14.0, step=1):
-    return truth_graph(WorldState("by hand", 0, step, float(step), target_mps, (ego, *others), ()))
+    return truth_graph(SCENARIO, WorldState("by hand", 0, step, float(step), target_mps, (ego, *others), ()))
 
 
 def from_left(x_m, speed_mps=10.0):
@@ -27,43 +27,43 @@ def from_left(x_m, speed_mps=10.0):
 
 
 def test_on_an_empty_road_it_keeps_going():
-    assert plan(graph(), ACTIONS) == "IDLE"
+    assert plan(SCENARIO, graph()) == "IDLE"
 
 
 def test_it_speeds_up_on_an_empty_road_when_slow():
-    assert plan(graph(ego=replace(EGO, speed_mps=7.0), target_mps=7.0), ACTIONS) == "FASTER"
+    assert plan(SCENARIO, graph(ego=replace(EGO, speed_mps=7.0), target_mps=7.0)) == "FASTER"
 
 
 def test_it_slows_for_a_car_that_it_would_meet_and_not_before_it_must():
     # 42 m before the crossing there is a second left to wait and see; 22 m before it there is none.
-    assert plan(graph(from_left(2.0 - 30.0)), ACTIONS) == "IDLE"
-    assert plan(graph(from_left(2.0 - 15.7), ego=CLOSE), ACTIONS) == "SLOWER"
+    assert plan(SCENARIO, graph(from_left(2.0 - 30.0))) == "IDLE"
+    assert plan(SCENARIO, graph(from_left(2.0 - 15.7), ego=CLOSE)) == "SLOWER"
 
 
 def test_it_keeps_going_before_a_car_that_comes_much_later_and_behind_one_that_has_passed():
-    assert plan(graph(from_left(2.0 - 60.0)), ACTIONS) == "IDLE"
-    assert plan(graph(from_left(2.0 - 12.0)), ACTIONS) == "IDLE"
+    assert plan(SCENARIO, graph(from_left(2.0 - 60.0))) == "IDLE"
+    assert plan(SCENARIO, graph(from_left(2.0 - 12.0))) == "IDLE"
 
 
 def test_it_does_not_guess_at_what_the_graph_does_not_list():
     hidden = graph(from_left(2.0 - 15.7), ego=CLOSE)
     hidden["conflicts"] = []
-    assert plan(hidden, ACTIONS) == "IDLE"
+    assert plan(SCENARIO, hidden) == "IDLE"
 
 
 def test_where_every_way_ends_in_a_collision_it_takes_the_one_with_the_widest_gap():
     # 14 m before the crossing, with a car 10 m from it: too late for anything but the least of evils.
     scene = graph(from_left(2.0 - 10.0), ego=replace(EGO, y_m=16.0))
     (conflict,) = scene["conflicts"]
-    gaps = {a: least_gap(rollouts([(a,)], 14.0, 14.0, 5, P), conflict)[0] for a in ACTIONS}
+    gaps = {a: least_gap(SCENARIO.road(), rollouts([(a,)], 14.0, 14.0, 5, P), conflict)[0] for a in ACTIONS}
     assert max(gaps.values()) < 0.0
-    assert gaps[plan(scene, ACTIONS)] == max(gaps.values())
+    assert gaps[plan(SCENARIO, scene)] == max(gaps.values())
 
 
 @pytest.mark.parametrize("first", ACTIONS)
 @pytest.mark.parametrize("second", ACTIONS)
 def test_its_model_of_motion_follows_the_simulator(first, second):
-    world = World.start(0)
+    world = World.start(SCENARIO, 0)
     start = world.state().ego.y_m
     (travelled,) = rollouts([(first, second)], 14.0, 14.0, P.decisions, P)
     for seconds, action in enumerate((first, second, "FASTER"), 1):
@@ -77,18 +77,20 @@ def test_the_gap_to_a_car_standing_on_the_crossing_is_what_the_discs_leave():
     (conflict,) = graph(from_left(2.0, speed_mps=0.0))["conflicts"]
     travelled = np.full((1, 90), conflict["ego"]["arc_m"] - 20.0)
     expected = 20.0 - 5.0 / 3 - 2 * DISC_RADIUS_M - MARGIN_M
-    assert least_gap(travelled, conflict) == pytest.approx([expected], abs=0.1)
+    assert least_gap(SCENARIO.road(), travelled, conflict) == pytest.approx([expected], abs=0.1)
 
 
 def test_an_ego_on_top_of_another_has_a_gap_below_zero():
     (conflict,) = graph(from_left(2.0, speed_mps=0.0))["conflicts"]
     travelled = np.full((1, 90), conflict["ego"]["arc_m"])
-    assert least_gap(travelled, conflict) == pytest.approx([-2 * DISC_RADIUS_M - MARGIN_M], abs=0.1)
+    assert least_gap(SCENARIO.road(), travelled, conflict) == pytest.approx(
+        [-2 * DISC_RADIUS_M - MARGIN_M], abs=0.1
+    )
 
 
 def test_only_the_full_view_driver_reads_the_truth():
     hidden, truth = graph(ego=CLOSE), graph(from_left(2.0 - 15.7), ego=CLOSE)
-    chosen = {driver: choose(driver, hidden, truth, ACTIONS) for driver in DRIVERS}
+    chosen = {driver: choose(SCENARIO, driver, hidden, truth) for driver in DRIVERS}
     assert chosen == {"cruise": "IDLE", "brake": "SLOWER", "local-view": "IDLE", "full-view": "SLOWER"}
     with pytest.raises(ValueError, match="reads the truth"):
-        choose("full-view", hidden, None, ACTIONS)
+        choose(SCENARIO, "full-view", hidden, None)

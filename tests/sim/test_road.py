@@ -8,8 +8,7 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.world.outcome import PRIORITY
-from harness.world.road import APPROACHES, ARM_M, ROUTES, conflict_zone, crossings, paths
+from harness.world.crossroads import APPROACHES, ARM_M, ROUTES, paths, road
 
 KEYS = [(approach, route) for approach in APPROACHES for route in ROUTES]
 
@@ -30,7 +29,7 @@ def lanes(network, approach, route):
 @pytest.mark.parametrize(("approach", "route"), KEYS)
 def test_a_path_runs_along_the_middle_of_highway_envs_lanes(network, approach, route):
     path = paths()[approach, route]
-    starts = (0.0, *path.junction_m)
+    starts = (0.0, *path.ends_m)
     for lane, start in zip(lanes(network, approach, route), starts, strict=True):
         for along in np.linspace(0.0, lane.length, 9)[1:-1]:
             x, y, heading = path.at(start + along)
@@ -40,7 +39,7 @@ def test_a_path_runs_along_the_middle_of_highway_envs_lanes(network, approach, r
 
 @pytest.mark.parametrize(("approach", "route"), KEYS)
 def test_the_right_of_way_is_highway_envs(network, approach, route):
-    assert lanes(network, approach, route)[1].priority == PRIORITY[approach][route]
+    assert lanes(network, approach, route)[1].priority == paths()[approach, route].priority
 
 
 def test_conflict_points_lie_where_geometry_puts_them():
@@ -53,23 +52,23 @@ def test_conflict_points_lie_where_geometry_puts_them():
         ("oncoming", "left"): (2.0, -dip, 111.0 + dip, 100.0 + turned),
         ("right", "left"): (2.0, dip, 111.0 - dip, 100.0 + 13 * math.pi / 2 - turned),
     }
-    assert crossings().keys() == by_hand.keys()  # the others merge with the ego's lane or never meet it
+    assert road().crossings.keys() == by_hand.keys()  # the others merge with the ego's lane or never meet it
     for key, expected in by_hand.items():
-        c = crossings()[key]
+        c = road().crossings[key]
         assert (c.x_m, c.y_m, c.ego_arc_m) == pytest.approx(expected[:3], abs=0.005)
 
 
 def test_arc_lengths_to_the_conflict_points_are_those_of_the_lanes():
-    assert crossings()["left", "straight"].other_arc_m == pytest.approx(113.0, abs=0.01)
-    assert crossings()["right", "straight"].other_arc_m == pytest.approx(109.0, abs=0.01)
+    assert road().crossings["left", "straight"].other_arc_m == pytest.approx(113.0, abs=0.01)
+    assert road().crossings["right", "straight"].other_arc_m == pytest.approx(109.0, abs=0.01)
     on_circle = 13 * math.atan2(math.sqrt(13**2 - 9**2), 9)
-    assert crossings()["oncoming", "left"].other_arc_m == pytest.approx(100.0 + on_circle, abs=0.05)
+    assert road().crossings["oncoming", "left"].other_arc_m == pytest.approx(100.0 + on_circle, abs=0.05)
 
 
 def test_the_conflict_zone_is_the_centroid_of_the_three_dangers_conflict_points():
     oncoming_y = -(11 - math.sqrt(13**2 - 9**2))
-    assert conflict_zone() == pytest.approx((2.0, oncoming_y / 3), abs=0.01)
-    assert conflict_zone()[1] < 0 < 2.0 + oncoming_y  # between the two crossing lanes
+    assert road().zone_m == pytest.approx((2.0, oncoming_y / 3), abs=0.01)
+    assert road().zone_m[1] < 0 < 2.0 + oncoming_y  # between the two crossing lanes
 
 
 @given(st.sampled_from(KEYS), st.floats(0.0, 200.0), st.floats(-1.5, 1.5))

@@ -7,8 +7,8 @@ import pytest
 
 from harness.core.errors import UserError
 from harness.world import scenarios
-from harness.world.road import SECTORS, crossings
-from harness.world.scenarios.occluded_intersection import ACTIONS, NAME, Parameters, layout
+from harness.world.crossroads import SECTORS, road
+from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
 
 P = Parameters()
 
@@ -25,7 +25,8 @@ def others(found):
 
 def test_the_registry_knows_the_scenario_by_its_files_name():
     assert scenarios.names() == (NAME,)
-    assert scenarios.get(NAME).ACTIONS == ACTIONS
+    assert scenarios.get(NAME) is SCENARIO
+    assert SCENARIO.name == NAME
 
 
 def test_an_unknown_scenario_is_an_error_that_names_the_nearest():
@@ -55,7 +56,7 @@ def test_a_danger_meets_a_cruising_ego_at_the_conflict_point_within_the_drawn_of
     for found in layouts:
         if found.danger_id:
             ego, danger = found.spawns[0], {s.id: s for s in found.spawns}[found.danger_id]
-            at = crossings()[danger.approach, danger.route]
+            at = road().crossings[danger.approach, danger.route]
             ego_s = (at.ego_arc_m - ego.arc_m) / ego.speed_mps
             danger_s = (at.other_arc_m - danger.arc_m) / danger.speed_mps
             assert P.danger_offset_s[0] <= danger_s - ego_s <= P.danger_offset_s[1]

@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 PAGE = (Path(__file__).parents[2] / "docs/scenarios/occluded-intersection.md").read_text()
 
@@ -13,10 +13,10 @@ def test_the_pages_table_has_every_parameter_with_its_value():
     stated = {name.strip("`"): value for name, value in rows.items() if name.startswith("`")}
     values = {
         name: ", ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}"
-        for name, value in asdict(Parameters()).items()
+        for name, value in asdict(SCENARIO.parameters).items()
     }
     assert stated == values
 
 
 def test_the_page_names_the_actions():
-    assert all(f"`{action}`" in PAGE for action in ACTIONS)
+    assert all(f"`{action}`" in PAGE for action in SCENARIO.actions)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.core.files import canonical_json
-from harness.world.road import APPROACHES, ROUTES
+from harness.world.crossroads import APPROACHES, ROUTES
 from harness.world.state import Building, VehicleState, WorldState, rectangle
 
 numbers = st.floats(-1e4, 1e4)

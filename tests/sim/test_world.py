@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,17 +17,18 @@ from harness.core.files import digest
 from harness.world import simulator
 from harness.world.outcome import Outcome, outline
 from harness.world.reference import drive
-from harness.world.scenarios.occluded_intersection import ACTIONS, Parameters
+from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import WorldState
 from harness.world.world import World
 
 NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING = 0, 1, 6, 10  # seeds
-P = Parameters()
+P: Any = SCENARIO.parameters
+ACTIONS = SCENARIO.actions
 
 
 def trajectory(seed, actions=("IDLE", "SLOWER", "FASTER", "IDLE")):
     """States at each decision, as JSON has them."""
-    world = World.start(seed)
+    world = World.start(SCENARIO, seed)
     states = [world.state().to_dict()]
     for action in actions:
         world.act(action)
@@ -37,7 +39,7 @@ def trajectory(seed, actions=("IDLE", "SLOWER", "FASTER", "IDLE")):
 def through_json(world):
     """The world thawed from what is left of it in a file."""
     state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
-    return World.thaw(WorldState.from_dict(state), snapshot)
+    return World.thaw(SCENARIO, WorldState.from_dict(state), snapshot)
 
 
 def advance(world, frames):
@@ -46,22 +48,22 @@ def advance(world, frames):
 
 
 def test_actions_are_highway_envs_by_name_and_order():
-    assert World.start(0).actions == ACTIONS == tuple(IntersectionEnv.ACTIONS.values())
+    assert World.start(SCENARIO, 0).actions == ACTIONS == tuple(IntersectionEnv.ACTIONS.values())
 
 
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_an_episode_starts_at_14_mps_in_the_egos_lane_before_the_first_decision(seed):
-    state = World.start(seed).state()
+    state = World.start(SCENARIO, seed).state()
     assert (state.ego.speed_mps, state.target_speed_mps, state.step, state.time_s) == (14.0, 14.0, 0, 0.0)
     assert (state.ego.id, state.ego.x_m, state.ego.route) == ("v1", 2.0, "straight")
     assert P.ego_start_m[0] <= state.ego.y_m + 0.54 <= P.ego_start_m[1]  # the conflict zone is 0.54 m north
 
 
 def test_the_ego_brakes_and_accelerates_within_its_limits():
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     speeds = [world.state().ego.speed_mps]
     for action in ("SLOWER", "SLOWER", "FASTER", "FASTER", "SLOWER"):
-        world.env.action_type.act(world.env.action_type.actions_indexes[action])
+        world.take(action)
         for _ in range(P.simulation_hz):
             advance(world, 1)
             speeds.append(world.state().ego.speed_mps)
@@ -71,16 +73,16 @@ def test_the_ego_brakes_and_accelerates_within_its_limits():
 
 
 def test_one_decision_lasts_one_second_of_fifty_frames():
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     world.act("IDLE")
     state = world.state()
     assert (state.step, state.time_s, world.frame) == (1, 1.0, 50)
-    assert state.ego.y_m == pytest.approx(World.start(NO_DANGER).state().ego.y_m - 14.0)
+    assert state.ego.y_m == pytest.approx(World.start(SCENARIO, NO_DANGER).state().ego.y_m - 14.0)
 
 
 def test_an_unhindered_cruise_clears_when_the_distance_is_covered():
-    start = World.start(NO_DANGER).state().ego.y_m
-    outcome = drive("cruise", NO_DANGER)
+    start = World.start(SCENARIO, NO_DANGER).state().ego.y_m
+    outcome = drive(SCENARIO, "cruise", NO_DANGER)
     frames = np.ceil((start + 11.0 + P.cleared_m) / 14.0 * P.simulation_hz)
     assert (outcome.result, outcome.time_s) == ("cleared", pytest.approx(frames / P.simulation_hz))
 
@@ -94,7 +96,7 @@ def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
             for _ in range(3):
                 env.step(1)
             env.close()
-        drive("brake", 3)
+        drive(SCENARIO, "brake", 3)
         here = digest(trajectory(ONCOMING))
     finally:
         IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
@@ -109,7 +111,7 @@ def test_the_same_seed_is_the_same_episode_whatever_ran_before_in_the_process():
 
 def test_a_world_leaves_highway_envs_classes_as_they_were():
     before = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
-    World.start(FROM_LEFT).act("IDLE")
+    World.start(SCENARIO, FROM_LEFT).act("IDLE")
     assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
 
 
@@ -127,7 +129,7 @@ def test_cheap_frames_are_highway_envs_to_the_last_bit(seed, actions, monkeypatc
 
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_a_second_at_once_and_frame_by_frame_are_the_same_second(seed):
-    whole, frames = World.start(seed), World.start(seed)
+    whole, frames = World.start(SCENARIO, seed), World.start(SCENARIO, seed)
     for action in ("SLOWER", "IDLE", "FASTER"):
         whole.act(action)
         frames.take(action)
@@ -137,7 +139,7 @@ def test_a_second_at_once_and_frame_by_frame_are_the_same_second(seed):
 
 
 def test_braking_hard_is_counted_once_each_time_it_begins():
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     for action, so_far in (("IDLE", 0), ("SLOWER", 1), ("IDLE", 1), ("SLOWER", 2), ("FASTER", 2)):
         world.act(action)
         assert world.hard_brakings == so_far
@@ -149,7 +151,7 @@ def test_two_seeds_are_two_episodes():
 
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
-    world = World.start(seed)
+    world = World.start(SCENARIO, seed)
     gaps = []
     while not world.outcome.ended:
         advance(world, 1)
@@ -160,32 +162,32 @@ def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
     assert gaps[-2] > 0.0
     assert gaps[-2] < 0.6  # 28 m/s is 0.56 m a frame, and no two vehicles close faster
     assert gaps[-1] < gaps[-2]
-    assert world.outcome.partner == world.env.layout.danger_id
+    assert world.outcome.partner == world.layout.danger_id
     assert world.outcome.least_gap_m == 0.0
     assert world.outcome.other_crashes == 0
 
 
 @pytest.mark.parametrize(("seed", "blamed"), [(FROM_RIGHT, "ego"), (FROM_LEFT, "ego"), (ONCOMING, "other")])
 def test_a_cruising_ego_owes_way_to_the_crossing_road_and_is_owed_it_by_a_left_turn(seed, blamed):
-    assert drive("cruise", seed).fault == blamed
+    assert drive(SCENARIO, "cruise", seed).fault == blamed
 
 
 def test_an_ego_beside_its_lane_has_left_the_road():
-    world = World.start(NO_DANGER)
-    world.env.road.vehicles[0].position[0] += 6.0
+    world = World.start(SCENARIO, NO_DANGER)
+    world.road.vehicles[0].position[0] += 6.0
     world.act("IDLE")
     assert (world.outcome.result, world.outcome.time_s) == ("off_road", 1 / P.simulation_hz)
 
 
 def test_always_braking_never_arrives():
-    outcome = drive("brake", NO_DANGER)
+    outcome = drive(SCENARIO, "brake", NO_DANGER)
     assert (outcome.result, outcome.time_s, outcome.partner) == ("time_out", P.time_limit_s, None)
     assert outcome.least_gap_m > 10.0
 
 
 def test_running_into_the_car_ahead_is_the_egos_fault_and_its_partner_is_that_car():
-    world = World.start(NO_DANGER)
-    ego, ahead = world.env.road.vehicles[0], world.env.road.vehicles[3]
+    world = World.start(SCENARIO, NO_DANGER)
+    ego, ahead = world.road.vehicles[0], world.road.vehicles[3]
     ahead.position, ahead.speed = ego.position - [0.0, 9.0], 4.0
     world.act("IDLE")
     assert world.outcome.result == "collision"
@@ -193,7 +195,7 @@ def test_running_into_the_car_ahead_is_the_egos_fault_and_its_partner_is_that_ca
 
 
 def test_a_crash_of_two_others_is_counted_apart_and_ends_nothing():
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     head_on(world, apart_m=6.0)
     world.act("IDLE")
     assert [v.id for v in world.state().vehicles if v.crashed] == ["v2", "v3"]
@@ -202,7 +204,7 @@ def test_a_crash_of_two_others_is_counted_apart_and_ends_nothing():
 
 def head_on(world, apart_m):
     """Two helpers drive into each other, far from the ego; `apart_m` is between their bumpers."""
-    first, second = world.env.road.vehicles[1:3]
+    first, second = world.road.vehicles[1:3]
     first.position, first.heading, first.speed = np.array([-40.0, -2.0]), 0.0, 6.0
     second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi - 0.3, 5.0
     asleep_at_the_wheel(world)
@@ -210,14 +212,14 @@ def head_on(world, apart_m):
 
 def asleep_at_the_wheel(world):
     """The two helpers neither steer nor brake."""
-    for vehicle in world.env.road.vehicles[1:3]:
+    for vehicle in world.road.vehicles[1:3]:
         vehicle.speed_control = lambda target_speed: 0.0
         vehicle._steering = lambda lane, along, lateral: 0.0
 
 
 @pytest.mark.parametrize("seed", [FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_a_thawed_world_goes_on_exactly_as_the_one_it_was_taken_from(seed):
-    world = World.start(seed)
+    world = World.start(SCENARIO, seed)
     for behaviour in ("IDLE", "SLOWER", "SLOWER", "FASTER"):
         for action in ACTIONS:
             thawed, original = through_json(world), world.branch()
@@ -233,7 +235,7 @@ def test_a_thawed_world_goes_on_exactly_as_the_one_it_was_taken_from(seed):
 
 def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
     for seed in range(20, 32):
-        world = World.start(seed)
+        world = World.start(SCENARIO, seed)
         for action in ("IDLE", "FASTER", "SLOWER"):
             thawed = through_json(world)
             world.act(action)
@@ -243,7 +245,7 @@ def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
 
 @pytest.mark.parametrize("apart_m", [9.6, 9.7, 9.9, 10.0, 11.0])
 def test_wrecks_that_touch_when_frozen_are_pushed_apart_when_thawed(apart_m):
-    world = World.start(NO_DANGER)
+    world = World.start(SCENARIO, NO_DANGER)
     head_on(world, apart_m)
     world.act("IDLE")
     thawed = through_json(world)
@@ -255,14 +257,14 @@ def test_wrecks_that_touch_when_frozen_are_pushed_apart_when_thawed(apart_m):
 
 
 def test_a_branch_goes_its_own_way():
-    world = World.start(FROM_LEFT)
+    world = World.start(SCENARIO, FROM_LEFT)
     before = world.state()
     world.branch().act("SLOWER")
     assert world.state() == before
 
 
 def test_a_snapshot_is_a_frame_a_section_a_vehicle_and_a_speed_level():
-    world = World.start(ONCOMING)
+    world = World.start(SCENARIO, ONCOMING)
     world.act("SLOWER")
     snapshot = world.snapshot()
     assert snapshot.keys() == {"frame", "sections", "speed_index"}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.coordination.consensus import RULES
+from harness.coordination.consensus import POOLS
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.studies.axes import AXES, axis_of, grid
@@ -48,8 +48,28 @@ def test_values_take_the_axis_unit() -> None:
     assert AXES["consensus"].at(point, "median").consensus == "median"
 
 
+def test_any_setting_is_an_axis_in_its_own_unit() -> None:
+    point = POINTS["6g"]
+    for name, text, settings in (
+        ("radius_m", "20,50", (20.0, 50.0)),
+        ("max_helpers", "0:3", (0, 1, 2, 3)),
+        ("on_demand", "false,true", (False, True)),
+        ("fallback", "uniform,brake", ("uniform", "brake")),
+    ):
+        axis = axis_of(name)
+        swept = [getattr(axis.at(point, value), name) for value in grid(axis, text)]
+        assert swept == list(settings)
+        assert list(map(type, swept)) == [type(setting) for setting in settings]
+    with pytest.raises(UserError, match=r"max_helpers is 1\.5"):
+        axis_of("max_helpers").at(point, 1.5)
+    with pytest.raises(UserError, match="on_demand is 'perhaps'"):
+        axis_of("on_demand").at(point, "perhaps")
+    with pytest.raises(UserError, match="--over radius_m: no grid is usual"):
+        grid(axis_of("radius_m"))
+
+
 def test_unknown_axes_and_rules_name_what_there_is() -> None:
     with pytest.raises(UserError, match="--over"):
         axis_of("speed")
-    with pytest.raises(UserError, match=next(iter(RULES))):
+    with pytest.raises(UserError, match=next(iter(POOLS))):
         grid(AXES["consensus"], "mode")

@@ -8,15 +8,30 @@ import pytest
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
-from harness.studies.calibrated import STEPS, Calibrated, Parameters
-from harness.studies.entropies import ACTIONS, peaked, spread
+from harness.core.arrays import Bools, Floats
+from harness.studies.calibrated import ACTIONS, STEPS, Calibrated, Parameters, peaked, spread
 from harness.studies.fit import fit
+from harness.studies.play import Walked
 
 SURE = OperatingPoint("6g", "6g", loss=0.0)  # nothing is lost
 
 
-def success(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> np.ndarray:
-    return next(source.scored(point, vehicles, seed))[1].verdict.success
+def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> Walked:
+    return next(source.walked(point, vehicles, [seed]))
+
+
+def success(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> Bools:
+    return ends(walked(source, point, vehicles, seed))
+
+
+def ends(made: Walked) -> Bools:
+    return made.ends["success_rate"][0] == 1.0
+
+
+def by_episode(made: Walked, name: str) -> Floats:
+    """A column of the decisions, (E, S)."""
+    in_order = np.argsort(made.places, kind="stable")  # decisions of an episode come in their order
+    return made.columns[name][in_order].reshape(len(made.episodes), STEPS)
 
 
 def test_the_shipped_parameters_are_what_the_fit_gives():
@@ -65,12 +80,12 @@ def test_on_a_serial_channel_the_third_reply_is_late():
 def test_an_ego_that_has_heard_keeps_what_it_learnt():
     """It hears the witness while it asks; in the last decision it asks nobody, and is right."""
     source = Calibrated(300, Parameters(guess_right=0.0, know_right=1.0))
-    laid, made = next(source.scored(replace(SURE, tau_nats=0.85), 4, 0))
-    asked = laid.by_episode(made.coordination.triggered, fill=False)
+    made = walked(source, replace(SURE, tau_nats=0.85))
+    asked = by_episode(made, "triggered") == 1.0
     quiet_at_last = asked[:, :-1].any(axis=1) & ~asked[:, -1]
     assert quiet_at_last.any()
-    assert made.verdict.success[quiet_at_last].all()
-    assert not made.verdict.success[~asked.any(axis=1)].any()
+    assert ends(made)[quiet_at_last].all()
+    assert not ends(made)[~asked.any(axis=1)].any()
 
 
 def test_alone_in_the_swarm_is_alone():
@@ -82,9 +97,9 @@ def test_alone_in_the_swarm_is_alone():
 def test_a_threshold_above_the_largest_entropy_is_as_good_as_no_channel():
     source = Calibrated(300)
     deaf = replace(POINTS["6g"], tau_nats=float(np.log(ACTIONS)))
-    _, made = next(source.scored(deaf, 4, 0))
-    assert not made.coordination.triggered.any()
-    assert (made.verdict.success == success(source, POINTS["single-local"])).all()
+    made = walked(source, deaf)
+    assert not made.columns["triggered"].any()
+    assert (ends(made) == success(source, POINTS["single-local"])).all()
 
 
 def test_more_loss_saves_nobody_who_was_lost_with_less():
@@ -97,16 +112,16 @@ def test_more_loss_saves_nobody_who_was_lost_with_less():
 def test_more_helpers_change_nothing_of_the_first_ones_draws():
     source = Calibrated(50)
     two, four = (source._draw(3, helpers, 0) for helpers in (2, 4))
-    assert np.array_equal(two.links.link, four.links.link[:, :2])
-    assert np.array_equal(two.known.helpers, four.known.helpers[:, :2])
-    assert np.array_equal(two.known.own, four.known.own)
+    assert np.array_equal(two.draws.link, four.draws.link[:, :2])
+    assert np.array_equal(two.intents.helpers, four.intents.helpers[:, :2])
+    assert np.array_equal(two.intents.own, four.intents.own)
 
 
 def test_helpers_that_are_unsure_load_the_channel():
     """Below every entropy four vehicles transmit: 6.6 %; above the helpers' only the ego does."""
     source = Calibrated(50)
     busy = replace(POINTS["6g"], helper_rounds=True)
-    _, low = next(source.scored(replace(busy, tau_nats=0.2), 4, 0))
-    _, high = next(source.scored(replace(busy, tau_nats=0.7), 4, 0))
-    assert low.coordination.loss == pytest.approx(np.full(50 * STEPS, 0.066))
-    assert high.coordination.loss == pytest.approx(np.full(50 * STEPS, 0.012))
+    low = walked(source, replace(busy, tau_nats=0.2))
+    high = walked(source, replace(busy, tau_nats=0.7))
+    assert low.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.066))
+    assert high.columns["effective_loss"] == pytest.approx(np.full(50 * STEPS, 0.012))

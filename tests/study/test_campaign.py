@@ -6,10 +6,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from harness.studies.campaign import run_paper
-from harness.studies.ledger import ledger, paper_numbers, verdict
-from harness.studies.page import tally
-from harness.studies.paper import panels
+from harness.studies.ledger import ledger, paper_numbers, tally, verdict
+from harness.studies.paper import panels, run_paper
 
 EPISODES = 1500  # a seed: at 69 % a mean of five seeds has a standard error of 0.5 points
 

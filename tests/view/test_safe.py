@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import quote
 
@@ -121,7 +122,7 @@ def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path
     assert made.status_code == 200
     assert SECRET not in made.text
     assert "Conditions side by side" in made.text
-    for file in ("rows.jsonl", "episodes.csv"):
+    for file in ("decisions.parquet", "answers.jsonl", "episodes.csv"):
         (reports / "second" / file).rename(outside / file)
         (reports / "second" / file).symlink_to(outside / file)
         for page in ("/run?path=second", "/report?path=second", "/compare?path=first&path=second"):
@@ -204,7 +205,7 @@ def test_what_a_run_holds_is_shown_in_a_sandbox(page: str, browser: TestClient) 
     common(answer.headers)
 
 
-def common(headers: dict[str, str]) -> None:
+def common(headers: Mapping[str, str]) -> None:
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["referrer-policy"] == "no-referrer"
     assert headers["cross-origin-resource-policy"] == "same-origin"

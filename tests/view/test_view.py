@@ -17,6 +17,7 @@ from viewing import configure, names, said
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
+from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
@@ -119,8 +120,8 @@ def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
         ("/report", "no run is picked"),
         ("/report?path=first&path=other", "first and "),
         ("/run?path=killed", "killed is unfinished (--resume); it has no page yet"),
-        ("/run?path=cut", "cut has no rows.jsonl of its own; make the run again"),
-        ("/run?path=garbled", "rows.jsonl line 1 is broken"),
+        ("/run?path=cut", "cut has no decisions.parquet of its own; make the run again"),
+        ("/run?path=garbled", "decisions.parquet is broken ("),
     ],
 )
 def test_what_cannot_be_shown_is_one_readable_line(
@@ -128,14 +129,14 @@ def test_what_cannot_be_shown_is_one_readable_line(
 ) -> None:
     manifest = json.loads((reports / "second/run.json").read_text())
     (reports / "killed/.work").mkdir(parents=True)
-    begun = {"created": manifest["created"], "settings": manifest}
+    begun = {"created": manifest["created"], "settings": manifest, "tags": []}
     (reports / "killed/.work/config.json").write_text(json.dumps(begun))
     for name in ("cut", "garbled"):
         shutil.copytree(reports / "second", reports / name)
-    (reports / "cut/rows.jsonl").unlink()
-    (reports / "garbled/rows.jsonl").write_text("{")
+    (reports / "cut/decisions.parquet").unlink()
+    (reports / "garbled/decisions.parquet").write_text("{")
     if "other" in address:
-        build(tmp_path / "data", 1, 7, 1, lambda done: None)
+        build(SCENARIO, tmp_path / "data", 1, 7, 1, lambda done: None)
         evaluate(spec_of(load(tmp_path / "data")), reports / "other")
     answer = browser.get(address)
     assert answer.status_code == 400

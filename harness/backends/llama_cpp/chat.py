@@ -21,17 +21,9 @@ class Vocabulary(Protocol):
     specials: dict[str, str]
     bos: int | None
 
-    def encode(self, text: str) -> list[int]:
-        """Token ids of a text."""
-        ...
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """Text of token ids."""
-        ...
-
-    def pieces(self, ids: Sequence[int]) -> list[str]:
-        """The text of each token on its own, special ones as they are written."""
-        ...
+    def encode(self, text: str) -> list[int]: ...
+    def decode(self, ids: Sequence[int]) -> str: ...
+    def pieces(self, ids: Sequence[int]) -> list[str]: ...
 
 
 class GgufChat(Chat):
@@ -50,19 +42,15 @@ class GgufChat(Chat):
 
     @property
     def bos(self) -> int | None:
-        """Id of the token that begins a sequence; None if there is none."""
         return self._vocabulary.bos
 
     def encode(self, prompt: str) -> list[int]:
-        """Token ids of a rendered prompt; the template has written BOS already, where there is one."""
         return self._vocabulary.encode(prompt)
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Text of an answer without its control tokens."""
         return self._vocabulary.decode(ids)
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """The text of each token on its own, control tokens as they are written."""
         return self._vocabulary.pieces(ids)
 
     def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:

@@ -52,7 +52,6 @@ class Child:
         self._start()
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order."""
         for _ in range(2):
             with suppress(_Died):
                 answers: list[Completion] = self._ask("complete", requests)
@@ -60,12 +59,10 @@ class Child:
         return [self._alone(request) for request in requests]
 
     def identity(self) -> dict[str, Any]:
-        """The backend's own."""
         found: dict[str, Any] = self.call("identity")
         return found
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """The backend's own."""
         found: list[str] = self.call("rendered", requests)
         return found
 

@@ -8,6 +8,7 @@ import llama_cpp as c
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.backends.engine import common_length
 from harness.backends.llama_cpp.model import LlamaModel, last_error
 
 Ints = NDArray[np.int32]
@@ -160,12 +161,6 @@ class LlamaContext:
         pointers = {name: arrays[name].ctypes.data_as(kind) for name, kind in _FIELDS if name in arrays}
         code: int = c.llama_decode(self._context, c.llama_batch(n_tokens=len(token), **pointers))
         return code
-
-
-def common_length(sequences: Sequence[list[int]]) -> int:
-    """How many tokens all of them begin with."""
-    first, last = min(sequences), max(sequences)
-    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
 
 
 def threads() -> int:

@@ -10,10 +10,12 @@ import numpy as np
 
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
+from harness.backends.engine import common_length
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.chat import GgufChat
-from harness.backends.llama_cpp.context import LlamaContext, Logits, common_length
+from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
+from harness.backends.weights import hub_commit
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
@@ -112,22 +114,19 @@ class LlamaEngine:
 
     def identity(self) -> dict[str, Any]:
         """What decides the answers: the build of llama.cpp, and the file by its hub commit or its content."""
+        commit = hub_commit(self._file.parent)
         return {
             "engine": "llama-cpp",
             **build(),
             "weights": self._card.weights,
             "file": self._card.file,
-            "revision": self._file.parent.name if self._cached else None,
-            "file_sha256": None if self._cached else self._sha256,
+            "revision": commit,
+            "file_sha256": None if commit else self._sha256,
             "dtype": self._model.dtype,
             "kv_cache": self._context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
         }
-
-    @property
-    def _cached(self) -> bool:
-        return self._file.parent.parent.name == "snapshots"
 
     @cached_property
     def _sha256(self) -> str:
@@ -143,7 +142,6 @@ class LlamaSession:
         self._logits = logits
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Most likely next token of each sequence, of those listed for it."""
         best = []
         for row, listed in zip(self._logits, among, strict=True):
             if listed is None:
@@ -154,25 +152,21 @@ class LlamaSession:
         return best
 
     def log_probs(self, tokens: Sequence[int]) -> Floats:
-        """Natural log-probabilities of some tokens as the next one, (n, len)."""
         logits = self._logits - self._logits.max(axis=1, keepdims=True).astype(np.float64)
         total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
         found: Floats = logits[:, list(tokens)] - total
         return found
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append tokens to each sequence; an empty chunk leaves it alone."""
         rows = [row for row, chunk in enumerate(chunks) if chunk]
         if rows:
             self._logits[rows] = self._engine.extend({self._places[row]: chunks[row] for row in rows})
 
     def keep(self, places: Sequence[int]) -> None:
-        """Go on with these sequences only, in this order."""
         kept = [self._places[place] for place in places]
         self._engine.release([place for place in self._places if place not in kept])
         self._places, self._logits = kept, self._logits[list(places)]
 
     def close(self) -> None:
-        """Give the sequences' memory back."""
         self._engine.release(self._places)
         self._places = []

@@ -10,9 +10,12 @@ from harness.backends.cards import Card, Dtype
 from harness.backends.chat import Chat
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
-from harness.backends.transformers import checkpoint
+from harness.backends.weights import fetching, find_checkpoint, held_to_digest, hub_commit
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_bytes
+from harness.core.files import digest, sha256_bytes, sha256_file
+
+# What decides an answer; a README or a licence does not.
+_HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
 
 
 def open(
@@ -21,21 +24,65 @@ def open(
     """Find and load a card's weights.
 
     Raises:
-        UserError: a package, the device, the weights or the chat template is missing, or files do not load.
+        UserError: the device, the weights or the chat template is missing, or files do not load.
     """
-    if package := checkpoint.missing_package():
-        raise UserError(
-            f"model {card.name!r} needs {package}, which is not installed; "
-            "run `pip install 'swarmdrive-harness[transformers]'`"
-        )
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
-    if batch_size < 1:
-        raise UserError(f"batch size {batch_size}; allowed: 1 or more")
-    where = checkpoint.find(card)
-    loaded = checkpoint.load(card, where, dtype=dtype, device=device_of(device))
-    return LanguageModel(TransformersEngine(card, where, loaded), batch_size)
+    where = find_checkpoint(card)
+    tokenizer, model = load(card, where, dtype=dtype, device=device_of(device))
+    return LanguageModel(TransformersEngine(card, where, tokenizer, model), batch_size)
+
+
+def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
+    """Tokenizer and model of a checkpoint, ready to answer.
+
+    Raises:
+        UserError: files that do not load, weights that do not fill the model, no chat template.
+    """
+    import transformers
+
+    held_to_digest(card, where / "model.safetensors")
+    transformers.utils.logging.set_verbosity_error()
+    transformers.utils.logging.disable_progress_bar()
+    # trust_remote_code=False: else a checkpoint with code of its own asks at the terminal.
+    options = {"local_files_only": True, "trust_remote_code": False}
+    try:
+        tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
+        model, report = transformers.AutoModelForCausalLM.from_pretrained(
+            where, dtype=dtype, output_loading_info=True, **options
+        )
+    except Exception as error:  # a broken file surfaces as any of a dozen exception types
+        reason = printable(" ".join(str(error).split()), 200)
+        raise UserError(
+            f"model {card.name!r} in {where} does not load: {reason}; {fetching(card)}"
+        ) from error
+    try:
+        model = model.to(device).eval()
+    except RuntimeError as error:
+        reason = printable(" ".join(str(error).split()), 200)
+        raise UserError(
+            f"model {card.name!r} does not fit on {device}: {reason}; give another device or dtype"
+        ) from error
+    if report["missing_keys"]:
+        # transformers fills them with random numbers.
+        absent = sorted(report["missing_keys"])
+        raise UserError(
+            f"model {card.name!r} in {where} lacks {len(absent)} of its weights "
+            f"({printable(absent[0])}); {fetching(card)}"
+        )
+    rows = model.get_input_embeddings().num_embeddings
+    if len(tokenizer) > rows:
+        raise UserError(
+            f"model {card.name!r} in {where}: its tokenizer has {len(tokenizer)} tokens and the model "
+            f"only {rows}; give both from one checkpoint"
+        )
+    if not tokenizer.chat_template:
+        raise UserError(
+            f"model {card.name!r} in {where} has no chat template; use its instruct version, "
+            "or put a chat_template.jinja beside its config.json"
+        )
+    return tokenizer, model
 
 
 def device_of(asked: str | None) -> str:
@@ -54,10 +101,10 @@ def device_of(asked: str | None) -> str:
 
 def gpus() -> list[str]:
     """Names of the GPUs that torch sees; none where it is not installed."""
-    if checkpoint.missing_package() == "torch":
+    try:
+        import torch
+    except ImportError:
         return []
-    import torch
-
     return [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
 
 
@@ -71,19 +118,19 @@ class TransformersEngine:
         model: the transformers model.
     """
 
-    def __init__(self, card: Card, where: Path, loaded: checkpoint.Loaded) -> None:
+    def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
         from harness.backends.transformers.session import Reader
 
         self.card = card
         self.where = where
-        self.chat = Chat(card.name, loaded.tokenizer)
-        self.model = loaded.model
+        self.chat = Chat(card.name, tokenizer)
+        self.model = model
         self.context_tokens: int = (
             card.context_tokens or self.model.config.get_text_config().max_position_embeddings
         )
         listed = self.model.generation_config.eos_token_id or []
         # A chat model's turn may end with a token that its generation config does not list.
-        ends = {*(listed if isinstance(listed, list) else [listed]), loaded.tokenizer.eos_token_id}
+        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id}
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(self.model)
 
@@ -93,14 +140,14 @@ class TransformersEngine:
 
     def identity(self) -> dict[str, Any]:
         """What decides the answers: a hub checkpoint is named by its commit, any other by its files."""
-        cached = self.where.parent.name == "snapshots"
+        commit = hub_commit(self.where)
         return {
             "engine": "transformers",
             "transformers": version("transformers"),
             "torch": version("torch"),
             "weights": self.card.weights,
-            "revision": self.where.name if cached else None,
-            "files_sha256": None if cached else self._files_sha256,
+            "revision": commit,
+            "files_sha256": None if commit else self._files_sha256,
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
@@ -108,4 +155,6 @@ class TransformersEngine:
 
     @cached_property
     def _files_sha256(self) -> str:
-        return checkpoint.files_sha256(self.where)
+        """Digest of the files that decide the answers, by name and content."""
+        files = sorted(p for p in self.where.iterdir() if p.is_file() and p.suffix in _HASHED)
+        return digest({path.name: sha256_file(path) for path in files})

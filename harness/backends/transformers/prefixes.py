@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from harness.backends.engine import common_length
+
 LEAST_TOKENS = 16  # a shorter beginning costs less to read again than to look after
 MOST_TOKENS = 2048  # kept together; 0.3 GB of a 4B model with grouped-query attention
 
@@ -19,9 +21,7 @@ NOTHING = Prefix([], [])
 
 def common(sequences: Sequence[list[int]]) -> list[int]:
     """What some sequences, at least one, begin with in common."""
-    first, last = min(sequences), max(sequences)  # whatever lies between begins with what these two do
-    differ = (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
-    return first[: next(differ, len(first))]
+    return sequences[0][: common_length(sequences)]
 
 
 class Prefixes:

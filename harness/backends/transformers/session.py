@@ -105,7 +105,6 @@ class Rows:
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Most likely next token of each sequence, of the tokens listed for it; the lowest of equals."""
         found = []
         for row, tokens in zip(self._logits, among, strict=True):
             if tokens is None:
@@ -117,13 +116,11 @@ class Rows:
         return chosen
 
     def log_probs(self, tokens: Sequence[int]) -> Floats:
-        """Natural log-probabilities of some tokens as the next one, (n, len)."""
         logits = self._logits.float()
         found: Floats = (logits[:, list(tokens)] - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
         return found
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append tokens to each sequence."""
         width = max(map(len, chunks))
         if width == 0:
             return
@@ -139,14 +136,12 @@ class Rows:
         self._logits = logits if self._logits is None else torch.where(moved, logits, self._logits)
 
     def keep(self, places: Sequence[int]) -> None:
-        """Go on with these sequences only, in this order."""
         rows = torch.tensor(places)
         self._mask = self._mask[rows]
         self._logits = self._logits[rows.to(self._logits.device)]
         self._cache.batch_select_indices(rows.to(self._logits.device))
 
     def close(self) -> None:
-        """Let go of the cache."""
         self._cache = self._logits = None
 
 
@@ -157,23 +152,18 @@ class Apart:
         self._sessions = sessions
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Most likely next token of each sequence, of the tokens listed for it; the lowest of equals."""
         return [s.argmax([tokens])[0] for s, tokens in zip(self._sessions, among, strict=True)]
 
     def log_probs(self, tokens: Sequence[int]) -> Floats:
-        """Natural log-probabilities of some tokens as the next one, (n, len)."""
         return np.concatenate([session.log_probs(tokens) for session in self._sessions])
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append tokens to each sequence."""
         for session, chunk in zip(self._sessions, chunks, strict=True):
             session.advance([chunk])
 
     def keep(self, places: Sequence[int]) -> None:
-        """Go on with these sequences only, in this order."""
         self._sessions = [self._sessions[place] for place in places]
 
     def close(self) -> None:
-        """Let go of the caches."""
         for session in self._sessions:
             session.close()

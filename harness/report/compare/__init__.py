@@ -1,1 +1,1 @@
-"""Two finished runs held against each other: what changed, by how much, and whether a gate fails."""
+"""Two finished runs compared: what changed, by how much, and whether a gate fails."""

@@ -3,19 +3,15 @@
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean, paired_difference
 from harness.report.compare import percentiles
-from harness.report.compare.pair import Pair, Side
-from harness.report.compare.table import MEANS
-
-if TYPE_CHECKING:
-    import pandas as pd
+from harness.report.compare.pair import Pair
+from harness.runs.metrics import SUCCESS, metrics_of
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Turned:
+class Flip:
     """An episode that succeeds in one run and not in the other.
 
     Attributes:
@@ -68,12 +64,12 @@ class InCondition:
     condition: str
     differences: tuple[Difference, ...]
     test: SuccessTest | None
-    gained: tuple[Turned, ...]
-    lost: tuple[Turned, ...]
+    gained: tuple[Flip, ...]
+    lost: tuple[Flip, ...]
 
 
 @dataclass(frozen=True)
-class AnswersTurned:
+class AnswersFlipped:
     """Answers to the same requests that were read with another verdict.
 
     Attributes:
@@ -104,25 +100,25 @@ class Comparison:
     pair: Pair
     settings: tuple[tuple[str, str | None, str | None], ...]
     conditions: tuple[InCondition, ...]
-    answers: tuple[AnswersTurned, ...]
+    answers: tuple[AnswersFlipped, ...]
     answers_in_both: dict[str, int]
 
 
 def compare(pair: Pair) -> Comparison:
     """Hold B against A."""
-    a, b = pair.a.answers, pair.b.answers
+    a, b = ({answer.id: answer for answer in side.run.answers} for side in (pair.a, pair.b))
     both = [request for request in a if request in b]
-    turned: dict[tuple[str, str, str], list[str]] = {}
+    flipped: dict[tuple[str, str, str], list[str]] = {}
     for request in both:
-        (role, before), (_, after) = a[request], b[request]
+        before, after = a[request].verdict, b[request].verdict
         if before != after:
-            turned.setdefault((role, before, after), []).append(request)
+            flipped.setdefault((a[request].role, before, after), []).append(request)
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
         conditions=tuple(_in_condition(pair, name) for name in pair.conditions),
-        answers=tuple(AnswersTurned(*how, tuple(ids)) for how, ids in sorted(turned.items())),
-        answers_in_both=dict(Counter(a[request][0] for request in both)),
+        answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
+        answers_in_both=dict(Counter(a[request].role for request in both)),
     )
 
 
@@ -139,47 +135,24 @@ def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
 
 
 def _in_condition(pair: Pair, condition: str) -> InCondition:
-    a, b = (_of(side.table, condition, pair) for side in (pair.a, pair.b))
-    differences = [_difference(name, _laid(a[name], pair), _laid(b[name], pair)) for name in MEANS]
+    differences = [
+        _difference(metric.name, *(pair.values(side, metric.name, condition) for side in (pair.a, pair.b)))
+        for metric in metrics_of(pair.a.run.world)
+    ]
     differences += [
         Difference(f"latency_p{percent}_ms", before, after, change)
         for percent, before, after, change in percentiles.differences(
-            _decided(pair.a, condition, pair), _decided(pair.b, condition, pair), len(pair.episodes)
+            pair.latencies(pair.a, condition), pair.latencies(pair.b, condition), len(pair.episodes)
         )
     ]
+    a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
     return InCondition(
         condition=condition,
         differences=tuple(d for d in differences if d.change.n),
-        test=success_test(_laid(a["success_rate"], pair), _laid(b["success_rate"], pair)),
-        gained=tuple(_turned(a, b, (a.end != "success") & (b.end == "success"))),
-        lost=tuple(_turned(a, b, (a.end == "success") & (b.end != "success"))),
+        test=success_test(a, b),
+        gained=tuple(_flips(pair, condition, (a == 0) & (b == 1))),
+        lost=tuple(_flips(pair, condition, (a == 1) & (b == 0))),
     )
-
-
-def _of(table: "pd.DataFrame", condition: str, pair: Pair) -> "pd.DataFrame":
-    """One condition's rows, by seed and episode, in the same order in both runs."""
-    import pandas as pd
-
-    rows = pd.MultiIndex.from_product([pair.seeds, pair.episodes], names=["seed", "episode"])
-    there = table.index.get_level_values("condition") == condition
-    return table[there].droplevel("condition").reindex(rows)
-
-
-def _decided(side: Side, condition: str, pair: Pair) -> list[percentiles.Decided]:
-    """Each seed's latencies, with the places of their episodes."""
-    index = side.latency_ms.index
-    there = (index.get_level_values("condition") == condition) & index.get_level_values("episode").isin(
-        pair.episodes
-    )
-    found = side.latency_ms[there]
-    place = np.searchsorted(pair.episodes, found.index.get_level_values("episode")).astype(np.int64)
-    seed, value = np.asarray(found.index.get_level_values("seed")), np.asarray(found, dtype=np.float64)
-    return [(place[seed == s], value[seed == s]) for s in pair.seeds]
-
-
-def _laid(column: "pd.Series[float]", pair: Pair) -> Floats:
-    """(E, S) from seeds and, in each, episodes."""
-    return np.asarray(column, dtype=float).reshape(len(pair.seeds), len(pair.episodes)).T
 
 
 def _difference(metric: str, a: Floats, b: Floats) -> Difference:
@@ -188,8 +161,12 @@ def _difference(metric: str, a: Floats, b: Floats) -> Difference:
     return Difference(metric, before, after, paired_difference(b, a))
 
 
-def _turned(a: "pd.DataFrame", b: "pd.DataFrame", which: "pd.Series[bool]") -> Iterator[Turned]:
-    ends = a[["end"]].join(b[["end"]], lsuffix="_a", rsuffix="_b")[which].reset_index()
-    for _, rows in ends.groupby(["episode", "end_a", "end_b"]):
-        first = rows.iloc[0]
-        yield Turned(int(first.episode), tuple(map(int, rows.seed)), str(first.end_a), str(first.end_b))
+def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
+    """Those (E, S) that flip, one an episode and way of ending."""
+    for episode, row in zip(pair.episodes, which, strict=True):
+        seeds: dict[tuple[str, str], list[int]] = {}
+        for seed in np.array(pair.seeds)[row].tolist():
+            a, b = (side.ends[condition, seed, episode] for side in (pair.a, pair.b))
+            how = ("success" if a.success else a.failure, "success" if b.success else b.failure)
+            seeds.setdefault(how, []).append(seed)
+        yield from (Flip(episode, tuple(in_seeds), *how) for how, in_seeds in sorted(seeds.items()))

@@ -1,4 +1,4 @@
-"""Gates: a difference that is not to be had, as typed after --fail-if."""
+"""Gates: a difference that fails a comparison, as typed after --fail-if."""
 
 import math
 import operator
@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 from harness.core.errors import UserError, printable, unknown
 from harness.report.compare.difference import Comparison
-from harness.report.compare.table import METRICS
+from harness.runs.metrics import METRICS, PERCENTILES
 
+NAMES = (*METRICS, *(f"latency_p{percent}_ms" for percent in PERCENTILES))
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
@@ -43,7 +44,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a gate: the conditions in which it failed, with the value that failed it."""
+    """The result of a gate: the conditions in which it failed, each with the value that failed it."""
 
     gate: str
     failed: tuple[tuple[str, float], ...]
@@ -55,37 +56,37 @@ def gate(text: str) -> Gate:
     Raises:
         UserError: it cannot be read, or names no metric that is compared.
     """
-    found = _GATE.fullmatch(text)
+    match = _GATE.fullmatch(text)
     try:
-        number = float(found["number"]) if found else math.nan
+        number = float(match["number"]) if match else math.nan
     except ValueError:
         number = math.nan
-    if not found or not math.isfinite(number):
+    if not match or not math.isfinite(number):
         raise UserError(
             f"--fail-if {printable(text)!r} cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as '6g:success_rate < -0.01'"
         )
-    if found["metric"] not in METRICS:
-        raise unknown("metric of --fail-if", found["metric"], METRICS)
-    if found["end"] not in (None, *ENDS):
-        raise unknown(f"end of {found['metric']}'s interval in --fail-if", found["end"], ENDS)
-    condition = found["condition"]
+    if match["metric"] not in NAMES:
+        raise unknown("metric of --fail-if", match["metric"], NAMES)
+    if match["end"] not in (None, *ENDS):
+        raise unknown(f"end of {match['metric']}'s interval in --fail-if", match["end"], ENDS)
+    condition = match["condition"]
     return Gate(
-        text, condition and condition.strip(), found["metric"], found["end"] or "value", found["op"], number
+        text, condition and condition.strip(), match["metric"], match["end"] or "value", match["op"], number
     )
 
 
-def judge(gate: Gate, found: Comparison) -> Verdict:
+def judge(gate: Gate, comparison: Comparison) -> Verdict:
     """Hold a gate against a comparison.
 
     Raises:
         UserError: its condition is not compared, or the difference is not known there.
     """
-    names = found.pair.conditions
+    names = comparison.pair.conditions
     if gate.condition is not None and gate.condition not in names:
         raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, names)
     failed = []
-    for condition in found.conditions:
+    for condition in comparison.conditions:
         if gate.condition in (None, condition.condition):
             changes = [d.change for d in condition.differences if d.metric == gate.metric]
             value = float(getattr(changes[0], gate.end)) if changes else math.nan

@@ -6,21 +6,12 @@ from pathlib import Path
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison
 from harness.report.compare.gate import Verdict
-from harness.report.page import environment, save
+from harness.report.page import environment
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
     """The page; `most` episodes and requests are listed of each kind."""
     template = environment(TEMPLATES).get_template("compare.html.j2")
-    return template.render(found=found, pair=found.pair, verdicts=verdicts, most=most, words=words)
-
-
-def write(found: Comparison, verdicts: Sequence[Verdict], most: int, out: Path) -> None:
-    """Write the page.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    save(render(found, verdicts, most), out, "--html")
+    return template.render(found=comparison, pair=comparison.pair, verdicts=verdicts, most=most, words=words)

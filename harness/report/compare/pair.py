@@ -1,20 +1,23 @@
-"""Two finished runs on the same scenes with the same luck, read and laid out alike."""
+"""Two finished runs on the same scenes with the same draws, as arrays of one layout."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import msgspec
+import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.evaluate.live_spec import FORMAT as DRIVEN
-from harness.report.compare.table import tables
+from harness.core.memory import uncollected
+from harness.report.compare.percentiles import Decided
 from harness.report.words import facts
-from harness.runs.driven_folder import LIVE
-from harness.runs.folder import FROZEN, Run, answers_of, read
-
-if TYPE_CHECKING:
-    import pandas as pd
+from harness.runs.folder import Run, read
+from harness.runs.metrics import by_episode, metrics_of
+from harness.runs.records import Episode, FrozenScenes
 
 SETTINGS = ("model", "prompt", "answer", "thinking", "dtype", "latency", "identity", "versions")
 
@@ -25,28 +28,32 @@ class Side:
 
     Attributes:
         run: as it was read.
-        scenes: what pins its scenes: the dataset's digest, or the scenario and the first layout seed.
-        on: its scenes, for people.
-        seeds: of the channel's luck, ascending.
-        settings: what may make a difference, by dotted name; None is left out.
-        table: its numbers by condition, seed and episode: see `tables`.
-        latency_ms: of every decision.
-        answers: role and verdict of each answer, by request id.
+        settings: those that may make a difference, by dotted name; None is left out.
+        values: of each metric, (C, S, E) by the run's grid; NaN where unknown.
     """
 
     run: Run
-    scenes: Any
-    on: str
-    seeds: tuple[int, ...]
     settings: Mapping[str, str]
-    table: "pd.DataFrame"
-    latency_ms: "pd.Series[float]"
-    answers: Mapping[str, tuple[str, str]]
+    values: Mapping[str, Floats]
 
     @property
-    def episodes(self) -> frozenset[int]:
-        """Numbers of its episodes."""
-        return frozenset(self.table.index.get_level_values("episode"))
+    def scenes(self) -> Any:
+        """What pins its scenes: the dataset's digest, or the scenario and the first layout seed."""
+        world = self.run.manifest.world
+        return world.sha256 if isinstance(world, FrozenScenes) else (world.scenario, world.first_seed)
+
+    @property
+    def on(self) -> str:
+        """Its scenes, for people."""
+        world = self.run.manifest.world
+        if isinstance(world, FrozenScenes):
+            return f"{world.name} {world.sha256[:12]}"
+        return f"{world.scenario['name']} from layout seed {world.first_seed}"
+
+    @cached_property
+    def ends(self) -> Mapping[tuple[str, int, int], Episode]:
+        """How each episode ended, by condition, seed and number."""
+        return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
 
 @dataclass(frozen=True)
@@ -57,8 +64,8 @@ class Pair:
         a: the one that is the base.
         b: the one that is compared with it.
         conditions: names that both have, in the order of `a`.
-        seeds: seeds of the channel's luck, the same in both.
-        episodes: numbers of the episodes that both have.
+        seeds: of the channel's draws, the same in both, ascending.
+        episodes: numbers of the episodes that both have, ascending.
     """
 
     a: Side
@@ -67,7 +74,26 @@ class Pair:
     seeds: tuple[int, ...]
     episodes: tuple[int, ...]
 
+    def values(self, side: Side, metric: str, condition: str) -> Floats:
+        """A metric of the episodes that both have, (E, S)."""
+        grid = side.run.grid
+        seeds, episodes = map(grid.seeds.index, self.seeds), map(grid.episodes.index, self.episodes)
+        of_condition = side.values[metric][grid.conditions.index(condition)]
+        return np.asarray(of_condition[np.ix_(list(seeds), list(episodes))].T)
 
+    def latencies(self, side: Side, condition: str) -> list[Decided]:
+        """Of each seed, the episodes' places in `episodes` and the latencies in ms of their decisions."""
+        decisions = side.run.decisions
+        of_condition = decisions.codes("condition", side.run.conditions) == side.run.conditions.index(
+            condition
+        )
+        kept = of_condition & np.isin(decisions.whole("episode"), self.episodes)
+        place = np.searchsorted(self.episodes, decisions.whole("episode")[kept]).astype(np.int64)
+        seed, latency_ms = decisions.whole("seed")[kept], decisions["latency_ms"][kept]
+        return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
+
+
+@uncollected()
 def pair(a: Path, b: Path) -> Pair:
     """Read two runs.
 
@@ -75,60 +101,36 @@ def pair(a: Path, b: Path) -> Pair:
         UserError: a folder is no finished run, or the two have not the same scenes and seeds, or no condition
             or episode in common.
     """
-    one, other = _side(a), _side(b)
+    one, other = read(a), read(b)
     shown = f"{printable(a)} and {printable(b)}"
-    if one.run.config["format"] != other.run.config["format"]:
+    if one.world != other.world:
         raise UserError(
             f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a kind, or "
             "see `harness fidelity`"
         )
-    if one.scenes != other.scenes:
-        raise UserError(
-            f"{shown} are not of the same scenes ({printable(one.on, 60)} and {printable(other.on, 60)}); "
-            "make both on the same"
-        )
-    if one.seeds != other.seeds:
-        seeds = " and ".join(printable(list(side.seeds), 40) for side in (one, other))
+    side_a, side_b = _side(one), _side(other)
+    if side_a.scenes != side_b.scenes:
+        scenes = " and ".join(printable(side.on, 60) for side in (side_a, side_b))
+        raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
+    seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (one, other))
+    if seeds_a != seeds_b:
+        seeds = " and ".join(printable(each, 40) for each in (seeds_a, seeds_b))
         raise UserError(f"{shown} have different seeds ({seeds}); make both with the same --seeds")
-    conditions = tuple(name for name in one.run.conditions if name in other.run.conditions)
+    conditions = tuple(name for name in one.conditions if name in other.conditions)
     if not conditions:
-        names = " and ".join(printable(", ".join(side.run.conditions), 60) for side in (one, other))
+        names = " and ".join(printable(", ".join(run.conditions), 60) for run in (one, other))
         raise UserError(f"{shown} have no condition in common ({names}); make both with the same --condition")
-    episodes = one.episodes & other.episodes
+    episodes = set(one.grid.episodes) & set(other.grid.episodes)
     if not episodes:
         raise UserError(f"{shown} have no episode in common; make both on the same episodes")
-    return Pair(one, other, conditions, one.seeds, tuple(sorted(episodes)))
+    return Pair(side_a, side_b, conditions, tuple(seeds_a), tuple(sorted(episodes)))
 
 
-def _side(path: Path) -> Side:
-    run = read(path, FROZEN, LIVE)
-    config = run.config
-    try:
-        if config["format"] == DRIVEN:
-            scenes = [config["scenario"], config["first_seed"]]
-            on = f"{config['scenario']['name']} from layout seed {config['first_seed']}"
-        else:
-            scenes = config["dataset"]["sha256"]
-            on = f"{config['dataset']['name']} {config['dataset']['sha256'][:12]}"
-        seeds = tuple(sorted(int(seed) for seed in config["seeds"]))
-        table, latency_ms = tables(run)
-        return Side(run, scenes, on, seeds, _settings(run), table, latency_ms, dict(_answers(run)))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{printable(path)} is no finished run ({printable(error)}); make the run again"
-        ) from None
-
-
-def _settings(run: Run) -> dict[str, str]:
-    config = {"answer": run.answer, **run.config}
-    told = {key: config[key] for key in SETTINGS if key in config}
-    # Through the class, so that a setting which an older run does not know has the value it had then.
-    points = [asdict(OperatingPoint.from_dict(c)) for c in config["conditions"]]
-    told["condition"] = {point["name"]: point for point in points}
-    return {name: str(value) for name, value in facts(told) if value is not None}
-
-
-def _answers(run: Run) -> Iterator[tuple[str, tuple[str, str]]]:
-    for row in run.rows:
-        for viewer, answer in answers_of(row).items():
-            yield f"{row['scene']}/{viewer}", (answer["role"], answer["verdict"])
+def _side(run: Run) -> Side:
+    stated = msgspec.json.decode(msgspec.json.encode(run.manifest))
+    named = {key: stated[key] for key in SETTINGS}
+    # Through the class, which gives a setting that the run does not know the value it had then.
+    points = [asdict(OperatingPoint.from_dict(condition)) for condition in stated["conditions"]]
+    named["condition"] = {point["name"]: point for point in points}
+    settings = {name: str(value) for name, value in facts(named) if value is not None}
+    return Side(run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes))

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean
-from harness.runs.summary import PERCENTILES
+from harness.runs.metrics import PERCENTILES
 
 RESAMPLES, RESAMPLING_SEED = 999, 0
 AT_ONCE = 4_000_000  # numbers that are laid out together
@@ -63,12 +63,12 @@ def _percentiles(decided: Decided, weights: Ints) -> Floats:
 
 def _weighted(decided: Decided, weights: Ints) -> Floats:
     place, values = decided
-    found = np.full((len(PERCENTILES), len(weights)), np.nan)
+    result = np.full((len(PERCENTILES), len(weights)), np.nan)
     some = weights[:, np.unique(place)].any(axis=1)  # resamples that have a decision at all
     order = np.argsort(values, kind="stable")
     counted = weights[some][:, place[order]].cumsum(axis=1)
     if not counted.size:
-        return found
+        return result
     last = counted[:, -1] - 1
     # Rows one above the other are one ascending line, in which every row is searched at once.
     row, size = np.arange(len(counted)), counted.shape[1]
@@ -83,5 +83,5 @@ def _weighted(decided: Decided, weights: Ints) -> Floats:
     position = np.array(PERCENTILES)[:, None] / 100 * last
     lower = np.floor(position).astype(np.int64)
     low, high = at(lower), at(np.minimum(lower + 1, last))
-    found[:, some] = low + (high - low) * (position - lower)
-    return found
+    result[:, some] = low + (high - low) * (position - lower)
+    return result

@@ -16,24 +16,22 @@ WIDTH = 80
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
 
 
-def terminal(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
     """Lines of at most `WIDTH` columns; `most` episodes, requests and so on are listed of each kind."""
     return "\n".join(
         piece
-        for text in _lines(found, verdicts, most)
+        for text in _lines(comparison, verdicts, most)
         for piece in wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
     )
 
 
-def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
-    pair = found.pair
-    for name, side in (("A", pair.a), ("B", pair.b)):
-        yield f"{name}: {side.run.path}: {words.who(side)}"
+def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
+    pair = comparison.pair
+    yield from (f"{name}: {side}" for name, side in words.sides(pair))
     yield f"paired: {words.paired(pair)}"
-    yield words.differing(found)
-    for setting, a, b in found.settings:
-        yield f"  {setting}: {_setting(a)} → {_setting(b)}"
-    for c in found.conditions:
+    yield words.differing(comparison)
+    yield from (f"  {setting}" for setting in words.settings(comparison))
+    for c in comparison.conditions:
         label = printable(c.condition)
         if len(label) > 25:
             yield label
@@ -42,44 +40,31 @@ def _lines(found: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterato
         for one in map(words.line, c.differences):
             yield f"{one.metric:<26}{one.a:>11}{one.b:>11}{one.change:>10} {one.interval:>21}"
         yield words.success(c, pair)
-        for name, some in (("gained", c.gained), ("lost", c.lost)):
-            if some:
-                yield f"  {name}: {words.turned(some, pair, most)}"
-    if not found.answers:
+        yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
+    if not comparison.answers:
         yield "answers: none changed its verdict"
-    for t in found.answers:
-        yield f"answers: {words.answers_turned(t, found)}"
-        yield "  " + ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
+    for turned, requests in words.answers_flipped(comparison, most):
+        yield f"answers: {turned}"
+        yield f"  {requests}"
     yield from map(words.judged, verdicts)
 
 
-def _setting(value: str | None) -> str:
-    return "none" if value is None else printable(value, 60)
-
-
-def markdown(found: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
-    """GitHub's Markdown, in which whatever a run says is code: no link, no picture and nobody called."""
-    pair = found.pair
+def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
+    """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
+    pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
     said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]
     said += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
-    said += [
-        f"- {name}: {code(f'{side.run.path}: {words.who(side)}')}"
-        for name, side in (("A", pair.a), ("B", pair.b))
-    ]
-    said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(found)}", ""]
-    for c in found.conditions:
+    said += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
+    said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
+    for c in comparison.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
-        for name, some in (("gained", c.gained), ("lost", c.lost)):
-            if some:
-                said += [f"- {name}: {code(words.turned(some, pair, most))}"]
+        said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         said += [""]
     said += ["<details><summary>Answers and settings</summary>", ""]
-    for t in found.answers:
-        ids = ", ".join([*t.requests[:most], *words.more(len(t.requests), most)])
-        said += [f"- {code(words.answers_turned(t, found))}: {code(ids)}"]
-    said += [] if found.answers else ["- no answer changed its verdict"]
-    said += [f"- {code(f'{name}: {_setting(a)} → {_setting(b)}')}" for name, a, b in found.settings]
+    said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
+    said += [] if comparison.answers else ["- no answer changed its verdict"]
+    said += [f"- {code(setting)}" for setting in words.settings(comparison)]
     return "\n".join([*said, "", "</details>"])
 
 
@@ -99,21 +84,21 @@ def code(text: str) -> str:
     return f"{fence}{pad}{text}{pad}{fence}"
 
 
-def mapping(found: Comparison, verdicts: Sequence[Verdict], most: int) -> dict[str, Any]:
+def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> dict[str, Any]:
     """For machines: metrics in their own units, null where there is no number."""
-    pair = found.pair
+    pair = comparison.pair
     return {
         "a": {"run": str(pair.a.run.path), "settings": dict(pair.a.settings)},
         "b": {"run": str(pair.b.run.path), "settings": dict(pair.b.settings)},
         "scenes": pair.a.on,
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
-        "settings": [{"name": name, "a": a, "b": b} for name, a, b in found.settings],
-        "conditions": [_in_condition(c, most) for c in found.conditions],
-        "answers_in_both": found.answers_in_both,
+        "settings": [{"name": name, "a": a, "b": b} for name, a, b in comparison.settings],
+        "conditions": [_in_condition(c, most) for c in comparison.conditions],
+        "answers_in_both": comparison.answers_in_both,
         "answers": [
             {"role": t.role, "a": t.a, "b": t.b, "count": len(t.requests), "requests": t.requests[:most]}
-            for t in found.answers
+            for t in comparison.answers
         ],
         "gates": [
             {"gate": v.gate, "passed": not v.failed,
@@ -132,11 +117,11 @@ def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
         }
         for d in c.differences
     }  # fmt: skip
-    told: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": c.test and asdict(c.test)}
+    entry: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": c.test and asdict(c.test)}
     for name, some in (("gained", c.gained), ("lost", c.lost)):
         listed = [asdict(t) for t in some[:most]]
-        told[name] = {"count": sum(len(t.seeds) for t in some), "episodes": len(some), "listed": listed}
-    return told
+        entry[name] = {"count": sum(len(t.seeds) for t in some), "episodes": len(some), "listed": listed}
+    return entry
 
 
 def _number(value: float) -> float | None:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from harness.core.errors import printable
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
-from harness.report.compare.difference import AnswersTurned, Comparison, Difference, InCondition, Turned
+from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
-from harness.report.words import unit
+from harness.runs.metrics import unit
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,13 @@ def line(d: Difference) -> Line:
 
 def who(side: Side) -> str:
     """Model, prompt and answer mode of a run."""
-    config = side.run.config
-    return f"{config['model']['name']} · prompt {config['prompt']['version']} · {side.run.answer}"
+    variant = side.run.manifest.variant
+    return f"{variant.model} · prompt {variant.prompt} · {variant.answer}"
+
+
+def sides(pair: Pair) -> list[tuple[str, str]]:
+    """`A` and `B`, each with its folder and who answered."""
+    return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
 
 
 def paired(pair: Pair) -> str:
@@ -48,7 +53,7 @@ def paired(pair: Pair) -> str:
     said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
-        episodes = len(side.episodes) - len(pair.episodes)
+        episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             said += f"; only {name} has {', '.join(conditions)}"
         if episodes:
@@ -56,15 +61,15 @@ def paired(pair: Pair) -> str:
     return said
 
 
-def differing(found: Comparison) -> str:
+def differing(comparison: Comparison) -> str:
     """What kinds of settings the runs differ in."""
-    kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in found.settings))
+    kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
 def success(c: InCondition, pair: Pair) -> str:
     """How many successes were gained and lost, and what the test says."""
-    gained, lost = (sum(len(t.seeds) for t in turned) for turned in (c.gained, c.lost))
+    gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
     of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
     said = f"success: {gained} gained, {lost} lost of {of}"
     if c.test is None:
@@ -76,24 +81,45 @@ def success(c: InCondition, pair: Pair) -> str:
     return f"{said}; {how} {ends} points, 95 %"
 
 
-def turned(some: Sequence[Turned], pair: Pair, most: int) -> str:
+def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
+    """What a condition gained and what it lost, where it did: up to so many episodes of each."""
+    ways = (("gained", c.gained), ("lost", c.lost))
+    return [(way, _flips(some, pair, most)) for way, some in ways if some]
+
+
+def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Up to so many episodes, each with how it failed; seeds where it is not all of them."""
     said = []
     for t in some[:most]:
         how = t.a if t.b == "success" else t.b
         seeds = "" if len(t.seeds) == len(pair.seeds) else f" (seeds {', '.join(map(str, t.seeds))})"
         said.append(f"{t.episode} {how}{seeds}")
-    return ", ".join(said + more(len(some), most))
+    return _listed(said, len(some), most)
 
 
-def more(n: int, most: int) -> list[str]:
-    """`n more`, where a list is cut."""
-    return [f"{n - most} more"] if n > most else []
+def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
+    """How many answers of a role changed their verdict, and up to so many of them."""
+    return [
+        (
+            f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",
+            _listed(t.requests[:most], len(t.requests), most),
+        )
+        for t in comparison.answers
+    ]
 
 
-def answers_turned(t: AnswersTurned, found: Comparison) -> str:
-    """How many answers of a role changed their verdict."""
-    return f"{t.role} {t.a} → {t.b}: {len(t.requests)} of {found.answers_in_both[t.role]}"
+def _listed(some: Sequence[str], n: int, most: int) -> str:
+    """Some of n, and how many more there are."""
+    return ", ".join([*some, f"{n - most} more"] if n > most else some)
+
+
+def settings(comparison: Comparison) -> list[str]:
+    """Each setting in which the runs differ, with both values."""
+
+    def shown(value: str | None) -> str:
+        return "none" if value is None else printable(value, 60)
+
+    return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in comparison.settings]
 
 
 def judged(verdict: Verdict) -> str:

@@ -2,9 +2,8 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from harness.core.arrays import Floats
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
 DISTANCES_M = (1.0, 4.0, 8.0, 13.0, 19.0, 26.0)
@@ -23,26 +22,26 @@ class Labels:
 
     def __init__(self, axes: Axes, pt_per_m: float, size_pt: float, view_m: float) -> None:
         self.axes, self.pt_per_m, self.size_pt, self.view_m = axes, pt_per_m, size_pt, view_m
-        self._taken: list[Array] = []
-        self._unloved: list[Array] = []
-        self._waiting: list[tuple[Array, float, str, bool, str, Array]] = []
+        self._taken: list[Floats] = []
+        self._unloved: list[Floats] = []
+        self._waiting: list[tuple[Floats, float, str, bool, str, Floats]] = []
 
-    def block(self, points: Array) -> None:
+    def block(self, points: Floats) -> None:
         """Keep labels off the box around points (n, 2) m."""
         self._taken.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
-    def discourage(self, points: Array) -> None:
+    def discourage(self, points: Floats) -> None:
         """Keep labels off the box around points (n, 2) m unless they would have to go far."""
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def add(
         self,
-        at: Array,
+        at: Floats,
         radius_m: float,
         text: str,
         bold: bool = False,
         colour: str = "#222222",
-        toward: Array = NOWHERE,
+        toward: Floats = NOWHERE,
     ) -> None:
         """A label for what lies at (2,) m and reaches radius_m, best on the side `toward` (2,) points to."""
         self._waiting.append((at, radius_m, text, bold, colour, toward))
@@ -66,15 +65,15 @@ class Labels:
                 bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8},
             )  # fmt: skip
 
-    def _half_size(self, text: str, bold: bool) -> Array:
+    def _half_size(self, text: str, bold: bool) -> Floats:
         lines = text.split("\n")
         width_em = max(map(len, lines)) * (0.66 if bold else 0.58)
         return np.array([width_em, 1.2 * len(lines)]) * self.size_pt / self.pt_per_m / 2 + 0.6
 
-    def _cost(self, spot: Array, half: Array, at: Array, toward: Array) -> float:
+    def _cost(self, spot: Floats, half: Floats, at: Floats, toward: Floats) -> float:
         """Metres away, and far more than any distance for what would be covered or cut."""
 
-        def covered(boxes: list[Array]) -> int:
+        def covered(boxes: list[Floats]) -> int:
             return sum(bool(np.all((spot - half < box[1]) & (spot + half > box[0]))) for box in boxes)
 
         cut = np.maximum(np.abs(spot) + half - self.view_m, 0.0).max()

@@ -1,6 +1,5 @@
-"""What pictures share: the look, colours that the colour-blind can tell apart, the same bytes every time."""
+"""What pictures share: the look, and the same bytes every time."""
 
-import base64
 import io
 import warnings
 from pathlib import Path
@@ -14,22 +13,10 @@ from matplotlib.figure import Figure
 
 from harness.core.errors import unknown
 from harness.core.files import write_whole
+from harness.report.drawing.colours import INK
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: tuple[Format, ...] = ("svg", "pdf", "png")
-
-# Okabe and Ito 2008.
-BLUE, SKY, GREEN, ORANGE, VERMILLION, PURPLE = (
-    "#0072B2",
-    "#56B4E9",
-    "#009E73",
-    "#E69F00",
-    "#D55E00",
-    "#CC79A7",
-)
-INK, GREY, PALE = "#222222", "#777777", "#DDDDDD"
-COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, INK)  # of series, in their order
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -79,8 +66,3 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
         write_whole(out, data.getvalue())
     else:
         out.write(data.getvalue())
-
-
-def uri(svg: bytes) -> str:
-    """A picture as what an `img` of a page that stands alone takes."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()

@@ -1,8 +1,4 @@
-"""A scene from above, north up: who is where, and what one vehicle sees of it.
-
-Pictures are in metres to the east and to the *north*; the frame of `harness.world.road` has south instead, so
-every position is flipped on its way in.
-"""
+"""A scene from above, north up: who is where, and what one vehicle sees of it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,19 +10,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from harness.core.arrays import Floats
 from harness.core.errors import printable, unknown
 from harness.dataset.load import Scene
-from harness.report.drawing.ground import ground, north_up
+from harness.report.drawing.colours import BLUE, GREY, INK, PURPLE, VERMILLION
+from harness.report.drawing.geometry import VIEW_M, conflict_points, north_up
+from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.labels import Labels
-from harness.report.drawing.pictures import BLUE, GREY, INK, PURPLE, VERMILLION, Format, save, styled
-from harness.world.road import LANE_WIDTH_M
+from harness.report.drawing.pictures import Format, save, styled
+from harness.world import scenarios
 from harness.world.state import VehicleState
 
-VIEW_M = 80.0  # from the centre of the junction to the edge of the picture
 SIDE_IN = 5.8  # of the square that shows it
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
-TEXT_PT = 6.5
 
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": BLUE, "edgecolor": INK, "linewidth": 1.0},
@@ -34,6 +29,12 @@ LOOKS: dict[str, dict[str, Any]] = {
     "danger": {"facecolor": VERMILLION, "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }
+HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
+DIAMOND: dict[str, Any] = {
+    "marker": "D", "markerfacecolor": "none", "markeredgecolor": VERMILLION, "markeredgewidth": 1.4,
+}  # fmt: skip
+CROSS: dict[str, Any] = {"marker": "X", "color": PURPLE, "markeredgecolor": INK, "markersize": 7}
+SIGHT = "#005A8C"
 NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other": "other vehicle"}
 
 
@@ -58,12 +59,12 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
 
     figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN + 1.12))
     height = figure.get_figheight()
-    axes = figure.add_axes((0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height))
-    axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[])
+    place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height
+    scenario = scenarios.get(scene.state.scenario)
+    axes = ground(figure, place, scenario, scene.state.buildings)
     labels = Labels(axes, PT_PER_M, TEXT_PT, VIEW_M)
-    for road in ([LANE_WIDTH_M, VIEW_M], [VIEW_M, LANE_WIDTH_M]):
-        labels.discourage(np.array([road, road]) * [[-1.0], [1.0]])
-    ground(axes, scene.state.buildings, VIEW_M, TEXT_PT)
+    for box in scenario.road().ground(VIEW_M).boxes:
+        labels.discourage(box)
     _sight_lines(axes, scene, viewer, seen)
     for vehicle in scene.state.vehicles:
         _vehicle(axes, labels, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
@@ -71,6 +72,13 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     labels.place()
     _words(figure, scene, viewer, seen)
     save(figure, out, format)
+
+
+def style_of(look: str, hidden: bool) -> dict[str, Any]:
+    """How a vehicle's outline is drawn; of one that is hidden only the dashed line."""
+    if not hidden:
+        return dict(LOOKS[look])
+    return {key: value for key, value in LOOKS[look].items() if key != "hatch"} | HIDDEN
 
 
 def _look(scene: Scene, vehicle: VehicleState) -> str:
@@ -81,7 +89,7 @@ def _sight_lines(axes: Axes, scene: Scene, viewer: str, seen: set[str]) -> None:
     eye = scene.state.vehicle(viewer)
     for v in scene.state.vehicles:
         if v.id in seen - {viewer}:
-            axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color="#005A8C", linewidth=0.7, alpha=0.75)
+            axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color=SIGHT, linewidth=0.7, alpha=0.75)
 
 
 def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidden: bool) -> None:
@@ -100,55 +108,31 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
         labels.add(edge, 1.5, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
-    style = dict(LOOKS[look])
+    style = style_of(look, hidden)
     if hidden:
-        style |= {"facecolor": "none", "linestyle": (0, (2, 1.2)), "linewidth": 1.1}
+        style["linewidth"] = 1.1
         style["edgecolor"] = VERMILLION if look == "danger" else style["edgecolor"]
-        style.pop("hatch", None)
     axes.add_patch(Polygon(corners, **style, zorder=3))
     along = north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
     nose = centre + along * vehicle.length_m / 2
     wings = corners[:2] - along * 1.2
-    axes.plot(
-        *np.vstack([wings[0], nose, wings[1]]).T,
-        color="white" if look == "ego" and not hidden else INK,
-        linewidth=0.8,
-        zorder=3,
-    )
+    colour = "white" if look == "ego" and not hidden else INK
+    axes.plot(*np.vstack([wings[0], nose, wings[1]]).T, color=colour, linewidth=0.8, zorder=3)
     if vehicle.speed_mps > 0.5:
         arrow = {
-            "arrowstyle": "-|>,head_width=0.15,head_length=0.3",
-            "color": INK,
-            "linewidth": 0.8,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
+            "arrowstyle": "-|>,head_width=0.15,head_length=0.3", "color": INK, "linewidth": 0.8,
+            "shrinkA": 0, "shrinkB": 0,
+        }  # fmt: skip
         tip = nose + along * vehicle.speed_mps
         axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow)
         labels.block(np.array([nose, tip]))
     radius_m = vehicle.length_m / 2
     if look == "danger":
-        axes.plot(
-            *centre,
-            marker="D",
-            markersize=15,
-            markerfacecolor="none",
-            markeredgecolor=VERMILLION,
-            markeredgewidth=1.4,
-        )
+        axes.plot(*centre, markersize=15, **DIAMOND)
         radius_m = max(radius_m, 4.2)
         labels.block(centre + np.array([[-4.0, -4.0], [4.0, 4.0]]))
     labels.block(corners)
     labels.add(centre, radius_m, text, bold=look in ("ego", "danger"))
-
-
-def conflict_points(scene: Scene, viewer: str) -> Floats:
-    """Where a viewer sees paths cross, (n, 2) m to the east and north, as its graph orders them."""
-    eye = scene.state.vehicle(viewer)
-    cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
-    conflicts = scene.record["graphs"][viewer]["conflicts"]
-    relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
-    return north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
 
 
 def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
@@ -156,9 +140,7 @@ def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
     conflicts = scene.record["graphs"][viewer]["conflicts"]
     points = conflict_points(scene, viewer)
     for conflict, point in zip(conflicts, points, strict=True):
-        axes.plot(
-            *point, marker="X", markersize=7, color=PURPLE, markeredgecolor=INK, markeredgewidth=0.7, zorder=4
-        )
+        axes.plot(*point, markeredgewidth=0.7, zorder=4, **CROSS)
         labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))
         text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
         # Labels of two points go apart, or their lines would cross.
@@ -185,29 +167,18 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
     figure.text(left, 1 - 0.45 / height, printable("; ".join(parts), 110), size=7.5)
 
     handles: list[Any] = [Patch(**LOOKS[look], label=NAMES[look]) for look in ("ego", "helper")]
-    danger = Line2D(
-        [], [], linestyle="none", marker="D", markersize=7, markerfacecolor="none", markeredgewidth=1.4
-    )
-    danger.set(markeredgecolor=VERMILLION, label=NAMES["danger"])
-    handles += [danger, Patch(**LOOKS["other"], label=NAMES["other"])]
-    handles.append(
-        Patch(
-            facecolor="none", edgecolor=INK, linestyle=(0, (2, 1.2)), label=f"hidden from {printable(viewer)}"
-        )
-    )
-    handles.append(Line2D([], [], color="#005A8C", linewidth=0.9, label="sight line"))
-    cross: dict[str, Any] = {"marker": "X", "color": PURPLE, "markeredgecolor": INK, "markersize": 7}
-    handles.append(Line2D([], [], linestyle="none", label="conflict point, time to it", **cross))
-    handles.append(Line2D([], [], color=INK, marker=">", markersize=3, linewidth=0.8, label="way in 1 s"))
+    handles += [
+        Line2D([], [], linestyle="none", markersize=7, label=NAMES["danger"], **DIAMOND),
+        Patch(**LOOKS["other"], label=NAMES["other"]),
+        Patch(**HIDDEN, edgecolor=INK, label=f"hidden from {printable(viewer)}"),
+        Line2D([], [], color=SIGHT, linewidth=0.9, label="sight line"),
+        Line2D([], [], linestyle="none", label="conflict point, time to it", **CROSS),
+        Line2D([], [], color=INK, marker=">", markersize=3, linewidth=0.8, label="way in 1 s"),
+    ]
     figure.legend(
-        handles=handles,
-        loc="lower center",
-        ncols=4,
-        frameon=False,
-        fontsize=7.5,
-        borderpad=0.2,
+        handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=7.5, borderpad=0.2,
         columnspacing=1.6,
-    )
+    )  # fmt: skip
 
 
 def _list(names: Any) -> str:

@@ -1,8 +1,8 @@
 """One still of a driven episode, from above: what moves is drawn over a ground that was drawn once."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import Any
+from itertools import cycle
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 
 from harness.core.errors import printable
 from harness.evaluate.replay import Played, Still
-from harness.report.drawing.ground import ground, north_up
-from harness.report.drawing.pictures import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILLION
-from harness.report.drawing.scene import LOOKS
-from harness.world.scenarios.occluded_intersection import ACTIONS
+from harness.report.drawing.colours import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILLION
+from harness.report.drawing.geometry import VIEW_M, north_up
+from harness.report.drawing.ground import TEXT_PT, ground
+from harness.report.drawing.scene import style_of
 from harness.world.state import Building, VehicleState, WorldState
 
 Pixels = NDArray[np.uint8]  # (height, width, 3)
 
-VIEW_M = 80.0
 SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
-TEXT_PT = 6.5
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 EYES = (BLUE, GREEN, PURPLE, ORANGE)  # of the ego and the helpers: lines to what each sees
 
@@ -36,15 +34,14 @@ class Canvas:
     """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
 
     def __init__(self, played: Played, buildings: Iterable[Building]) -> None:
-        self.played = played
+        self.played, self.actions = played, played.scenario.actions
         height = SIDE_IN + BARS_IN
         self.figure = Figure(figsize=(SIDE_IN, height), dpi=DPI)
-        self.axes = self.figure.add_axes((0.0, BARS_IN / height, 1.0, SIDE_IN / height))
-        self.axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[])
-        ground(self.axes, buildings, VIEW_M, TEXT_PT)
+        place = 0.0, BARS_IN / height, 1.0, SIDE_IN / height
+        self.axes = ground(self.figure, place, played.scenario, buildings)
         self.bars = self.figure.add_axes((0.62, 0.28 / height, 0.35, 0.8 / height))
-        self.bars.set(xlim=(0, 1), ylim=(len(ACTIONS) - 0.5, -0.5), xticks=[0, 0.5, 1])
-        self.bars.set_yticks(range(len(ACTIONS)), labels=ACTIONS, size=7)
+        self.bars.set(xlim=(0, 1), ylim=(len(self.actions) - 0.5, -0.5), xticks=[0, 0.5, 1])
+        self.bars.set_yticks(range(len(self.actions)), labels=self.actions, size=7)
         self.bars.tick_params(labelsize=6, length=2)
         self.lines = [self.figure.text(0.02, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
         self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
@@ -62,13 +59,13 @@ class Canvas:
             self._over(_vehicle(vehicle, vehicle.id in (*seen[ego.id], ego.id)))
         self._over(_names(still.state.vehicles))
         self._over(*_messages(self.played, still))
-        for bar in _bars(still):
+        for bar in _bars(still, self.actions):
             self.bars.add_artist(bar)
             self.bars.draw_artist(bar)
             bar.remove()
         slow = ", thinking (slowed)" if still.open else ""
         self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
-        decision = f"decision {still.decision['action']} at {still.decision['acts_at_s']:.2f} s"
+        decision = f"decision {still.decision.action} at {still.decision.acts_at_s:.2f} s"
         self.lines[3].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
         for line in self.lines[2:]:
             self.figure.draw_artist(line)
@@ -84,19 +81,16 @@ class Canvas:
 
 def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
-    for colour, (viewer, ids) in zip(EYES, seen.items(), strict=True):
+    for colour, (viewer, ids) in zip(cycle(EYES), seen.items(), strict=False):
         lines = [np.array([at[viewer], at[other]]) for other in ids]
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
 
 def _vehicle(vehicle: VehicleState, known: bool) -> Artist:
     """Filled if the ego knew of it when its last decision began."""
-    style: dict[str, Any] = dict(LOOKS[vehicle.part])
-    if vehicle.crashed:
+    style = style_of(vehicle.part, not known)
+    if known and vehicle.crashed:
         style["facecolor"] = VERMILLION
-    if not known:
-        style |= {"facecolor": "none", "linestyle": (0, (2, 1.2))}
-        style.pop("hatch", None)
     return Polygon(north_up(vehicle.corners()), **style)
 
 
@@ -104,13 +98,8 @@ def _names(vehicles: Iterable[VehicleState]) -> Artist:
     """Every vehicle's id beside it, as one outline, which costs a fifth of as many texts."""
     at = north_up(np.array([(v.x_m, v.y_m) for v in vehicles])) + 2.5
     outlines = [_outline(v.id) for v in vehicles]
-    path = Outline.make_compound_path(
-        *(
-            Outline(outline.vertices + place, outline.codes)
-            for outline, place in zip(outlines, at, strict=True)
-        )
-    )
-    return PathPatch(path, facecolor=INK, edgecolor="none")
+    moved = [Outline(o.vertices + place, o.codes) for o, place in zip(outlines, at, strict=True)]
+    return PathPatch(Outline.make_compound_path(*moved), facecolor=INK, edgecolor="none")
 
 
 @lru_cache
@@ -120,26 +109,26 @@ def _outline(name: str) -> Outline:
 
 def _messages(played: Played, still: Still) -> Iterator[Artist]:
     """Each reply on its way from its helper to the ego; one that was lost goes half of it."""
-    latency = played.config["latency"]["inference_s"]
-    sent_s = max(latency.values())
+    latency = played.manifest.latency
+    sent_s = max(latency.ego_s or 0.0, latency.helper_s or 0.0)
     ego = still.state.ego
-    for message in still.decision["messages"] if still.open else ():
-        end_s = (message["arrival_ms"] or still.decision["latency_ms"]) / 1000
+    for message in still.decision.messages if still.open else ():
+        end_s = (message.arrival_ms or still.decision.latency_ms or 0.0) / 1000
         share = np.clip((still.since_s - sent_s) / max(end_s - sent_s, 1e-9), 0.0, 1.0)
-        lost = not message["delivered"]
+        lost = not message.delivered
         share = min(share, 0.5) if lost else share
-        helper = still.state.vehicle(message["from"])
+        helper = still.state.vehicle(message.sender)
         path = north_up(np.array([[helper.x_m, helper.y_m], [ego.x_m, ego.y_m]]))
         place = path[0] + share * (path[1] - path[0])
         yield Line2D(*path.T, color=GREY, linewidth=0.8, linestyle=":")
         if still.since_s >= sent_s:
-            colour = VERMILLION if lost or not message["on_time"] else INK
+            colour = VERMILLION if lost or not message.on_time else INK
             yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
 
 
-def _bars(still: Still) -> Iterator[Artist]:
+def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
     """The policy of the last decision, pale until it is ready."""
     decision = still.decision
-    for n, (action, p) in enumerate(zip(ACTIONS, decision["fused"], strict=True)):
-        colour = VERMILLION if action == decision["action"] else "#BBBBBB"
+    for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
+        colour = VERMILLION if action == decision.action else "#BBBBBB"
         yield Rectangle((0.0, n - 0.4), p, 0.8, color=colour, alpha=0.35 if still.open else 1.0)

@@ -92,7 +92,7 @@ def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixel
         if still.seen != moment:
             moment = still.seen
             seen = {
-                v.id: [node["id"] for node in scene_graph(moment, v.id)["nodes"]]
+                v.id: [node["id"] for node in scene_graph(played.scenario, moment, v.id)["nodes"]]
                 for v in (moment.ego, *moment.helpers)
             }
         yield canvas.picture(still, seen)

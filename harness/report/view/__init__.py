@@ -1,1 +1,1 @@
-"""A folder of runs in the browser of whoever sits at this machine."""
+"""A folder of runs in a browser on this machine."""

@@ -6,11 +6,11 @@ then opened must lie in the folder itself (`folder.py`). What a run says it was 
 prompt and its dataset, is read as by `harness report`: shown only if it has the digest that the run noted.
 
 Other sites get nothing: names other than this machine's are refused, which ends DNS rebinding, and no page
-may be framed, embedded or posted to. The list runs no script. Pages of runs were written by whoever made the
-run, so they are kept apart from it and from each other: `sandbox` gives them an origin of their own, from
-which they can read nothing here, and they may load nothing. Their inline scripts may run as far as their own
-policy lets them, and save files if they are clicked. Browsers show no page that is both in a sandbox and
-`same-origin` with its opener, so these are not.
+may be framed, embedded or posted to. The list runs no script. A run's page is as untrusted as the run's
+author, so pages are kept apart from the list and from each other: `sandbox` gives them an origin of their
+own, from which they can read nothing here, and they may load nothing. Their inline scripts may run as far as
+their own policy lets them, and save files if they are clicked. Browsers show no page that is both in a
+sandbox and `same-origin` with its opener, so these are not.
 """
 
 import asyncio
@@ -93,7 +93,7 @@ class View:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._drawing = asyncio.Lock()  # Matplotlib draws for one at a time
+        self._drawing = asyncio.Lock()  # a page holds all rows of its runs
 
     def index(self, request: Request) -> Response:
         """The list of runs, filtered by `q` and sorted by `sort`."""
@@ -130,7 +130,7 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Two runs held against each other; the one that was begun first is A."""
+        """Two runs compared; the older is A."""
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")

@@ -1,4 +1,4 @@
-"""The pages as text. Whatever a run says of itself is hostile: the report's templates escape it all."""
+"""The pages as text. A run's text is hostile: the report's templates escape it all."""
 
 from collections.abc import Callable, Sequence
 from importlib.resources import files
@@ -33,7 +33,7 @@ def report(folders: Sequence[Path]) -> str:
 
 
 def compared(a: Path, b: Path) -> str:
-    """Run B held against run A."""
+    """Run B compared with run A."""
     return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH)
 
 

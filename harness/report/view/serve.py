@@ -22,7 +22,7 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
         listening: called with the address as soon as it is listened on.
 
     Raises:
-        UserError: the port cannot be had.
+        UserError: the port is not available.
     """
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -30,7 +30,7 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
             listener.bind((LOOPBACK, port))
             listener.listen()
         except OSError as error:
-            what = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be had ({error.strerror})"
+            what = "is in use" if error.errno == errno.EADDRINUSE else f"is not available ({error.strerror})"
             raise UserError(f"--port {port} {what}; give another, or 0 for a free one") from None
         listening(f"http://{LOOPBACK}:{listener.getsockname()[1]}/")
         config = uvicorn.Config(

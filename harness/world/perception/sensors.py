@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core import noise as luck
+from harness.core import noise
 from harness.world.perception.rays import Sweep
 from harness.world.state import VehicleState, WorldState
 
@@ -30,7 +30,7 @@ class Detection:
         id: the object's id (association across vehicles is taken to be perfect).
         sensors: those that reported it, of `camera`, `lidar`, `radar`.
         kind: class by camera, else None.
-        indicator: turn indicator by camera: `left` or `off`; else None.
+        indicator: turn indicator by camera: `left`, `right` or `off`; else None.
         x_m: estimated position of the centre.
         y_m: estimated position of the centre.
         heading_rad: estimated heading; None where only the radar saw it.
@@ -73,7 +73,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
     sensors = tuple(name for name, yes in seen.items() if yes)
     if not sensors:
         return None
-    z = luck.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
+    z = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
 
     # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
     if seen["lidar"]:
@@ -94,7 +94,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
         id=v.id,
         sensors=sensors,
         kind=v.kind if seen["camera"] else None,
-        indicator=("left" if v.route == "left" else "off") if seen["camera"] else None,
+        indicator=v.indicator if seen["camera"] else None,
         x_m=float(x),
         y_m=float(y),
         heading_rad=float(v.heading_rad + np.radians(2.0) * z[3]) if seen["lidar"] else None,

@@ -7,32 +7,29 @@ Three helpers have just left the junction on the three other arms and see what c
 Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from harness.core import noise as luck
-from harness.world.road import SECTORS, crossings, paths
-from harness.world.state import Building, Kind, Part
+from harness.core import noise
+from harness.world.crossroads import JUNCTION_M, SECTORS, road
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import Building, Kind
 
 NAME = "occluded-intersection"
-ACTIONS = ("SLOWER", "IDLE", "FASTER")  # the environment's own names and order; a test holds them together
 BUILDING_END_M = 70.0  # outer walls, from the centre lines
 
 
 @dataclass(frozen=True)
-class Parameters:
-    """Every dial of the scenario. Pairs are bounds of a uniform draw.
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
 
     Attributes:
-        target_speeds_mps: what SLOWER, IDLE and FASTER step through.
         ego_speed_mps: speed at the start.
         ego_start_m: distance from the start to the centroid of the conflict zone.
-        braking_mps2: hardest braking.
-        acceleration_mps2: hardest acceleration.
-        decisions: decisions an episode.
-        decision_period_s: seconds between two decisions.
-        simulation_hz: frames a second.
         time_limit_s: an ego that has not cleared the intersection by then never will.
         delay_allowance_s: how much later than the full-view driver an ego may clear the intersection. A
             needless SLOWER costs about 0.65 s: one is forgiven, two are not.
@@ -51,16 +48,8 @@ class Parameters:
         helper_speed_mps: speed at which they leave.
     """
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
     ego_speed_mps: float = 14.0
     ego_start_m: tuple[float, float] = (61.0, 69.0)
-    braking_mps2: float = 8.0
-    acceleration_mps2: float = 3.0
-    decisions: int = 6
-    decision_period_s: float = 1.0
-    simulation_hz: int = 50
-    time_limit_s: float = 10.0
-    delay_allowance_s: float = 1.0
     cleared_m: float = 2.5
     danger_share: float = 0.75
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
@@ -76,42 +65,12 @@ class Parameters:
     helper_speed_mps: tuple[float, float] = (4.0, 7.0)
 
 
-@dataclass(frozen=True)
-class Spawn:
-    """One vehicle at the start: where on which path, how fast, and its id."""
-
-    id: str
-    kind: Kind
-    part: Part
-    approach: str
-    route: str
-    arc_m: float
-    speed_mps: float
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The start of one episode.
-
-    Attributes:
-        spawns: vehicles in spawn order, the ego first, then the helpers.
-        buildings: one a corner.
-        danger: sector the danger comes from, or None.
-        danger_id: the dangerous vehicle, or None.
-    """
-
-    spawns: tuple[Spawn, ...]
-    buildings: tuple[Building, ...]
-    danger: str | None
-    danger_id: str | None
-
-
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's luck."""
-    p = parameters
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p, paths, crossings = parameters, road().paths, road().crossings
 
     def draw(what: str) -> float:
-        return float(luck.uniforms((1,), NAME, seed, what)[0])
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
 
     def between(what: str, bounds: tuple[float, float]) -> float:
         return bounds[0] + draw(what) * (bounds[1] - bounds[0])
@@ -123,12 +82,12 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     start = between("ego_start", p.ego_start_m)
     # The centroid of the conflict zone lies 1.46 m before the ego's farthest conflict point.
-    ego_arc = crossings()["right", "straight"].ego_arc_m - 1.46 - start
+    ego_arc = crossings["right", "straight"].ego_arc_m - 1.46 - start
     offset = between("danger_offset", p.danger_offset_s)
 
     def timed(approach: str, route: str, speed: float, late: float) -> float:
         """Arc length from which a vehicle is at the conflict point `late` s after a cruising ego."""
-        at = crossings()[approach, route]
+        at = crossings[approach, route]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
     turning = between("turning_speed", p.turning_speed_mps)
@@ -151,7 +110,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
-        arc = paths()[approach, "straight"].junction_m[1]
+        arc = paths[approach, "straight"].ends_m[1]
         arc += between(f"helper_start_{exit_name}", p.helper_start_m)
         if exit_name == "ahead":
             arc += 4.0  # stays clear of the ego that follows it out of the junction
@@ -159,7 +118,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
 
     # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
-    numbers = luck.generator(NAME, seed, "ids").permutation(3)
+    numbers = noise.generator(NAME, seed, "ids").permutation(3)
     roles = ("danger", "truck", "late")
     ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
     for name in sorted(others, key=ids.__getitem__):
@@ -172,3 +131,20 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         ys = sorted((south * between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
         buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
     return Layout(tuple(spawns), tuple(buildings), danger, ids["danger"] if danger else None)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego's centre is far enough behind the junction's exit."""
+    return bool(JUNCTION_M + parameters.cleared_m <= -vehicles[0].position[1])
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "go straight over an intersection", "hiding": "buildings and trucks"},
+)

@@ -1,0 +1,131 @@
+"""CPU seconds and peak memory of whole commands, in turn with those of another checkout if one is given.
+
+    python benchmarks/commands.py [--repeats 3] [--against CHECKOUT] [--copies 14]
+
+CPU is user and system time of the process and its children; memory is that of the largest process. The other
+checkout (a commit of before, say, from `git worktree add`) runs with this interpreter's packages. `--copies`
+also evaluates the shipped dataset so many times over, each copy with other episode numbers and layout seeds;
+0 leaves that out. Medians; every command runs once before it counts, so caches are warm.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from harness.core.files import canonical_json, sha256_bytes
+from harness.core.resources import DATASET
+from harness.dataset.load import find
+
+HERE = Path(__file__).resolve().parent.parent
+AIMS = {  # CPU seconds, and MB of peak memory
+    "eval, 1 440 decision points": (4.0, 250),
+    "eval --limit 1": (1.2, None),
+    "eval, 20 160 decision points": (35.0, 800),
+    "ls": (0.15, None),
+    "model list": (0.15, None),
+    "--help": (0.15, None),
+}
+CHILD = """
+import os, resource, subprocess, sys
+subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+"""
+
+
+def main() -> None:
+    """Print a table and one line of JSON."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--repeats", type=int, default=3)
+    arguments.add_argument("--against", type=Path)
+    arguments.add_argument("--copies", type=int, default=14)
+    given = arguments.parse_args()
+    checkouts = {"here": HERE, **({"against": given.against.resolve()} if given.against else {})}
+    measured = {}
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        proxy = ["eval", "--model", "proxy", "--quiet", "--out", "OUT"]
+        commands = {
+            "--help": ["--help"],
+            "model list": ["model", "list"],
+            "eval --limit 1": [*proxy, "--limit", "1"],
+            "eval, 1 440 decision points": proxy,
+            "ls": ["ls", "RUNS"],
+        }
+        if given.copies:
+            large = copied(given.copies, work / "large")
+            commands["eval, 20 160 decision points"] = [*proxy, "--dataset", str(large)]
+        print(f"{'command':<30}{'checkout':<9}{'CPU s':>8}{'peak MB':>9}{'aim s':>7}{'aim MB':>8}")
+        for name, command in commands.items():
+            repeats = 1 if "20 160" in name else given.repeats
+            figures: dict[str, list[tuple[float, float]]] = {checkout: [] for checkout in checkouts}
+            for n in range(repeats + (repeats > 1)):
+                for checkout, path in checkouts.items():
+                    figure = run(path, command, work / checkout)
+                    if n or repeats == 1:
+                        figures[checkout].append(figure)
+            for checkout, each in figures.items():
+                cpu_s, peak_mb = (statistics.median(column) for column in zip(*each, strict=True))
+                aim_s, aim_mb = AIMS[name]
+                print(f"{name:<30}{checkout:<9}{cpu_s:>8.2f}{peak_mb:>9.0f}{aim_s:>7}{aim_mb or '':>8}")
+                measured[f"{name}, {checkout}"] = {"cpu_s": cpu_s, "peak_mb": peak_mb, "n": len(each)}
+    print(json.dumps(measured))
+
+
+def run(checkout: Path, command: list[str], runs: Path) -> tuple[float, float]:
+    """CPU seconds and peak memory in MB of one command; its run stays in `runs` for `ls`."""
+    runs.mkdir(exist_ok=True)
+    if "OUT" in command:
+        shutil.rmtree(runs / "run", ignore_errors=True)
+    typed = [{"OUT": str(runs / "run"), "RUNS": str(runs)}.get(part, part) for part in command]
+    said = subprocess.run(
+        [sys.executable, "-c", CHILD, sys.executable, "-m", "harness", *typed],
+        env={**os.environ, "PYTHONPATH": str(checkout)},
+        cwd=checkout,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout
+    cpu_s, peak_mb = map(float, said.split()[-2:])
+    return cpu_s, peak_mb
+
+
+def copied(copies: int, out: Path) -> Path:
+    """The shipped dataset so many times over."""
+    shipped = find(DATASET)
+    out.mkdir()
+    lines = [json.loads(line) for line in (shipped / "scenes.jsonl").read_text().splitlines()]
+    episodes = 1 + max(line["episode"] for line in lines)
+    scenes = "".join(
+        canonical_json({
+            **line, "episode": (episode := line["episode"] + n * episodes),
+            "scene": f"{episode:05d}-{line['step']}", "episode_seed": line["episode_seed"] + n * 100_000,
+            "state": {**line["state"], "episode_seed": line["state"]["episode_seed"] + n * 100_000},
+        }) + "\n"
+        for n in range(copies) for line in lines
+    )  # fmt: skip
+    (out / "scenes.jsonl").write_text(scenes)
+    for schema in shipped.glob("*.schema.json"):
+        shutil.copy(schema, out)
+    manifest = json.loads((shipped / "manifest.json").read_text())
+    files = {
+        name: sha256_bytes((out / name).read_bytes()) for name in manifest["files"] if (out / name).exists()
+    }
+    manifest |= {
+        "name": out.name,
+        "episodes": episodes * copies,
+        "decisions": len(lines) * copies,
+        "files": files,
+    }
+    (out / "manifest.json").write_text(canonical_json(manifest))
+    return out
+
+
+if __name__ == "__main__":
+    main()

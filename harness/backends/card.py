@@ -1,0 +1,160 @@
+"""A model card: what a model is, what it may see and where its latency comes from; and its file."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+from harness.backends.failures import Failures
+from harness.backends.registry import engines, find, registrations
+from harness.backends.servers import Server
+from harness.core.config import Count, Seconds, convert, toml
+from harness.core.errors import UserError, printable, unknown
+
+Dtype = Literal["float32", "bfloat16", "auto"]
+Thinking = Literal["none", "switch", "always"]
+LatencySource = Literal["card", "measured"]
+Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 0-9 a-f")]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time of one answer.
+
+    Attributes:
+        source: `card` takes `inference_s` as it stands; `measured` takes each run's own batch-1 seconds.
+        inference_s: declared seconds of one answer; None when measured.
+        basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
+    """
+
+    source: LatencySource
+    inference_s: Seconds | None
+    basis: str
+
+    def __post_init__(self) -> None:
+        if (self.source == "card") != (self.inference_s is not None):
+            raise ValueError('inference_s goes with source = "card", and only with it')
+
+
+@dataclass(frozen=True)
+class Card:
+    """One model on one engine.
+
+    Attributes:
+        name: file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or
+            `replay:<run>`.
+        engine: which backend answers.
+        description: one line for people.
+        latency: time of one answer.
+        weights: directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
+            `replay`; the name a server knows the model by for `openai`; None if model-free.
+        file: name of the GGUF file in `weights`; None where `weights` is the file, or needs none.
+        revision: branch, tag or commit on the hub; None is its default branch.
+        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, compared with it on loading.
+        gated: the hub gives the weights only to who has accepted their licence there.
+        dtype: number format of a checkpoint's weights; `auto` is its own.
+        quantisation: number format of a GGUF file's weights, for people; the file has the say.
+        context_tokens: most tokens of prompt and answer together; None takes the checkpoint's own.
+        thinking: `switch` if its chat template can turn thinking on and off, `always` if it cannot be off.
+        privileged: sees the truth behind the occlusion: an upper reference, never a contestant.
+        licence: SPDX id of the weights, or their licence's name where it has none.
+        max_new_tokens: most tokens of an answer, where the model needs another bound than its prompt's.
+        thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
+        server: where an `openai` model is asked; None for other engines.
+        failures: how often the proxy fails on purpose; None if it never does.
+    """
+
+    name: str
+    engine: str
+    description: str
+    latency: Latency
+    weights: str | None = None
+    file: str | None = None
+    revision: str | None = None
+    sha256: Sha256 | None = None
+    gated: bool = False
+    dtype: Dtype = "auto"
+    quantisation: str | None = None
+    context_tokens: Count | None = None
+    thinking: Thinking = "none"
+    privileged: bool = False
+    licence: str | None = None
+    max_new_tokens: Count | None = None
+    thinking_tokens: Count = 2048
+    server: Server | None = None
+    failures: Failures | None = None
+
+
+@dataclass(frozen=True)
+class _File(Card):
+    """What a file may say: a card, and what is different on other engines."""
+
+    engines: dict[str, Any] = field(default_factory=dict)
+
+
+# Keys that mean something to some engines only; a `Registration` says to which.
+_OF_SOME = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation", "failures",
+            "privileged")  # fmt: skip
+# Keys that a model may have anew for each engine that it runs on.
+_ANEW = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation", "server")
+
+
+def read(path: Path) -> list[Card]:
+    """A file's model on each of its engines; the one it runs on unasked is first.
+
+    Raises:
+        UserError: for every mistake in the file, in one line.
+    """
+    where = f"model card {path}"
+    table = _whole(toml(path, where))
+    others = convert(table, _File, where, name=path.stem).engines
+    table.pop("engines", None)
+    cards = [_card(table, where, path.stem)]
+    shared = {key: value for key, value in table.items() if key not in _ANEW}
+    if cards[0].latency.source == "measured":  # one that was declared says nothing of another engine
+        shared["latency"] = table["latency"]
+    for engine, anew in others.items():
+        at = f"{where} [engines.{printable(engine)}]"
+        other = None if engine == table["engine"] else find(engine)
+        if other is None or "weights" not in other.allowed_keys:
+            allowed = [name for name in _takers("weights") if name != table["engine"]]
+            raise unknown(f"engine in {where}", engine, allowed)
+        if not isinstance(anew, dict):
+            raise UserError(f"{at} = {printable(anew)!r}; allowed: a table")
+        for key in anew:
+            if key not in _ANEW:
+                raise unknown(f"key in {at}", key, _ANEW)
+        cards.append(_card(_whole({**shared, **anew, "engine": engine}), at, f"{path.stem}:{engine}"))
+    return cards
+
+
+def _whole(table: dict[str, Any]) -> dict[str, Any]:
+    """A table with the `inference_s` that a measured latency leaves out."""
+    latency = table.get("latency")
+    return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
+
+
+def _card(table: dict[str, Any], where: str, name: str) -> Card:
+    card = convert(table, Card, where, name=name)
+    if (engine := find(card.engine)) is None:
+        raise unknown(f"engine in {where}", card.engine, engines())
+    for key in _OF_SOME:
+        lacking = key in engine.required_keys and key not in table
+        if lacking or (key in table and key not in engine.allowed_keys):
+            shown = f"[{key}]" if key in ("server", "failures") else key
+            takers = " or ".join(_takers(key))
+            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
+    if card.server and card.thinking == "switch" and not card.server.tells_thinking:
+        raise UserError(
+            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '
+            "tell; else set it at the server, and here none or always"
+        )
+    if card.failures and card.failures.slow_tail and card.latency.source != "card":
+        raise UserError(f'{where} [failures]: a slow tail goes with a latency whose source = "card"')
+    return card
+
+
+def _takers(key: str) -> list[str]:
+    """Engines whose cards may have a key that not all may have."""
+    return [engine for engine, registered in registrations().items() if key in registered.allowed_keys]

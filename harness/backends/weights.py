@@ -1,0 +1,161 @@
+"""A card's weights on disk: where they lie, whether they are whole, and fetching them once, by hand.
+
+Nothing else in the program downloads anything.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from harness.backends.cards import Card
+from harness.backends.registry import capabilities, registration, resolve
+from harness.core.errors import UserError, printable
+from harness.core.files import sha256_file
+from harness.core.resources import find
+
+# Without these AutoTokenizer builds an empty tokenizer and says nothing.
+_TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
+_WEIGHTS = ("*.safetensors", "*.bin")
+_SHARDS = "model.safetensors.index.json"
+# What transformers loads; a repository's other formats of the same weights would come on top.
+_FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
+
+
+def find_checkpoint(card: Card) -> Path:
+    """Directory of a card's checkpoint: as given, beside the cards, or in the hub's cache.
+
+    Raises:
+        UserError: it is nowhere, or its config, weights or tokenizer are not there.
+    """
+    local = find("models", card.weights or "")
+    where = local if local.is_dir() else _snapshot(card)
+    if where is None:
+        at = f" at revision {card.revision!r}" if card.revision else ""
+        raise UserError(
+            f"model {card.name!r}: no directory {card.weights!r}, and none{at} in the hub cache "
+            f"{_hub_cache()}; {fetching(card)}"
+        )
+    wanted = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
+    wanted |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
+    for what, patterns in wanted.items():
+        if not any(path.is_file() for pattern in patterns for path in where.glob(pattern)):
+            raise UserError(
+                f"model {card.name!r} in {where} has no {what} ({' or '.join(patterns)}); {fetching(card)}"
+            )
+    return where
+
+
+def find_gguf(card: Card) -> Path:
+    """The GGUF file of a card: as given, beside the cards, or in the hub's cache.
+
+    Raises:
+        UserError: it is nowhere.
+    """
+    local = find("models", card.weights or "")
+    where = local / card.file if card.file else local
+    hint = "give the path of a .gguf file"
+    if card.file and not local.is_dir():
+        hint = f"run `harness model pull {printable(card.name)}`, or point --model at a .gguf file"
+        where = (_snapshot(card) or local) / card.file
+    if not where.is_file():
+        raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
+    return where
+
+
+def held_to_digest(card: Card, file: Path) -> Path:
+    """The file, if the card's digest is the file's, or the card has none. Raises UserError if it is not."""
+    if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
+        raise UserError(
+            f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {digest}, "
+            f"and the card has {card.sha256}; fetch it again, or mend the card"
+        )
+    return file
+
+
+def pull(card: Card) -> Path:
+    """Download what a card's engine needs and is not there yet, into the hub's cache.
+
+    Returns:
+        The checkpoint's directory, or the GGUF file.
+
+    Raises:
+        UserError: there is nothing to fetch, the hub is not reached or refuses, or what came is not what the
+            card says.
+    """
+    if not capabilities(card.engine).has_weights:
+        raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
+    here = find("models", card.weights or "")
+    if here.exists():
+        raise UserError(f"model {printable(card.name)!r} lies in {printable(here)}: nothing to pull")
+    _download(card)
+    where: Path = resolve(registration(card.engine).finds)(card)
+    held_to_digest(card, where if where.is_file() else where / "model.safetensors")
+    return where
+
+
+def _download(card: Card) -> None:
+    from huggingface_hub import constants, errors, snapshot_download
+    from huggingface_hub.utils import disable_progress_bars, logging
+
+    logging.set_verbosity_error()
+    if not sys.stderr.isatty():
+        disable_progress_bars()
+    patterns = [card.file] if card.file else _FETCHED
+    shown = f"model {printable(card.name)!r}"
+    at = f"{printable(constants.ENDPOINT)}/{printable(card.weights)}"
+    try:
+        snapshot_download(card.weights or "", revision=card.revision, allow_patterns=patterns)
+    except errors.GatedRepoError:
+        raise UserError(
+            f"{shown}: {at} asks for its licence to be accepted; do so on that page, then `hf auth login`"
+        ) from None
+    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):
+        revision = f" at {printable(card.revision)}" if card.revision else ""
+        raise UserError(
+            f"{shown}: there is no {at}{revision}, or it is private; see `hf auth login`"
+        ) from None
+    except Exception as error:  # the hub, the network and the disk fail in any of a dozen types
+        reason = printable(" ".join(str(error).split()), 160)
+        raise UserError(
+            f"{shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their path"
+        ) from None
+
+
+def hub_commit(folder: Path) -> str | None:
+    """The commit that a folder of the hub's cache holds; None for a folder anywhere else."""
+    return folder.name if folder.parent.name == "snapshots" else None
+
+
+def fetching(card: Card) -> str:
+    """What to do about a checkpoint that is not there, or not whole."""
+    if Path(card.weights or "").is_absolute():
+        return "copy the checkpoint again, or give another directory"
+    return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"
+
+
+def _hub_cache() -> Path:
+    """Where the hub's package keeps what it fetched. Importing it to ask would take longer than a listing."""
+    home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    home = os.environ.get("HF_HOME") or f"{home}/huggingface"
+    cache = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE") or f"{home}/hub"
+    return Path(os.path.expandvars(os.path.expanduser(cache)))
+
+
+def _snapshot(card: Card) -> Path | None:
+    """The folder in the hub's cache of a card's repository at its revision; None if it is not there."""
+    repository = _hub_cache() / f"models--{(card.weights or '').replace('/', '--')}"
+    revision = card.revision or "main"
+    reference = repository / "refs" / revision
+    commit = reference.read_text().strip() if reference.is_file() else revision
+    snapshot = repository / "snapshots" / commit
+    return snapshot if snapshot.is_dir() else None
+
+
+def _shards(checkpoint: Path) -> list[str]:
+    """Names of the files that weights are split into; a download that was cut off lacks some."""
+    try:
+        index = json.loads((checkpoint / _SHARDS).read_bytes())
+        return sorted(set(index["weight_map"].values()))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return []

@@ -1,0 +1,131 @@
+"""`harness eval`: a model with a prompt on a dataset."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
+from harness.cli.run import Column, as_mapping, default_out, show
+from harness.core import resources
+from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.dataset.load import Dataset as Frozen
+    from harness.evaluate.spec import Spec
+
+COLUMNS = (
+    Column("success % [95 % CI]", "success_rate", 100, interval=True),
+    Column("gain, points", "success_gain_over_single-local", 100, interval=True),
+    Column("latency", "latency_proxy_ms", unit=" ms"),
+    Column("trigger", "trigger_rate", 100, " %"),
+    Column("msgs", "messages_per_episode"),
+)
+
+
+def command(
+    model: str = typer.Option(
+        "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
+    ),
+    engine: options.Engine = None,
+    prompt: options.Prompt = "v2",
+    dataset: options.Dataset = resources.DATASET,
+    condition: options.Conditions = None,
+    seeds: options.Seeds = "0:5",
+    limit: int | None = typer.Option(None, help="How many of the dataset's episodes. Default: all."),
+    thinking: options.Thinking = False,
+    answer: options.Answer = "json",
+    batch_size: options.BatchSize = 8,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    latency: options.Latency = None,
+    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-<dataset>."),
+    resume: options.Resume = False,
+    no_cache: options.NoCache = False,
+    dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
+    tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
+    tag: options.Tags = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Evaluate a model with a prompt on frozen scenes. Writes the run's folder, with a report."""
+    from harness.backends import cards
+    from harness.backends.cache import default_file
+    from harness.coordination.operating_point import POINTS, named_point
+    from harness.dataset import load
+    from harness.evaluate.asking import request_count
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.run import evaluate
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+
+    if limit is not None and limit < 1:
+        raise UserError(f"--limit {limit}: give 1 or more episodes")
+    frozen = load.load(load.find(dataset), limit)
+    spec = Spec(
+        card=cards.resolve(model, engine),
+        prompt=versions.load(prompt),
+        source=FrozenSource(frozen, limit),
+        points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+        seeds=options.parse_seeds(seeds),
+        thinking=thinking,
+        answer=answer,
+        batch_size=batch_size,
+        device=device,
+        dtype=dtype,
+        latency=latency,
+        tags=tuple(dict.fromkeys(tag or ())),
+    )
+    if dry_run:
+        _dry_run(spec, frozen, tokenizer, as_json, quiet)
+        return
+    folder = out or default_out(spec, resume)
+    silent = as_json or quiet
+    with bar(
+        f"asking {printable(spec.card.name, 30)}", request_count(spec, frozen.scenes), silent
+    ) as progress:
+        cache = None if no_cache else default_file()
+        done = evaluate(spec, folder, resume, progress, cache, progress.more)
+    from harness.cli.report import write
+
+    page = write([folder], quiet=silent, dataset=frozen)
+    if as_json:
+        echo_json(as_mapping(done))
+    if silent:
+        return
+    notes = (
+        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds; intervals over episodes; "
+        "msgs an episode;",
+        "gain is over single-local, paired by episode",
+    )
+    show(done, frozen.name, COLUMNS, notes)
+    typer.echo(f"wrote {page}")
+
+
+def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:
+    from harness.backends.tokens import counter, spread_of
+    from harness.evaluate.asking import requests
+
+    count = counter(tokenizer, spec.card)
+    sizes: dict[str, list[int]] = {}
+    asked = 0
+    for request in requests(spec, dataset.scenes):
+        asked += 1
+        if count:
+            sizes.setdefault(request.role, []).append(count(request.messages))
+    stats = {role: spread_of(n) for role, n in sizes.items()}
+    if as_json:
+        echo_json({**spec.settings(), "requests": asked, "prompt_tokens": stats or None})
+    if as_json or quiet:
+        return
+    scenes = len(dataset.scenes)
+    typer.echo(f"{asked} requests for {scenes} scenes; would score {len(spec.points)} conditions × "
+               f"{len(spec.seeds)} seeds; no model was called")  # fmt: skip
+    for role, s in stats.items():
+        typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
+    if not stats:
+        typer.echo(
+            "prompt tokens: not counted, no tokenizer at hand; give --tokenizer (tokenizer.json or GGUF)"
+        )

@@ -1,0 +1,70 @@
+"""Options that several commands have, each declared once."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Option
+
+from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
+    from harness.evaluate.spec import Latency as LatencySource
+else:  # typer takes any text; what is evaluated says which are allowed
+    AnswerMode = LatencySource = str
+
+MOST_SEEDS = 1000
+MOST_WORKERS = 256
+
+Runs = Annotated[list[Path], Argument(help="Folders of finished runs.", metavar="RUN...")]
+Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds them.")]
+Model = Annotated[str, Option(help="Card, checkpoint directory, .gguf file or hub id. `harness model list`.")]
+Scenario = Annotated[str, Argument(help="Scenario.")]
+Engine = Annotated[str | None, Option(help="Another engine that the card names, such as llama-cpp.")]
+Prompt = Annotated[str, Option(help="Prompt version. `harness prompt list`.")]
+Dataset = Annotated[str, Option(help="Shipped dataset, or a dataset's folder.")]
+Conditions = Annotated[
+    list[str] | None,
+    Option(help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all."),
+]
+Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
+FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
+Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
+Answer = Annotated[AnswerMode, Option(help="json: free text; constrained: to the schema; readout: letters.")]
+BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
+Workers = Annotated[int, Option(help="Processes.")]
+ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded.")]
+Device = Annotated[str | None, Option(help="cpu or cuda.")]
+Dtype = Annotated[str | None, Option(help="float32, bfloat16 or auto, in place of the card's.")]
+Latency = Annotated[
+    LatencySource | None,
+    Option(help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's."),
+]
+Resume = Annotated[bool, Option("--resume", help="Continue a run that was stopped.")]
+NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that an earlier run has.")]
+Tags = Annotated[list[str] | None, Option(help="Word to find the run by. Repeatable.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, Option("--quiet", help="Print nothing but errors, and what --json asks for.")]
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds from `0:5` (0 to 4) or `3,7,9`."""
+    start, colon, stop = text.partition(":")
+    try:
+        # A range is counted before it is made: 0:99999999999 would not fit into memory.
+        most = int(start) + MOST_SEEDS + 1 if colon else 0
+        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
+    except ValueError:
+        seeds = ()
+    if not 0 < len(seeds) <= MOST_SEEDS:
+        raise UserError(
+            f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
+            f"of {MOST_SEEDS} seeds at most"
+        )
+    return seeds
+
+
+def in_range(option: str, value: int, least: int, most: int) -> None:
+    """Raise UserError unless `least` <= `value` <= `most`."""
+    if not least <= value <= most:
+        raise UserError(f"{option} {value} is out of range; give {least} to {most}")

@@ -1,0 +1,99 @@
+"""What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from harness.cli.estimates import console, interval, table
+from harness.core.errors import printable
+
+if TYPE_CHECKING:
+    from harness.evaluate.run import Evaluated
+    from harness.evaluate.spec import Spec
+    from harness.runs.records import Manifest, Score
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a run's table: the metric, and how it is written. `interval`: with its ends."""
+
+    head: str
+    metric: str
+    scale: float = 1.0
+    unit: str = ""
+    interval: bool = False
+
+    def cell(self, score: "Score | None") -> str:
+        """The metric's score; a dash if there is none."""
+        if score is None or score.value is None:
+            return "-"
+        if self.interval:
+            return interval(score.value, score.low, score.high, self.scale)
+        return f"{score.value * self.scale:.1f}{self.unit}"
+
+
+def file_name(model: str) -> str:
+    """A model's name as part of a folder's."""
+    return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
+
+
+def default_out(spec: "Spec", resume: bool) -> Path:
+    """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
+    mode = "" if spec.answer == "json" else f"-{spec.answer}"
+    name = f"{file_name(spec.card.name)}-{spec.prompt.version}{mode}-{spec.source.name}"
+    last = free = Path("reports") / name
+    number = 1
+    while free.exists():
+        last, number = free, number + 1
+        free = free.with_name(f"{name}-{number}")
+    return last if resume else free
+
+
+def as_mapping(done: "Evaluated") -> dict[str, Any]:
+    """A finished run for machines: its folder, its manifest and the rows of its summary."""
+    variant = msgspec.to_builtins(done.manifest.variant)
+    return {
+        "run": str(done.out),
+        "manifest": msgspec.to_builtins(done.manifest),
+        "summary": [{**variant, **msgspec.to_builtins(score)} for score in done.scores],
+    }
+
+
+def show(
+    done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str], tight: bool = False
+) -> None:
+    """Print a run's table, a row a condition, with what it was run on and what to know about it."""
+    m = done.manifest
+    figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
+    names = [point["name"] for point in m.conditions]
+    text = console()
+    text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
+    table(
+        ("condition", *(column.head for column in columns)),
+        [(name, *(column.cell(figures.get((name, column.metric))) for column in columns)) for name in names],
+        tight,
+    )
+    for note in (*notes, *_origins(m, figures)):
+        text.print(note)
+
+
+def _origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
+    """Where a run's times come from and how its answers were read."""
+    yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
+    if (m.latency.load_a_core or 0) > 1:
+        yield (
+            f"timed on a busy machine ({m.latency.load_a_core} processes a core): "
+            "let it run alone, or use --latency card or paper"
+        )
+    if m.cached_answers:
+        yield f"{m.cached_answers} answers came from the cache (--no-cache asks anew)"
+    if m.engine_errors:
+        yield f"{m.engine_errors} answers are errors of the engine; answers.jsonl has its messages"
+    for role in ("ego", "helper", "merge"):
+        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
+        if shares[0] is not None:
+            values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
+            yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}"

@@ -1,0 +1,138 @@
+"""Configuration as typed records. A mistake is one line: file, table and key, the value, what is allowed.
+
+A record is a frozen dataclass or a `msgspec.Struct`, nested as the file's tables are. Its annotations are the
+rules: `Literal[...]` lists choices; `Annotated[float, Meta(ge=0, description="seconds, 0 or more")]` bounds a
+value and says so in words; a ValueError from `__post_init__` says what is wrong with a table as a whole. No
+value is converted but an integer to a float. An unknown key is refused, with the nearest one that exists.
+
+    @dataclass(frozen=True)
+    class Channel:
+        model: Literal["ideal", "radio"]
+        loss: Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")] = 0.0
+
+    convert(toml(path, f"channel file {path}"), Channel, f"channel file {path}")
+"""
+
+import re
+import tomllib
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from sys import float_info
+from typing import Annotated, Any, TypeVar, cast
+
+import msgspec
+from msgspec.inspect import type_info
+
+from harness.core.errors import UserError, printable, unknown
+
+Record = TypeVar("Record")
+Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=float_info.max, description="seconds, 0 or more")]
+_type_info = cache(type_info)
+_MISSING = re.compile(r"Object missing required field `(.+)`")
+_STEPS = re.compile(r"[^.\[\]`]+")  # of a path such as `.points[1].loss`
+_IN_WORDS = {"object": "a table", "array": "a list"}
+
+
+def toml(path: Path, where: str) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Args:
+        path: the file, which is there.
+        where: what it is called in messages, such as `model card models/mine.toml`.
+
+    Raises:
+        UserError: it is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{where} is no TOML: {printable(error)}; mend the file") from None
+
+
+def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
+    """A record of some kind from a table, as TOML and JSON have them.
+
+    Args:
+        table: its keys are names of fields.
+        kind: class of the record.
+        where: what the table is called in messages.
+        given: fields that the program fills in, which the table may not hold.
+
+    Raises:
+        UserError: an unknown or missing key, or a value that is not allowed.
+    """
+    info = _type_info(cast("Hashable", kind))
+    for path, key, known in _unknown_keys(table, info, (), given):
+        raise unknown(f"key in {_place(where, path)}", key, known)
+    try:
+        return msgspec.convert({**table, **given}, kind)
+    except msgspec.ValidationError as error:
+        raise _mistake(str(error), table, info, where) from None
+
+
+def _place(where: str, path: Sequence[str]) -> str:
+    return f"{where} [{'.'.join(path)}]" if path else where
+
+
+def _unknown_keys(
+    value: Any, kind: Any, path: tuple[str, ...], but: Collection[str] = ()
+) -> Iterator[tuple[tuple[str, ...], str, list[str]]]:
+    """Path of a table, key that is none of its record's fields, and the fields' names."""
+    if isinstance(value, Mapping) and (fields := _fields(kind)):
+        for key, inner in value.items():
+            if key in but or key not in fields:
+                yield path, key, [name for name in fields if name not in but]
+            else:
+                yield from _unknown_keys(inner, fields[key], (*path, key))
+    elif isinstance(value, Mapping | list) and (item := _item(kind)):
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _unknown_keys(inner, item, (*path, str(key)))
+
+
+def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> UserError:
+    """What msgspec says, such as "Expected `int`, got `str` - at `$.latency.n`", as a line for people."""
+    said, _, at = message.partition(" - at `$")
+    path = _STEPS.findall(at)
+    if missing := _MISSING.fullmatch(said):
+        return UserError(f"{_place(where, path)} has no {missing[1]}; add it")
+    # From a __post_init__, of the whole, or inside a member that msgspec does not name.
+    if not said.startswith(("Expected", "Invalid enum")) or not path or "[...]" in at[:-6]:
+        return UserError(f"{_place(where, path)}: {printable(said)}")
+    value: Any = table
+    for step in path:
+        value = value[int(step) if isinstance(value, list) else step]
+        kind = (_fields(kind) or {}).get(step) or _item(kind)
+    *tables, key = path
+    if said.startswith("Invalid enum"):
+        return unknown(f"{key} in {_place(where, tables)}", str(value), map(str, _plain(kind).values))
+    expected, _, got = said.removeprefix("Expected ").replace("`", "").partition(", got ")
+    kinds = " or ".join(_IN_WORDS.get(name, name) for name in expected.split(" | ") if name != "null")
+    allowed = kinds if got else _description(kind) or kinds
+    return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    """Types of a record's fields; empty for any other type."""
+    return {field.encode_name: field.type for field in getattr(_plain(kind), "fields", ())}
+
+
+def _item(kind: Any) -> Any:
+    """Type of what a list or a table of any keys holds; None for any other type."""
+    plain = _plain(kind)
+    return getattr(plain, "item_type", None) or getattr(plain, "value_type", None)
+
+
+def _plain(kind: Any) -> Any:
+    """A type without null and without what describes it."""
+    if hasattr(kind, "extra_json_schema"):
+        return _plain(kind.type)
+    others = [one for one in getattr(kind, "types", ()) if type(one).__name__ != "NoneType"]
+    return _plain(others[0]) if len(others) == 1 else kind
+
+
+def _description(kind: Any) -> str | None:
+    """The words of a type's `Meta(description=...)`."""
+    words: str | None = (getattr(kind, "extra_json_schema", None) or {}).get("description")
+    return words or next(filter(None, map(_description, getattr(kind, "types", ()))), None)

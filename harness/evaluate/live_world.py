@@ -1,0 +1,205 @@
+"""The closed loop: each decision is made from what vehicles see when it is due, and acts when it is ready.
+
+Decision k is due at k decision periods. The model answers from what each vehicle sees then; the action is
+taken in the first frame that begins after the decision's latency, and until then the ego keeps to its last
+action. A decision that is still open when the next is due continues, and the next one is skipped.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import product
+from typing import Any, ClassVar
+
+import numpy as np
+
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.files import digest
+from harness.dataset.freeze import moment
+from harness.dataset.load import Scene
+from harness.evaluate.branches import Course, Decision, Trajectory
+from harness.evaluate.walk import Decided, Due, channel_draws
+from harness.runs import metrics
+from harness.runs.records import ClosedLoop, Episode
+from harness.world import reference, scenarios
+from harness.world.drivers import PRIVILEGED
+from harness.world.outcome import Outcome
+from harness.world.scenario import Scenario
+from harness.world.world import World
+
+ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
+
+
+@dataclass(frozen=True)
+class LiveSource:
+    """Layouts of a scenario that are driven: episode e has layout seed `first_seed` + e."""
+
+    first_seed: int
+    episodes: int
+    scenario_name: str = scenarios.DEFAULT
+    name: ClassVar[str] = "drive"
+    kind: ClassVar[metrics.World] = "closed-loop"
+    command: ClassVar[str] = "drive"
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """What is driven."""
+        return scenarios.get(self.scenario_name)
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The scenario's."""
+        return self.scenario.actions
+
+    def record(self) -> ClosedLoop:
+        """The scenario, and which of its layouts."""
+        parameters = asdict(self.scenario.parameters)
+        return ClosedLoop(
+            scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
+            episodes=self.episodes, late_against="full-view driver, whose decisions act at once",
+        )  # fmt: skip
+
+    def options(self) -> list[tuple[str, object]]:
+        """Which layouts of which scenario."""
+        return [
+            ("--scenario", self.scenario_name),
+            ("--episodes", self.episodes),
+            ("--first-seed", self.first_seed),
+        ]
+
+    def trial(self, most: int, ego_alone: bool) -> list[Scene]:
+        """One decision point of each of some episodes, a while after its start."""
+        scenes, p = [], self.scenario.parameters
+        for number in range(min(most, self.episodes)):
+            trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
+            trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
+            scenes.append(look(trajectory, 0, ego_alone))
+        return scenes
+
+
+class LiveWorld:
+    """Some episodes of a scenario under all conditions and seeds, which share worlds until they part."""
+
+    def __init__(
+        self, scenario: Scenario, first_seed: int, numbers: Sequence[int],
+        points: Sequence[OperatingPoint], seeds: Sequence[int], ego_alone: bool,
+    ) -> None:  # fmt: skip
+        """The first moments.
+
+        Args:
+            scenario: what is driven.
+            first_seed: layout seed of episode 0.
+            numbers: of the episodes.
+            points: the conditions.
+            seeds: of the channel's draws.
+            ego_alone: whether helpers are not asked, so need not look.
+        """
+        self._scenario, self._p = scenario, scenario.parameters
+        self._first_seed, self._ego_alone = first_seed, ego_alone
+        ways = list(product(points, seeds))
+        self._going = [
+            Trajectory(n, World.start(scenario, first_seed + n), [Course(*way) for way in ways])
+            for n in numbers
+        ]
+        self._ended: list[Trajectory] = []
+        self._decisions: list[Decision] = []
+        self._step = 0
+
+    def observe(self) -> Sequence[Scene]:
+        """Every moment in which some episode has no open decision, once."""
+        while self._going and self._step < self._p.decisions:
+            for trajectory in self._going:
+                for course in trajectory.courses:
+                    course.skipped += course.open is not None
+            self._deciding = [t for t in self._going if any(c.open is None for c in t.courses)]
+            if self._deciding:
+                self._moments = [look(t, self._step, self._ego_alone) for t in self._deciding]
+                return self._moments
+            self._advance()
+        return ()
+
+    def due(self, point: OperatingPoint) -> Due:
+        """Each episode of the condition that has no open decision."""
+        places = self._places(point)
+        at = np.array([n for n, _ in places], dtype=int)
+        seed = np.array([course.seed for _, course in places], dtype=int)
+        episode = np.array([trajectory.number for trajectory in self._deciding])[at]
+        helpers = max(len(scene.viewers) for scene in self._moments) - 1
+        step = np.full(len(at), self._step)
+        draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
+        return Due(at, episode, seed, draws)
+
+    def step(self, decided: Sequence[Decided[Scene]]) -> None:
+        """Open every decision, and simulate until the next are due."""
+        actions, hz = self._scenario.actions, self._p.simulation_hz
+        begun = round(self._step * self._p.decision_period_s * hz)
+        for part in decided:
+            latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
+            for (_, course), latency_s, action in zip(
+                self._places(part.point), latencies_s, chosen, strict=True
+            ):
+                course.open = Decision(actions[action], begun + frames(latency_s, hz))
+                self._decisions.append(course.open)
+        self._advance()
+
+    def _places(self, point: OperatingPoint) -> list[tuple[int, Course]]:
+        return [
+            (n, course) for n, trajectory in enumerate(self._deciding) for course in trajectory.courses
+            if course.open is None and course.point is point
+        ]  # fmt: skip
+
+    def _advance(self) -> None:
+        self._step += 1
+        p = self._p
+        until_s = p.time_limit_s if self._step == p.decisions else self._step * p.decision_period_s
+        parts = [part for t in self._going for part in t.advance(round(until_s * p.simulation_hz))]
+        self._ended += [part for part in parts if part.world.outcome.ended]
+        self._going = [part for part in parts if not part.world.outcome.ended]
+
+    def columns(self) -> dict[str, Any]:
+        """When each decision acts, and whether it has, in the order of decisions."""
+        return {
+            "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
+            "acted": np.array([d.acted for d in self._decisions]),
+        }
+
+    def episodes(self) -> list[Episode]:
+        """How each episode ended; late against a full-view driver whose decisions act at once."""
+        references = {
+            number: reference.drive(self._scenario, PRIVILEGED, self._first_seed + number)
+            for number in sorted({t.number for t in self._ended if t.world.outcome.success})
+        }
+        return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
+
+
+def frames(latency_s: float, simulation_hz: int) -> int:
+    """Whole frames that a decision takes."""
+    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
+
+
+def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
+    """The decision point of a trajectory now. Equal states have equal ids anywhere."""
+    world = trajectory.world
+    state = replace(world.state(), step=step)
+    viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
+    seen = moment(world, state, trajectory.number, viewers)
+    return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
+
+
+def _episode(trajectory: Trajectory, course: Course, against: Outcome | None) -> Episode:
+    """How an episode ended; it is `late` if it cleared too long after the reference."""
+    world = trajectory.world
+    ended = world.outcome
+    outcome = ended.judged(against, world.scenario.parameters) if against else ended
+    delay_s = None
+    if against and against.time_s is not None and against.success and ended.success:
+        delay_s = round((ended.time_s or 0.0) - against.time_s, 3)
+    return Episode(
+        condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
+        danger=world.layout.danger or "none", success=outcome.success,
+        failure="" if outcome.success else outcome.result, delay_s=delay_s, time_s=outcome.time_s,
+        partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
+        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.hard_brakings,
+        other_crashes=outcome.other_crashes, skipped=course.skipped,
+    )  # fmt: skip

@@ -1,0 +1,336 @@
+"""`harness eval` and `harness drive`: walk, score, write. A killed run resumes where it was."""
+
+import math
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import lru_cache, partial
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+
+from harness.backends.base import Backend, Request
+from harness.backends.cache import cached
+from harness.backends.cards import Card
+from harness.backends.registry import open_backend
+from harness.core.errors import UserError, printable
+from harness.core.files import alone, canonical_json, digest, write_whole
+from harness.core.memory import uncollected
+from harness.core.parallel import spread
+from harness.dataset.load import Scene
+from harness.evaluate import latency as latencies
+from harness.evaluate.asking import Asker, fusion_request, requests
+from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.spec import Spec, versions
+from harness.evaluate.walk import heard_codes, table, walk
+from harness.runs import folder
+from harness.runs.decisions import Decisions
+from harness.runs.formats import CONFIG, FORMAT, WORK
+from harness.runs.metrics import Grid
+from harness.runs.records import Answer, Episode, Latency, Manifest, Score
+from harness.runs.summary import counted, scores
+
+if TYPE_CHECKING:  # the simulator is loaded by who drives
+    from harness.evaluate.live_world import LiveSource, LiveWorld
+
+EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
+LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """A finished run: its folder, its manifest and its summary."""
+
+    out: Path
+    manifest: Manifest
+    scores: Sequence[Score]
+
+
+def evaluate(
+    spec: Spec,
+    out: Path,
+    resume: bool,
+    progress: Callable[[int], None],
+    cache: Path | None = None,
+    more: Callable[[int], None] = lambda count: None,
+    workers: int = 1,
+) -> Evaluated:
+    """Evaluate a model with a prompt and write the run's folder; the same for any number of workers.
+
+    Args:
+        spec: what is evaluated.
+        out: the run's folder.
+        resume: continue the run that a kill left there.
+        progress: called with the number of new answers, or of episodes just driven, those kept from before
+            included.
+        cache: file of completions kept between runs, for language models; None for no cache.
+        more: called with the number of fusion calls on frozen scenes, once it is known.
+        workers: processes that drive, each with a backend of its own.
+
+    Raises:
+        UserError: the folder holds something else, or the model is not available. Nothing is written then.
+    """
+    if resume and (out / "run.json").is_file():
+        return finished(spec, out)
+    refuse(spec, out, resume)
+    if isinstance(spec.source, FrozenSource):
+        done = _frozen(spec, spec.source, out, progress, cache, more)
+    else:
+        done = _closed_loop(spec, cast("LiveSource", spec.source), out, progress, cache, workers)
+    tidy(out)
+    return done
+
+
+@dataclass(frozen=True)
+class Walked:
+    """All that a walk decided, how its episodes ended, and the answers by request id."""
+
+    decisions: Decisions
+    episodes: Sequence[Episode]
+    answers: dict[str, Answer]
+
+
+def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
+    decided = list(chain.from_iterable(walk(world, spec.points, asker)))
+    return Walked(table(decided, world.columns(), spec.actions), world.episodes(), asker.answers)
+
+
+def _frozen(
+    spec: Spec, source: FrozenSource, out: Path, progress: Callable[[int], None], cache: Path | None,
+    more: Callable[[int], None],
+) -> Evaluated:  # fmt: skip
+    scenes = source.dataset.scenes
+    backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
+    with working(spec, out, backend.identity()) as work:
+        # Times are those of the backend itself: the cache answers in no time.
+        latency = latencies.declared(spec, backend) or latencies.kept(work / "latency.json")
+        trial = partial(requests, spec, latencies.sample(scenes))
+        if latency is None:
+            latency = latencies.measured(spec, backend, list(trial()))
+        asked = cached(backend, spec.card, cache)
+        asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
+        asker.ask(list(requests(spec, scenes)))
+        if latency.each_its_own and latencies.lacks_times(asker.answers):
+            asker.latency = latencies.timed(backend, list(trial()))
+        latencies.keep(work / "latency.json", asker.latency)
+        if any(point.asks_again for point in spec.points):
+            calls = _fusion_calls(spec, source, asker)
+            asker.ask_fusion(calls, calls)
+            latencies.keep(work / "latency.json", asker.latency)
+        with uncollected():
+            walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
+        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), asker.latency)
+
+
+def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Request]:
+    """All fusion calls of a run, scene by scene: what frozen scenes show depends on no decision.
+
+    They are made before the walk, so that the time of one may count for another, whatever their steps.
+    """
+    world = FrozenWorld(source.dataset, spec.seeds)
+    asked: list[Request] = []
+    while scenes := world.observe():
+        codes = heard_codes({point: world.due(point) for point in spec.points}, asker(scenes))
+        asked += asker.fusion_requests(scenes, codes)
+    place = {scene.id: n for n, scene in enumerate(source.dataset.scenes)}
+    return sorted(asked, key=lambda request: place[request.id.partition("/")[0]])
+
+
+def _closed_loop(
+    spec: Spec, source: "LiveSource", out: Path, progress: Callable[[int], None], cache: Path | None,
+    workers: int,
+) -> Evaluated:  # fmt: skip
+    # Compiled templates do not travel between processes.
+    spec = replace(spec, prompt=replace(spec.prompt))
+    # Engines are opened where they answer: a forked process has none of their threads.
+    [(identity, latency)] = spread(_begin, [spec], workers, lambda done: None)
+    with working(spec, out, identity) as work:
+        latency = latencies.keep(work / "latency.json", latencies.kept(work / "latency.json") or latency)
+        size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
+        chunks = [range(at, min(at + size, source.episodes)) for at in range(0, source.episodes, size)]
+        sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
+        drive = partial(_driven, spec, source.first_seed, latency, work, cache)
+        parts = spread(drive, chunks, min(workers, len(chunks)), lambda done: progress(next(sizes)))
+        with uncollected():
+            read = [folder.read_part(part, spec.actions) for part in parts]
+            walked = Walked(
+                Decisions.concat([decisions for decisions, _, _ in read]),
+                [episode for _, episodes, _ in read for episode in episodes],
+                {answer.id: answer for _, _, answers in read for answer in answers},
+            )
+            return _written(spec, out, work, tuple(range(source.episodes)), walked, identity, latency)
+
+
+def _driven(
+    spec: Spec, first_seed: int, latency: Latency, work: Path, cache: Path | None, chunk: range
+) -> Path:
+    """Drive a chunk, unless a killed run did."""
+    from harness.evaluate.live_world import LiveWorld
+
+    part = work / f"episodes-{chunk.start:06d}"
+    if not part.is_dir():
+        asker = Asker(
+            spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
+        )
+        world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+        walked = _walked(spec, world, asker)
+        folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
+    return part
+
+
+def _begin(spec: Spec) -> tuple[dict[str, Any], Latency]:
+    """Identity of the model and latency of its decisions in the closed loop.
+
+    An answer's own seconds depend on what else the machine does, so a measured latency is always the median
+    of a sample: the same in every episode, with any number of workers.
+    """
+    backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, None)
+    latency = latencies.declared(spec, backend)
+    if latency:
+        return backend.identity(), latency
+    scenes = cast("LiveSource", spec.source).trial(latencies.SAMPLE, spec.ego_alone)
+    trial = replace(spec, batch_size=2)
+    latency = latencies.measured(trial, backend, list(requests(trial, scenes)))
+    if latency.ego_s is None or latency.helper_s is None:
+        raise UserError(
+            f"--model {printable(spec.card.name)}: none of {len(scenes)} trial answers could be timed, and "
+            "an episode needs a latency; see what `harness model check` says"
+        )
+    if any(point.asks_again for point in spec.points):
+        asker = Asker(trial, lambda: backend, latency)
+        asker.ask(list(requests(trial, scenes)))
+        fusion = list(_with_every_message(trial, scenes, asker.answers))
+        if fusion:
+            latency = latencies.with_fusion(latency, backend, fusion)
+    return backend.identity(), msgspec.structs.replace(latency, fusion_s=latency.fusion_s or latency.ego_s)
+
+
+def _with_every_message(spec: Spec, scenes: Sequence[Scene], answers: dict[str, Answer]) -> Iterator[Any]:
+    for scene in scenes:
+        said = {v: answers[f"{scene.id}/{v}"] for v in scene.viewers}
+        if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
+            yield fusion_request(spec, scene, said, heard)
+
+
+@lru_cache(maxsize=2)
+def _opened(
+    card: Card, device: str | None, dtype: str | None, batch_size: int, cache: Path | None
+) -> Backend:
+    """This process's backend, with the cache in front of a language model's."""
+    if cache is not None:
+        backend = _opened(card, device, dtype, batch_size, None)
+        return cached(backend, card, cache)
+    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
+
+
+def _written(
+    spec: Spec, out: Path, work: Path, numbers: tuple[int, ...], walked: Walked, identity: dict[str, Any],
+    latency: Latency,
+) -> Evaluated:  # fmt: skip
+    """Score a walk and write the run's files, the manifest last."""
+    begun = _begun(work)
+    spec = spec.tagged(begun)
+    grid = Grid(tuple(point.name for point in spec.points), spec.seeds, numbers)
+    episodes = counted(grid, walked.decisions, walked.episodes)
+    answers = folder.ordered(walked.answers.values(), walked.decisions)
+    summary = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
+    manifest = msgspec.convert({
+        "format": FORMAT, "name": out.name, "created": begun["created"], "command": spec.command(out),
+        "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency), "identity": identity,
+        "cached_answers": sum(answer.cached for answer in answers),
+        "engine_errors": sum(answer.error is not None for answer in answers),
+        "versions": versions(),
+    }, Manifest)  # fmt: skip
+    folder.write(out, manifest, walked.decisions.rounded(), episodes, answers, summary)
+    return Evaluated(out, manifest, summary)
+
+
+def finished(spec: Spec, out: Path) -> Evaluated:
+    """The run that is there already. Raises UserError if it is another run, or damaged."""
+    run = folder.read(out)
+    _same(spec.settings(), msgspec.json.decode(msgspec.json.encode(run.manifest)), out)
+    tidy(out)
+    return Evaluated(out, run.manifest, run.scores)
+
+
+def tidy(out: Path) -> None:
+    """Remove what the work left, and what kills left of files half written."""
+    shutil.rmtree(out / WORK, ignore_errors=True)
+    for part in out.glob(".*.part"):
+        part.unlink(missing_ok=True)
+
+
+def refuse(spec: Spec, out: Path, resume: bool) -> None:
+    """Raise before anything is loaded or written, if the folder cannot be used."""
+    shown = printable(out)
+    if (out / "run.json").exists():
+        raise UserError(f"--out {shown} already holds a finished run; choose another folder or delete it")
+    if (out / WORK / CONFIG).is_file():
+        if not resume:
+            raise UserError(f"--out {shown} holds an unfinished run; add --resume to go on, or delete it")
+        _same(spec.settings(), _begun(out / WORK)["settings"], out)
+    elif out.exists() and (not out.is_dir() or any(p.name != WORK for p in out.iterdir())):
+        raise UserError(f"--out {shown} exists and is no run; choose another folder")
+
+
+def _begun(work: Path) -> dict[str, Any]:
+    begun: dict[str, Any] = msgspec.json.decode((work / CONFIG).read_bytes())
+    return begun
+
+
+def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
+    """Refuse to go on with other settings, naming those that differ."""
+    now = msgspec.json.decode(canonical_json(settings))
+    other = _differing(now, stored)
+    if "world" in other and "world" in stored:
+        # It may lie in another folder now.
+        inside = [key for key in _differing(now["world"], stored["world"]) if key != "path"]
+        other = [key for key in other if key != "world"] + [f"{key} of the world" for key in inside]
+    if other:
+        raise UserError(
+            f"--resume: {printable(out)} was begun with another {', '.join(other)}; "
+            "repeat its settings, or choose another --out"
+        )
+
+
+def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
+    return [key for key, value in now.items() if stored.get(key) != value]
+
+
+@contextmanager
+def working(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
+    """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
+    work, existed = out / WORK, out.exists()
+    new = not (work / CONFIG).is_file()
+    if not new and _begun(work)["identity"] != digest(identity):
+        raise UserError(
+            f"--resume: the model behind {printable(spec.card.name)} is not the one this run was begun with "
+            "(its files, package versions or device differ); start a new run in another --out"
+        )
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(out)} cannot be made ({error.strerror}); choose another folder"
+        ) from None
+    try:
+        with alone(work / "lock"):
+            if new:
+                (work / "answers.jsonl").unlink(missing_ok=True)
+                begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"),
+                         "settings": spec.settings(), "identity": digest(identity),
+                         "tags": spec.tags}  # fmt: skip
+                write_whole(work / CONFIG, canonical_json(begun))
+            yield work
+    except BlockingIOError:
+        raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
+    except UserError:
+        if new:
+            shutil.rmtree(work)
+            if not existed:
+                out.rmdir()
+        raise

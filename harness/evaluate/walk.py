@@ -1,0 +1,248 @@
+"""The one loop: observe the world, get intents, coordinate under every condition and seed, act.
+
+Frozen scenes, the closed loop and the calibrated proxy of the paper's study are worlds. They differ in where
+their moments come from and in where an action leads, and in nothing else. A moment is one decision point.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.coordination.channel import Draws
+from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
+from harness.coordination.exchange import exchange
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.core import noise
+from harness.core.arrays import Floats, Ints
+from harness.dataset.load import Scene
+from harness.evaluate.fusion import codes_of
+from harness.runs.decisions import Decisions, Labels, by_action, by_message
+
+Moment = TypeVar("Moment")
+AskedMoment = TypeVar("AskedMoment", contravariant=True)
+
+
+@dataclass(frozen=True)
+class Due:
+    """Decisions that are to be made now under one condition.
+
+    Attributes:
+        at: the moment of each, a position among those the world shows, (n,).
+        episode: number of the episode of each, (n,).
+        seed: seed of the channel's draws of each, (n,).
+        draws: those draws, (n, ...).
+    """
+
+    at: Ints
+    episode: Ints
+    seed: Ints
+    draws: Draws
+
+
+@dataclass(frozen=True)
+class Decided(Generic[Moment]):
+    """Decisions made under one condition.
+
+    Attributes:
+        point: the condition.
+        moments: those the world showed.
+        due: what was to be decided.
+        result: what was, (n, ...).
+    """
+
+    point: OperatingPoint
+    moments: Sequence[Moment]
+    due: Due
+    result: Coordination
+
+
+class World(Protocol[Moment]):
+    """Where decision points come from, and where actions lead."""
+
+    def observe(self) -> Sequence[Moment]:
+        """Every distinct moment in which some episode is to decide now; none if all episodes are decided."""
+        ...
+
+    def due(self, point: OperatingPoint) -> Due:
+        """The decisions of a condition that are due in the moments just shown."""
+        ...
+
+    def step(self, decided: Sequence[Decided[Moment]]) -> None:
+        """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
+        ...
+
+
+class Ask(Protocol[AskedMoment]):
+    """Where intents come from."""
+
+    def __call__(self, moments: Sequence[AskedMoment]) -> Intents:
+        """What every vehicle intends in these moments, (n, ...)."""
+        ...
+
+    def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,)."""
+        ...
+
+
+def walk(
+    world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
+) -> Iterator[Sequence[Decided[Moment]]]:
+    """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
+    memories: dict[str, _Memory] = {point.name: _Memory() for point in points}
+    while moments := world.observe():
+        intents = ask(moments)
+        due = {point: each for point in points if len((each := world.due(point)).at)}
+        calls = _fusion_calls(due, moments, intents, ask)
+        decided = []
+        for point, each in due.items():
+            call = calls(each.at) if calls and point.asks_again else None
+            fusion = Fusion(call, memories[point.name].recall(each))
+            result = coordinate(point, intents.take(each.at), each.draws, fusion)
+            decided.append(Decided(point, moments, each, result))
+        for part in decided:
+            memories[part.point.name].keep(part.due, part.result.state)
+        yield decided
+        world.step(decided)
+
+
+class _Memory:
+    """What a condition's consensus rule remembers of each episode and seed."""
+
+    def __init__(self) -> None:
+        self._state: dict[tuple[int, int], Floats] = {}
+
+    def recall(self, due: Due) -> Floats | None:
+        """The state of each decision's episode, (n, K); None at the first step."""
+        places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
+        return np.array([self._state[place] for place in places]) if self._state else None
+
+    def keep(self, due: Due, state: Floats) -> None:
+        """The state for the next step, (n, K), if the rule has any."""
+        if state.shape[-1]:
+            places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
+            self._state |= dict(zip(places, state, strict=True))
+
+
+def _fusion_calls(
+    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
+) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
+    """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
+    if not any(point.asks_again for point in due):
+        return None
+    return ask.fusion_call(moments, heard_codes(due, intents))
+
+
+def heard_codes(due: Mapping[OperatingPoint, Due], intents: Intents) -> Ints:
+    """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
+    codes = [np.empty(0, dtype=int)]
+    for point, each in due.items():
+        if point.asks_again:
+            on_time = exchange(point, intents.take(each.at), each.draws).on_time
+            codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
+    return np.unique(np.concatenate(codes))
+
+
+@lru_cache(maxsize=1 << 16)
+def _channel(seed: int, layout_seed: int, steps: int, helpers: int) -> NDArray[np.float64]:
+    return noise.uniforms((2 + steps, helpers), "channel", seed, layout_seed)
+
+
+def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
+    """The channel's draws of decisions (n,): a link is up or down for an episode, jitter is a decision's own.
+
+    The key is the seed and the episode's layout, so every condition, prompt and model, frozen and in the
+    closed loop, has the same.
+    """
+    pairs, place = np.unique(np.stack([seed, layout_seed]), axis=1, return_inverse=True)
+    of_pairs = np.array([_channel(s, layout, steps, helpers) for s, layout in pairs.T.tolist()])
+    of_pairs, place = of_pairs.reshape(pairs.shape[1], 2 + steps, helpers), place.reshape(-1)
+    return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step])
+
+
+def columns(decided: Decided[Any]) -> dict[str, Any]:
+    """Numbers of decisions (n,) by name, as the table of decisions has them, NaN where unknown."""
+    c, point = decided.result, decided.point
+    anybody = c.on_time.any(axis=-1)
+    return {
+        "messages": c.messages, "triggered": c.triggered, "own_failed": c.own_failed,
+        "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
+        "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
+        "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
+        "fusion_ms": c.fusion_s * 1000,
+        "fusion_failed": np.where(anybody & point.asks_again, c.fusion_failed, np.nan),
+        "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
+    }  # fmt: skip
+
+
+def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
+    """The table of decisions, in the order of episode, step, moment, condition and seed.
+
+    Args:
+        decided: in any order.
+        more: further columns (n,), in the order of `decided`.
+        actions: meta-actions.
+    """
+    first = {id(part.moments): part.moments for part in decided}
+    starts = np.cumsum([0, *map(len, first.values())]).tolist()
+    start = dict(zip(first, starts, strict=False))
+    scenes = [scene for moments in first.values() for scene in moments]
+    helpers = max(len(scene.viewers) for scene in scenes) - 1
+    at = np.concatenate([start[id(part.moments)] + part.due.at for part in decided])
+    n_each = [len(part.due.at) for part in decided]
+    points = list(dict.fromkeys(part.point.name for part in decided))
+    point = np.repeat([points.index(part.point.name) for part in decided], n_each)
+
+    def of_scenes(values: Iterable[Any]) -> Any:
+        return np.array(list(values))[at]
+
+    def of_messages(name: str) -> Any:
+        arrays = [getattr(part.result, name) for part in decided]
+        wide = [np.pad(each, ((0, 0), (0, helpers - each.shape[1]))) for each in arrays]
+        return np.concatenate(wide)
+
+    numbers = [columns(part) for part in decided]
+    asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
+    sent = {
+        "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
+        "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
+        "weight": np.concatenate([
+            np.pad(part.result.weights[:, 1:], ((0, 0), (0, helpers + 1 - part.result.weights.shape[1])))
+            for part in decided
+        ]),
+    }  # fmt: skip
+    senders = [[*scene.viewers[1:], *[None] * (helpers + 1 - len(scene.viewers))] for scene in scenes]
+    episode, step = (of_scenes(scene.record[name] for scene in scenes) for name in ("episode", "step"))
+    ids = [scene.id for scene in scenes]
+    rank = np.unique(ids, return_inverse=True)[1]
+    order = np.lexsort((point, rank[at], step, episode))
+    values = {
+        **{name: np.concatenate([each[name] for each in numbers]) for name in numbers[0]},
+        **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
+        **more,
+        **{
+            column: array
+            for name, each in sent.items()
+            for column, array in by_message(name, np.where(asked, each, np.nan)).items()
+        },
+        "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
+    }  # fmt: skip
+    labels = {
+        "scene": _labels(ids, at), "danger": _labels([s.record["danger"]["sector"] for s in scenes], at),
+        "condition": Labels(point, points),
+        "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
+        **{
+            f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)
+        },
+    }  # fmt: skip
+    return Decisions.of({**values, **labels}, actions, helpers).take(order)
+
+
+def _labels(of_scenes: Sequence[str | None], at: Ints, there: Any = True) -> Labels:
+    names = list(dict.fromkeys(label for label in of_scenes if label is not None))
+    code: dict[str | None, int] = {None: -1, **{name: place for place, name in enumerate(names)}}
+    return Labels(np.where(there, np.array([code[label] for label in of_scenes])[at], -1), names)

@@ -1,0 +1,79 @@
+"""The answer that fits as it stands: one typed reading, which costs a third of looking for what to mend."""
+
+import math
+from functools import lru_cache
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from harness.parsing.answer import Answer, recommended
+from harness.parsing.values import EXACT
+from harness.prompts.answer_schema import EVIDENCE_CHARS, RISKS
+
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+def fitting(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
+    """The answer if the text is nothing but that, by the published schema and the sum of 1.
+
+    None is no verdict: an escape in a text, for one, is left to those who read more slowly.
+    """
+    for decoder, colons in _forms(role, actions):
+        try:
+            answer = decoder.decode(text)
+        except (ValueError, RecursionError):
+            continue
+        evidence = answer.evidence if role == "helper" else ""
+        # The reader takes the last of two equal keys, and says nothing; but each key has its colon.
+        if "\\" in text or text.count(":") != colons + evidence.count(":"):
+            return None
+        return _answer(answer, role, actions)
+    return None
+
+
+def _answer(answer: Any, role: str, actions: tuple[str, ...]) -> Answer | None:
+    mass: float | None = None
+    if hasattr(answer, "action_distribution"):
+        shares = msgspec.structs.astuple(answer.action_distribution)
+        mass = math.fsum(shares)
+        if abs(mass - 1) > EXACT:
+            return None
+        intent = tuple(abs(p) / mass for p in shares)
+        confidence = max(intent)
+        maneuver = actions[intent.index(confidence)]
+    else:
+        maneuver, confidence = answer.recommended_maneuver, abs(answer.confidence)
+        intent = recommended(maneuver, confidence, actions)
+    if role == "ego":
+        return Answer(intent, mass, None, frozenset())
+    message = {
+        "evidence": answer.evidence,
+        "risk": answer.risk,
+        "recommended_maneuver": maneuver,
+        "confidence": confidence,
+    }
+    return Answer(intent, mass, message, frozenset())
+
+
+@lru_cache(maxsize=16)
+def _forms(role: str, actions: tuple[str, ...]) -> tuple[tuple[msgspec.json.Decoder[Any], int], ...]:
+    """Readers of the forms that an answer may have, and how many keys each has."""
+    if any(":" in action or "\\" in action for action in actions) or len(set(actions)) < len(actions):
+        return ()
+    names = [(f"p{n}", Share, msgspec.field(name=action)) for n, action in enumerate(actions)]
+    shares = msgspec.defstruct("Shares", names, forbid_unknown_fields=True)
+    distribution: list[tuple[str, Any]] = [("action_distribution", shares)]
+    evidence = Annotated[str, msgspec.Meta(max_length=EVIDENCE_CHARS)]
+    report: list[tuple[str, Any]] = [("evidence", evidence), ("risk", Literal[RISKS])]
+    recommendation: list[tuple[str, Any]] = [
+        ("recommended_maneuver", Literal[actions]),
+        ("confidence", Share),
+    ]
+    forms = [distribution] if role == "ego" else [report + distribution, report + recommendation]
+    return tuple(
+        (
+            msgspec.json.Decoder(msgspec.defstruct("Form", form, forbid_unknown_fields=True)),
+            len(form) + (len(actions) if form[-1][0] == "action_distribution" else 0),
+        )
+        for form in forms
+    )

@@ -1,0 +1,296 @@
+"""The registry of metrics: one entry a metric, with values from the tables of decisions and episodes."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from harness.core.arrays import Floats, Ints
+from harness.core.statistics import (
+    Estimate,
+    brier,
+    episode_interval,
+    known_mean,
+    negative_log_likelihood,
+    rate_interval,
+    safe_target,
+    seed_interval,
+)
+from harness.runs.decisions import Decisions
+from harness.runs.records import Episode
+
+World = Literal["frozen", "closed-loop"]
+SUCCESS, LATENCY = "success_rate", "latency_proxy_ms"
+GAIN = "success_gain_over_"  # and the name of the condition it is over
+PERCENTILES = (50, 95, 99)
+ALL = "all"  # stands for the condition where a figure does not depend on it
+
+
+class Columns(Protocol):
+    """Numbers of decisions (n,) by name, NaN where unknown."""
+
+    def __getitem__(self, name: str, /) -> Floats: ...
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One metric.
+
+    Attributes:
+        name: in tables, with its unit at the end.
+        meaning: for people.
+        decisions: its values (n,), of which an episode has the mean; None for a metric of episodes.
+        episodes: an episode's value; None for a metric of decisions.
+        total: an episode has the sum over its decisions, not the mean.
+        world: where it is known; None for everywhere.
+        yes_or_no: an episode has it or has not.
+        closed_loop: what it means in the closed loop, where that differs.
+    """
+
+    name: str
+    meaning: str
+    decisions: Callable[[Any], Floats] | None = None
+    episodes: Callable[[Episode], Any] | None = None
+    total: bool = False
+    world: World | None = None
+    yes_or_no: bool = False
+    closed_loop: str | None = None
+
+
+def _ends(name: str, meaning: str, of: Callable[[Episode], bool], world: World | None = None,
+          closed_loop: str | None = None) -> Metric:  # fmt: skip
+    return Metric(name, meaning, episodes=of, world=world, yes_or_no=True, closed_loop=closed_loop)
+
+
+def _fails(*how: str) -> Callable[[Episode], bool]:
+    return lambda e: e.failure in how
+
+
+def _field(name: str) -> Callable[[Episode], Any]:
+    return lambda e: getattr(e, name)
+
+
+def _column(name: str) -> Callable[[Columns], Floats]:
+    return lambda d: d[name]
+
+
+METRICS = {
+    metric.name: metric
+    for metric in (
+        _ends(SUCCESS, "episodes with every decision safe, and their delays within the allowance",
+              _field("success"),
+              closed_loop="episodes in which the ego clears the intersection, no later than the allowance"),
+        _ends("unsafe_rate", "episodes with a decision that leads to a collision or a forced failure",
+              lambda e: not e.success and e.failure != "late",
+              closed_loop="episodes that end in a collision, by time-out or off the road"),
+        _ends("collision_rate", "episodes that end in a collision", _fails("collision"), "closed-loop"),
+        _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
+              lambda e: e.fault == "ego", "closed-loop"),
+        _ends("late_rate", "episodes with all decisions safe, but delays beyond the allowance",
+              _fails("late"),
+              closed_loop="episodes cleared, but too long after the full-view driver, whose decisions act at "
+              "once"),
+        _ends("time_out_rate", "episodes in which the ego does not clear the intersection in time",
+              _fails("time_out"), "closed-loop"),
+        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road"),
+              "closed-loop"),
+        Metric("time_to_clear_s", "until the ego has cleared the intersection, where it does, late or not",
+               episodes=lambda e: e.time_s if e.failure in ("", "late") else None, world="closed-loop"),
+        Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
+               episodes=_field("least_gap_m"), world="closed-loop"),
+        Metric("hard_brakings_per_episode", "times the ego begins to brake harder than 4 m/s²",
+               episodes=_field("hard_brakings"), world="closed-loop"),
+        Metric("other_crashes_per_episode", "vehicles that crash without the ego",
+               episodes=_field("other_crashes"), world="closed-loop"),
+        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions"),
+               world="closed-loop"),
+        Metric("skipped_per_episode", "decisions not begun, since the one before was still open",
+               episodes=_field("skipped"), world="closed-loop"),
+        Metric("never_acted_per_episode", "decisions that were not ready before the episode ended",
+               episodes=_field("never_acted"), world="closed-loop"),
+        Metric("messages_per_episode", "replies scheduled; the request is none", _column("messages"),
+               total=True),
+        Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
+               "included", _column("latency_ms")),
+        Metric("deadline_miss_rate", "decisions that took longer than the decision window",
+               _column("deadline_missed")),
+        Metric("trigger_rate", "decisions in which the ego asked", _column("triggered")),
+        Metric("effective_loss", "probability that one crossing was lost", _column("effective_loss")),
+        Metric("observed_reply_loss", "scheduled replies that did not arrive; request and reply must both "
+               "cross", _column("observed_loss")),
+        Metric("entropy_nats", "of the ego's own intent", _column("entropy_nats")),
+        Metric("normalised_entropy", "of the ego's own intent; 1 is undecided",
+               _column("normalised_entropy")),
+        Metric("brier", "of the fused policy against the safe actions; 0 best, 2 worst",
+               lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0)),
+               world="frozen"),
+        Metric("negative_log_likelihood", "of the safe actions in the fused policy; 0 best",
+               lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0),
+               world="frozen"),
+        Metric("fallback_rate", "decisions in which the ego's own answer could not be read",
+               _column("own_failed")),
+        Metric("fusion_ms", "part of it that fusion takes: 0 for a rule, which is arithmetic; ego-prompt "
+               "infers again", _column("fusion_ms")),
+        Metric("merge_failed_rate", "answers to fusion calls that could not be read; the ego kept its own "
+               "intent", _column("fusion_failed")),
+    )
+}  # fmt: skip
+# What a summary has besides, and what it means.
+DERIVED = {
+    "message_count": "replies scheduled in the whole run; the request is none",
+    **{f"latency_p{p}_ms": f"{p} % of all decisions are as fast" for p in PERCENTILES},
+}
+
+
+def metrics_of(world: World) -> tuple[Metric, ...]:
+    """The metrics that are known in a world."""
+    return tuple(metric for metric in METRICS.values() if metric.world in (None, world))
+
+
+def meaning(name: str, world: World) -> str:
+    """A metric's meaning in a world; empty for a name that says it all."""
+    if name in DERIVED:
+        return DERIVED[name]
+    metric = METRICS.get(name)
+    if metric is None:
+        return ""
+    return (world == "closed-loop" and metric.closed_loop) or metric.meaning
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Conditions by seeds by episodes, in which every episode has a place.
+
+    Attributes:
+        conditions: names of the operating points.
+        seeds: of the channel's draws.
+        episodes: their numbers.
+    """
+
+    conditions: tuple[str, ...]
+    seeds: tuple[int, ...]
+    episodes: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(C, S, E)."""
+        return len(self.conditions), len(self.seeds), len(self.episodes)
+
+    def places(self, decisions: Decisions) -> Ints:
+        """The episode of each decision, (n,), counted row by row. ValueError for one outside the grid."""
+        condition = decisions.codes("condition", self.conditions)
+        seed, episode = (
+            _position(decisions.whole(name), names)
+            for name, names in (("seed", self.seeds), ("episode", self.episodes))
+        )
+        return np.ravel_multi_index((condition, seed, episode), self.shape)
+
+    def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
+        """The episodes by place. Raises ValueError if one is missing or there twice."""
+        by_place = {(e.condition, e.seed, e.episode): e for e in episodes}
+        wanted = [(c, s, e) for c in self.conditions for s in self.seeds for e in self.episodes]
+        if len(by_place) != len(episodes) or set(by_place) != set(wanted):
+            raise ValueError("not every episode is there once in every condition and seed")
+        return [by_place[place] for place in wanted]
+
+
+def by_episode(
+    metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
+) -> dict[str, Floats]:
+    """Each metric's values, (C, S, E): of an episode's decisions, or the field of the episode's record.
+
+    Args:
+        metrics: which.
+        grid: where each episode stands.
+        decisions: of all episodes.
+        episodes: by place (`Grid.ordered`).
+    """
+    places = grid.places(decisions)
+
+    def values(metric: Metric) -> Floats:
+        if not metric.episodes:
+            return of_decisions(metric, decisions, places, len(episodes))
+        numbers = [metric.episodes(episode) for episode in episodes]
+        return np.array([np.nan if v is None else float(v) for v in numbers])
+
+    return {metric.name: values(metric).reshape(grid.shape) for metric in metrics}
+
+
+def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
+    """A metric of n episodes, (n,), from their decisions, each at its episode's place."""
+    assert metric.decisions
+    values = np.asarray(metric.decisions(decisions), dtype=float)
+    return sum_by_place(values, places, n) if metric.total else mean_by_place(values, places, n)
+
+
+def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
+    """Sum of what is known at each of n places, (n,)."""
+    return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
+
+
+def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
+    """Mean of what is known at each of n places, (n,); NaN where nothing is."""
+    known = ~np.isnan(values)
+    count = np.bincount(places[known], minlength=n)
+    total = sum_by_place(values[known], places[known], n)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def over_seeds(name: str, values: Floats) -> Estimate:
+    """Interval over seeds of a metric's values (S, E)."""
+    return in_range(name, seed_interval(known_mean(values, axis=1)))
+
+
+def over_episodes(name: str, values: Floats) -> Estimate:
+    """Interval over episodes of a metric's values (S, E)."""
+    each = known_mean(values, axis=0)
+    settled = each[~np.isnan(each)]
+    # Student's t would give 0 of 20 episodes an interval of no width.
+    yes_or_no = name in METRICS and METRICS[name].yes_or_no
+    if yes_or_no and np.isin(settled, (0.0, 1.0)).all():
+        return rate_interval(each)
+    return in_range(name, episode_interval(each))
+
+
+def in_range(name: str, e: Estimate) -> Estimate:
+    """No metric here is below 0 and no share above 1; Student's t may go beyond."""
+    most = 1.0 if name.endswith(("_rate", "_loss", "_mass")) else np.inf
+    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, most))
+    return Estimate(e.value, low, high, e.n, e.n_excluded)
+
+
+def percentiles(latency_ms: Floats) -> Floats:
+    """`PERCENTILES` of the latencies (n,) that are known; NaN where none is."""
+    measured = latency_ms[~np.isnan(latency_ms)]
+    return np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
+
+
+def unit(name: str) -> tuple[float, str, int]:
+    """How a metric is shown: factor, unit, decimals."""
+    if "_gain_" in name:
+        return 100.0, " points", 1
+    if "_rate" in name or name.endswith("_loss"):
+        return 100.0, " %", 1
+    endings: Mapping[str, tuple[str, int]] = {
+        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1), "_per_episode": ("", 2),
+    }  # fmt: skip
+    for ending, (suffix, digits) in endings.items():
+        if name.endswith(ending):
+            return 1.0, suffix, digits
+    return 1.0, "", 1 if "message" in name or "tokens" in name else 3
+
+
+def label(name: str) -> str:
+    """A metric's name in words; its unit is shown with the value."""
+    for suffix in ("_ms", "_nats", "_s", "_m"):
+        name = name.removesuffix(suffix)
+    return name.replace("_", " ")
+
+
+def _position(values: Ints, names: Sequence[int]) -> Ints:
+    order = np.argsort(names)
+    place = order[np.minimum(np.searchsorted(names, values, sorter=order), len(names) - 1)]
+    if (np.asarray(names)[place] != values).any():
+        raise ValueError("a decision of another seed or episode")
+    return np.asarray(place)

@@ -1,0 +1,301 @@
+"""The records of a run, typed: they own the names of what its files hold. docs/files.md has their meaning."""
+
+from typing import Any, Literal
+
+from msgspec import Struct, field
+
+Role = Literal["ego", "helper", "merge"]
+
+
+class Answer(Struct, frozen=True, kw_only=True):
+    """One answer of a model: a line of `answers.jsonl`.
+
+    Attributes:
+        scene: id of the decision point.
+        viewer: id of the vehicle that answered.
+        heard: ids of the helpers whose messages were in the prompt of a fusion call.
+        role: `ego`, `helper`, or `merge` for the ego's fusion call.
+        raw: the completion, untouched but for lone surrogates, which no file can hold.
+        finish_reason: `stop`, `length` or `error`.
+        error: the engine's message; None if it answered.
+        prompt_tokens: tokens in; None if the engine has no tokenizer.
+        completion_tokens: tokens out; None if the engine has no tokenizer.
+        seconds: time of this answer where its request was alone; None otherwise.
+        batch_size: how many requests went through the engine together.
+        label_mass: probability on the letters together, of a read-out; None otherwise.
+        retries: attempts that failed before this one.
+        cached: it comes from the cache.
+        slow_s: seconds that it is declared to take beyond its card's latency.
+        prompt_sha256: digest of the chat messages.
+        status: the parser's one outcome (`harness.parsing.status`).
+        verdict: the status in three classes: `strict`, `recovered` or `failed`.
+        repairs: corrections before parsing; empty unless recovered.
+        intent: probabilities in the order of the actions; None if failed.
+        mass: their sum as written; None where none was.
+        message: the rest of a helper's answer; None if there is none.
+        detail: one sentence for people.
+    """
+
+    scene: str
+    viewer: str
+    heard: tuple[str, ...] = ()
+    role: Role
+    raw: str
+    finish_reason: str
+    error: str | None
+    prompt_tokens: int | None
+    completion_tokens: int | None
+    seconds: float | None
+    batch_size: int
+    label_mass: float | None
+    retries: int
+    cached: bool
+    slow_s: float
+    prompt_sha256: str
+    status: str
+    verdict: Literal["strict", "recovered", "failed"]
+    repairs: tuple[str, ...]
+    intent: tuple[float, ...] | None
+    mass: float | None
+    message: dict[str, Any] | None
+    detail: str
+
+    @property
+    def id(self) -> str:
+        """Of the request: scene, viewer and the senders heard."""
+        return f"{self.scene}/{self.key}"
+
+    @property
+    def key(self) -> str:
+        """Names the answer among those of its decision point."""
+        return "+".join((self.viewer, *self.heard))
+
+
+class Latency(Struct, frozen=True, omit_defaults=True):
+    """How long inference takes, decided once a run.
+
+    Attributes:
+        source: `card`, `measured` or `paper`.
+        basis: where the numbers come from.
+        ego_s: seconds of one inference of the ego; None where each answer's own time counts.
+        helper_s: of a helper.
+        fusion_s: of the ego's fusion call; None where each answer's own time counts, or none is needed.
+        n: answers behind a measured time, by role.
+        load_a_core: processes that wanted a core while it was measured, a core; None where unknown.
+    """
+
+    source: Literal["card", "measured", "paper"]
+    basis: str
+    ego_s: float | None
+    helper_s: float | None
+    fusion_s: float | None = None
+    n: dict[str, int] = {}
+    load_a_core: float | None = None
+
+    @property
+    def each_its_own(self) -> bool:
+        """Whether each answer's own time counts."""
+        return self.ego_s is None and self.helper_s is None
+
+
+class Message(Struct, frozen=True, rename={"sender": "from"}):
+    """A helper's reply: whether it arrived, when (None if lost), and its weight in the policy."""
+
+    sender: str
+    delivered: bool
+    on_time: bool
+    arrival_ms: float | None
+    weight: float | None
+
+
+class Decision(Struct, frozen=True, kw_only=True):
+    """One decision: a row of `decisions.parquet`, for people and pages; None where unknown.
+
+    Attributes:
+        scene: id of the decision point.
+        episode: its number.
+        step: its number in the episode.
+        danger: where the hidden danger comes from; None without one.
+        condition: name of the operating point.
+        seed: of the channel's draws.
+        action: what was decided.
+        fused: the policy, in the order of the actions.
+        entropy_nats: of the ego's own intent.
+        triggered: whether the ego asked.
+        own_failed: the ego's own answer could not be parsed.
+        own_weight: weight of its intent in the policy; None where a fusion call answered.
+        latency_ms: from seeing to acting.
+        deadline_missed: it took longer than the window.
+        messages: replies scheduled.
+        safe: whether the action is safe; known of frozen scenes.
+        delay_s: its needless delay; known of frozen scenes.
+        acts_at_s: when it acts; in the closed loop.
+        acted: whether the episode lasted until then; in the closed loop.
+    """
+
+    scene: str
+    episode: int
+    step: int
+    danger: str | None
+    condition: str
+    seed: int
+    action: str
+    fused: tuple[float, ...]
+    entropy_nats: float | None
+    triggered: bool
+    own_failed: bool
+    own_weight: float | None
+    latency_ms: float | None
+    deadline_missed: bool | None
+    messages: tuple[Message, ...]
+    safe: bool | None
+    delay_s: float | None
+    acts_at_s: float | None
+    acted: bool | None
+
+
+class Episode(Struct, frozen=True, kw_only=True):
+    """How one layout ended under one condition and seed: a line of `episodes.csv`.
+
+    What only the closed loop shows is None in a frozen run.
+
+    Attributes:
+        condition: name of the operating point.
+        seed: of the channel's draws.
+        episode: its number.
+        layout_seed: of the layout.
+        danger: where the hidden danger comes from; `none` without one.
+        success: whether it succeeded.
+        failure: how it failed; empty if it did not.
+        delay_s: needless delay in all.
+        messages: replies scheduled.
+        trigger_rate: share of its decisions in which the ego asked.
+        latency_ms: mean latency of its decisions.
+        deadline_misses: decisions that outlasted the window.
+        time_s: when it was decided.
+        partner: the vehicle the ego collided with.
+        striker: whose front hit.
+        fault: who should have given way.
+        least_gap_m: smallest distance to another vehicle's outline.
+        hard_brakings: times the ego began to brake harder than 4 m/s².
+        other_crashes: vehicles that crashed without the ego.
+        decisions: decisions begun.
+        skipped: decisions not begun, since one was still open.
+        never_acted: decisions that were not ready before the end.
+    """
+
+    condition: str
+    seed: int
+    episode: int
+    layout_seed: int
+    danger: str
+    success: bool
+    failure: str
+    delay_s: float | None = None
+    messages: int = 0
+    trigger_rate: float | None = None
+    latency_ms: float | None = None
+    deadline_misses: int = 0
+    time_s: float | None = None
+    partner: str | None = None
+    striker: str | None = None
+    fault: str | None = None
+    least_gap_m: float | None = None
+    hard_brakings: int | None = None
+    other_crashes: int | None = None
+    decisions: int | None = None
+    skipped: int | None = None
+    never_acted: int | None = None
+
+
+class Variant(Struct, frozen=True):
+    """Who answered, and how they were asked: what every line of a run's CSV files begins with.
+
+    Attributes:
+        model: name of the card.
+        prompt: its version.
+        answer: the answer mode.
+    """
+
+    model: str
+    prompt: str
+    answer: str
+
+    def __str__(self) -> str:
+        return f"{self.model} · {self.prompt} · {self.answer}"
+
+
+class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
+    """An estimate of a metric: a line of `summary.csv`.
+
+    Attributes:
+        condition: name of the operating point, or `all` for what does not depend on it.
+        metric: name of the metric, its unit at the end.
+        value: the mean; None if there was nothing to average.
+        low: lower end of the 95 % interval; None where the data cannot bound it.
+        high: upper end.
+        n: units behind it.
+        n_excluded: units without a value.
+        interval: what the units are: `episodes`, `seed means` or `answers`.
+    """
+
+    condition: str
+    metric: str
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int
+    n_excluded: int
+    interval: str
+
+
+class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True):
+    """A world of frozen scenes: the dataset, of which a run with `limit` has the first episodes only."""
+
+    name: str
+    sha256: str
+    scenes: int
+    episodes: int
+    limit: int | None
+    delay_allowance_s: float
+    path: str
+
+
+class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True):
+    """A world that is simulated: episode e has layout seed `first_seed` + e."""
+
+    scenario: dict[str, Any]
+    first_seed: int
+    episodes: int
+    late_against: str
+
+
+class Manifest(Struct, frozen=True, kw_only=True):
+    """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
+
+    format: str
+    name: str
+    created: str
+    command: str
+    tags: tuple[str, ...]
+    model: dict[str, Any]
+    prompt: dict[str, Any]
+    world: FrozenScenes | ClosedLoop
+    actions: tuple[str, ...]
+    conditions: tuple[dict[str, Any], ...]
+    seeds: tuple[int, ...]
+    thinking: bool
+    answer: str
+    batch_size: int
+    dtype: str | None
+    latency_source: str | None
+    latency: Latency
+    identity: dict[str, Any]
+    cached_answers: int
+    engine_errors: int
+    versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def variant(self) -> Variant:
+        """Who answered, and how they were asked."""
+        return Variant(self.model["name"], self.prompt["version"], self.answer)

@@ -1,0 +1,128 @@
+"""highway-env's four-way intersection as a road, for an ego that goes straight over it.
+
+The ego comes from the south and goes north, so for it "left" is the west arm, "right" the east arm and
+"oncoming" the north arm. Lane width and radii are those of highway-env 1.12's `IntersectionEnv`; a test holds
+them against its road network.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.world.road import Ground, Lane, Path, PathKey, Road, crossings
+
+LANE_WIDTH_M = 4.0
+JUNCTION_M = 11.0  # from the centre to where approach lanes end
+ARM_M = 100.0  # length of an approach or exit lane
+LEFT_TURN_RADIUS_M = 13.0
+STEP_M = 0.25
+SECTOR_REACH_M = (8.0, 50.0)  # stretch of the approach lane, from the conflict point, that is looked at
+
+APPROACHES = ("own", "left", "oncoming", "right")  # south, west, north, east: highway-env's nodes o0..o3
+SECTORS = ("left", "right", "oncoming")  # where danger can come from
+ROUTES = ("straight", "left")
+EXITS = ("exit-own", "exit-left", "exit-ahead", "exit-right")
+# Right of way of highway-env's intersection: the crossing road before the ego's, straight before left.
+PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left": 2},
+            "own": {"straight": 1, "left": 0}, "oncoming": {"straight": 1, "left": 0}}  # fmt: skip
+
+
+@cache
+def road() -> Road:
+    """The intersection. Its conflict zone is the centroid of the conflict points of three dangers."""
+    ways, ego = paths(), ("own", "straight")
+    meetings = crossings(ways, ego)
+    points = [meetings[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
+    return Road(
+        facts={
+            "kind": "four-way intersection",
+            "lane_width_m": LANE_WIDTH_M,
+            "junction_m": JUNCTION_M,
+            "ego": "/".join(ego),
+        },
+        paths=ways,
+        ego=ego,
+        crossings=meetings,
+        zone_m=(float(np.mean([p.x_m for p in points])), float(np.mean([p.y_m for p in points]))),
+        sectors={sector: _approach(ways[sector, "straight"]) for sector in SECTORS},
+        network=network,
+        ground=ground,
+    )
+
+
+@cache
+def paths() -> dict[PathKey, Path]:
+    """Every path, by (approach, route)."""
+    built = {}
+    for corner, approach in enumerate(APPROACHES):
+        turn = np.pi / 2 * corner
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).round(12)
+        for route in ROUTES:
+            points = _southern(route) @ rotation.T
+            arc = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
+            inside = 2 * JUNCTION_M if route == "straight" else LEFT_TURN_RADIUS_M * np.pi / 2
+            end = (corner + (2 if route == "straight" else 1)) % 4
+            roles = (f"approach-{approach}", "junction", EXITS[end])
+            lanes: tuple[Lane, ...] = (
+                (f"o{corner}", f"ir{corner}", 0),
+                (f"ir{corner}", f"il{end}", 0),
+                (f"il{end}", f"o{end}", 0),
+            )
+            ends = (ARM_M, ARM_M + inside)
+            built[approach, route] = Path(
+                approach, route, points, arc, ends, roles, lanes, PRIORITY[approach][route]
+            )
+    return built
+
+
+def _southern(route: str) -> Floats:
+    """Points of a path that starts on the south arm."""
+    half, end = LANE_WIDTH_M / 2, JUNCTION_M + ARM_M
+    count = int(ARM_M / STEP_M)
+    approach = np.column_stack([np.full(count, half), np.linspace(end, JUNCTION_M, count, endpoint=False)])
+    if route == "straight":
+        inside = np.linspace(JUNCTION_M, -JUNCTION_M, int(2 * JUNCTION_M / STEP_M), endpoint=False)
+        leaving = np.linspace(-JUNCTION_M, -end, count + 1)
+        y = np.concatenate([inside, leaving])
+        return np.concatenate([approach, np.column_stack([np.full(len(y), half), y])])
+    angle = np.linspace(0, np.pi / 2, int(LEFT_TURN_RADIUS_M * np.pi / 2 / STEP_M), endpoint=False)
+    radius = LEFT_TURN_RADIUS_M
+    arc = np.column_stack([half - radius + radius * np.cos(angle), JUNCTION_M - radius * np.sin(angle)])
+    leaving = np.linspace(-JUNCTION_M, -end, count + 1)
+    return np.concatenate([approach, arc, np.column_stack([leaving, np.full(count + 1, -half)])])
+
+
+def _approach(path: Path) -> Floats:
+    """(15, 2) m, points of an approach lane that are looked at."""
+    back_m = np.linspace(*SECTOR_REACH_M, 15)
+    return np.array([path.at(path.ends_m[0] + JUNCTION_M - back)[:2] for back in back_m])
+
+
+@cache
+def network() -> Any:
+    """highway-env's own road network."""
+    from highway_env.envs.intersection_env import IntersectionEnv
+
+    env = IntersectionEnv.__new__(IntersectionEnv)
+    env.config = IntersectionEnv.default_config()
+    env._make_road()
+    return env.road.network
+
+
+def ground(far_m: float) -> Ground:
+    """Its two roads up to `far_m`, with the centre line and the stop line of each arm."""
+    half = LANE_WIDTH_M
+    # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
+    angle = np.linspace(np.pi, 1.5 * np.pi, 9)
+    fillet = JUNCTION_M + (JUNCTION_M - half) * np.column_stack([np.cos(angle), np.sin(angle)])
+    corner = np.vstack([[half, far_m], fillet, [far_m, half]])
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])  # clockwise, for row vectors
+    turns = [np.linalg.matrix_power(quarter, n) for n in range(4)]
+    return Ground(
+        outline=np.vstack([corner @ turn for turn in turns]),
+        marks=tuple(np.array([[0.0, JUNCTION_M], [0.0, far_m]]) @ turn for turn in turns),
+        stops=tuple(np.array([[0.0, JUNCTION_M], [-half, JUNCTION_M]]) @ turn for turn in turns),
+        boxes=tuple(np.array([[-x, -y], [x, y]]) for x, y in ((half, far_m), (far_m, half))),
+    )

@@ -1,0 +1,106 @@
+"""`harness export`: decisions and answers as text."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from run_on_disk import Row, answers_of, made_up, rows_of
+
+from harness.runs import export
+from harness.runs.folder import read
+
+Said = tuple[int, str, str]
+HOSTILE = 'a "b", \n=1+1 \u202e ü'
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    def spoil(row: Row) -> None:
+        if row["viewer"] == "v1":
+            row["raw"] = HOSTILE
+        if row["viewer"] == "v2":
+            row |= {"verdict": "failed", "status": "no_json", "intent": None, "mass": None, "message": None}
+        if row["viewer"] == "v3":
+            row["repairs"] = ("code_fence", "prose")
+        if row["viewer"] == "v4":
+            row |= {"viewer": "v1", "heard": ("v2", "v4"), "role": "merge"}
+
+    return made_up(tmp_path / "run", answer=spoil)
+
+
+def test_csv_has_every_decision_and_answer(run: Path, harness: Callable[..., Said]) -> None:
+    code, out, err = harness("export", run, "--csv")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [str(run / "decisions.csv"), str(run / "answers.csv")]
+    with (run / "decisions.csv").open(newline="") as file:
+        told = list(csv.DictReader(file))
+    rows = rows_of(run)
+    assert [list(row) for row in told] == [list(row) for row in rows]
+    for written, row in zip(told, rows, strict=True):
+        for name, value in row.items():
+            shown = written[name]
+            if value is None:
+                assert shown == ""
+            elif isinstance(value, bool):
+                assert shown == str(value).lower()
+            else:
+                assert type(value)(shown) == value
+    with (run / "answers.csv").open(newline="", encoding="utf-8") as file:
+        said = list(csv.DictReader(file))
+    answers = answers_of(run)
+    assert [row["raw"] for row in said] == [answer.raw for answer in answers]
+    assert HOSTILE in [row["raw"] for row in said]
+    assert {row["heard"] for row in said} == {"", "v2+v4"}
+    assert {row["repairs"] for row in said} == {"", "code_fence prose"}
+    assert [row["intent_IDLE"] for row in said] == ["1.0" if a.intent else "" for a in answers]
+    assert [json.loads(row["message"]) if row["message"] else None for row in said] == [
+        answer.message for answer in answers
+    ]
+
+
+def test_jsonl_has_an_object_a_decision(
+    run: Path, harness: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "AT_ONCE", 5)
+    code, out, err = harness("export", run, "--jsonl", "--out", "text")
+    assert (code, out, err) == (0, "text/decisions.jsonl\n", "")
+    lines = Path("text/decisions.jsonl").read_text().splitlines()
+    assert [json.loads(line, parse_constant=pytest.fail) for line in lines] == rows_of(run)
+    assert [path.name for path in Path("text").iterdir()] == ["decisions.jsonl"]
+
+
+def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decisions = read(run).decisions
+    whole = export.decisions_csv(decisions, tmp_path / "whole.csv").read_bytes()
+    monkeypatch.setattr(export, "AT_ONCE", 3)
+    assert export.decisions_csv(decisions, tmp_path / "pieces.csv").read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--csv or --jsonl: give one of them"),
+        (("--csv", "--jsonl"), "--csv or --jsonl: give one of them"),
+        (("--csv", "--out", "run/run.json"), "--out run/run.json cannot be written ("),
+        (("--jsonl", "--out", "run/run.json/in"), "; choose another folder with --out"),
+    ],
+)
+def test_bad_options_are_one_line(
+    options: tuple[str, ...], said: str, run: Path, harness: Callable[..., Said]
+) -> None:
+    code, out, err = harness("export", run, *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+
+
+def test_a_folder_that_is_no_run_or_broken_is_one_line(run: Path, harness: Callable[..., Said]) -> None:
+    code, out, err = harness("export", "nowhere", "--csv")
+    assert (code, out) == (2, "")
+    assert "nowhere is no finished run: it has no run.json" in err
+    (run / "decisions.parquet").write_text("PAR1")
+    code, out, err = harness("export", run, "--csv")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "decisions.parquet is broken" in err
+    assert not (run / "decisions.csv").exists()

@@ -1,0 +1,88 @@
+"""What holds for every scenario: the contract of `harness.world.scenario.Scenario`."""
+
+import json
+import pickle
+
+import numpy as np
+import one_way_crossing
+import pytest
+
+from harness.world import scenarios
+from harness.world.reference import drive
+from harness.world.scenario import Scenario
+from harness.world.state import WorldState
+from harness.world.world import World
+
+SEEDS = range(6)
+
+
+@pytest.fixture(
+    params=[*map(scenarios.get, scenarios.names()), one_way_crossing.SCENARIO], ids=lambda s: s.name
+)
+def scenario(request: pytest.FixtureRequest) -> Scenario:
+    found: Scenario = request.param
+    return found
+
+
+def test_it_says_what_it_is(scenario: Scenario) -> None:
+    assert scenario.description.startswith(f"Scenario `{scenario.name}`: {scenario.summary}")
+    assert {"SLOWER", "IDLE", "FASTER"} <= set(scenario.actions)
+
+
+def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(scenario: Scenario) -> None:
+    for seed in SEEDS:
+        found = scenario.layout(seed, scenario.parameters)
+        assert found == scenario.layout(seed, scenario.parameters)
+        parts = [spawn.part for spawn in found.spawns]
+        assert parts == sorted(parts, key=("ego", "helper", "other").index)
+        assert (parts.count("ego"), found.spawns[0].id) == (1, "v1")
+        assert len({spawn.id for spawn in found.spawns}) == len(parts)
+        assert found.danger in (None, *scenario.road().sectors)
+        assert (found.danger is None) == (found.danger_id is None)
+    layouts = [scenario.layout(seed, scenario.parameters) for seed in SEEDS]
+    assert any(one != layouts[0] for one in layouts[1:])
+
+
+def test_its_paths_run_along_the_middle_of_their_lanes(scenario: Scenario) -> None:
+    road = scenario.road()
+    for path in road.paths.values():
+        assert len(path.lanes) == len(path.roles) == len(path.ends_m) + 1
+        starts = (0.0, *path.ends_m)
+        for section, (lane, start) in enumerate(zip(path.lanes, starts, strict=True)):
+            street = road.network().get_lane(lane)
+            along = street.length / 2
+            assert path.section(start + along) == section
+            place = street.local_coordinates(np.array(path.at(start + along)[:2]))
+            assert place == pytest.approx((along, 0.0), abs=0.01)
+
+
+def test_its_ego_drives_straight_to_the_north_through_every_crossing(scenario: Scenario) -> None:
+    road = scenario.road()
+    assert np.ptp(road.ego_path.points[:, 0]) == pytest.approx(0.0)
+    assert (np.diff(road.ego_path.points[:, 1]) < 0).all()
+    for key, at in road.crossings.items():
+        assert road.ego_path.at(at.ego_arc_m)[:2] == pytest.approx((at.x_m, at.y_m), abs=0.05)
+        assert road.paths[key].at(at.other_arc_m)[:2] == pytest.approx((at.x_m, at.y_m), abs=0.05)
+
+
+def test_it_travels_as_its_name_and_parameters(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenarios, "get", {scenario.name: scenario}.__getitem__)
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+    assert len(pickle.dumps(scenario)) < 2000
+
+
+def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario) -> None:
+    for action in scenario.actions:
+        world = World.start(scenario, 1)
+        world.act("SLOWER")
+        state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
+        thawed, branch = World.thaw(scenario, WorldState.from_dict(state), snapshot), world.branch()
+        for then in (action, "IDLE"):
+            for one in (world, thawed, branch):
+                one.act(then)
+            assert thawed.state() == branch.state() == world.state()
+
+
+def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(scenario: Scenario) -> None:
+    assert {drive(scenario, "full-view", seed).result for seed in SEEDS} == {"cleared"}
+    assert {drive(scenario, "brake", seed).result for seed in SEEDS} <= {"time_out", "collision"}

@@ -1,0 +1,86 @@
+"""What a package adds to the harness without a change of it: a consensus rule, a channel and a backend."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.backends.base import Completion, Request
+from harness.backends.card import Card
+from harness.backends.registry import Capabilities, Registration
+from harness.coordination.channel import Delivery, Draws, Links, link_up
+from harness.coordination.consensus import Fused, Messages, linear_pool
+from harness.core.arrays import Floats
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """The mean of the linear pool and of what this rule gave at the last step.
+
+    A rule with memory: it goes on through steps in which the ego hears nobody and acts on its own.
+    """
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
+        """NaN: there was no last step."""
+        return np.full((*batch, actions), np.nan)
+
+    def fuse(self, messages: Messages, state: Floats) -> Fused:
+        """What it gives, it remembers."""
+        now = linear_pool(messages.intents, messages.weights)
+        policy = np.where(np.isnan(state), now, (now + state) / 2)
+        return Fused(policy, messages.weights, policy)
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Replies are lost with distance and never wait for each other. An assumption; nothing was measured.
+
+    Attributes:
+        latency_s: seconds of one exchange, the request included.
+        loss_per_m: probability, a metre between ego and helper, that one crossing is lost.
+    """
+
+    latency_s: float = 0.01
+    loss_per_m: float = 0.01
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """Each link has a loss of its own."""
+        loss = np.minimum(links.range_m * self.loss_per_m, 1.0)
+        delay_s = np.where(links.asked, links.ready_s + self.latency_s, np.inf)
+        return Delivery(link_up(draws.link, loss), delay_s, loss)
+
+
+class Cautious:
+    """Slows down where its own view shows a conflict, and is in doubt all the same."""
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        """Any number of requests at a time, so no answer has seconds of its own."""
+        return [Completion(r.id, answer(r), None, None, "stop", None, len(requests)) for r in requests]
+
+    def identity(self) -> dict[str, Any]:
+        """There is nothing else to it: no weights and no settings."""
+        return {"engine": "cautious", "version": 1}
+
+
+def answer(request: Request) -> str:
+    """The JSON that the prompt asks for. Actions come with the most conservative one first."""
+    assert request.view is not None
+    shares = (0.6, 0.3, 0.1) if request.view["conflicts"] else (0.2, 0.4, 0.4)
+    said = {"action_distribution": dict(zip(request.actions, shares, strict=True))}
+    return json.dumps(said if request.role == "ego" else {"evidence": "", "risk": "low", **said})
+
+
+def opened(card: Card, **options: Any) -> Cautious:
+    """The backend of a card; device, number format and batch size mean nothing to it."""
+    return Cautious()
+
+
+SMOOTHING = Smoothing()
+FOG = Fog()
+CAUTIOUS = Registration(
+    "swarm_extras:opened",
+    Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False),
+    card_keys=("revision",),
+)

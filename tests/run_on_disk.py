@@ -1,0 +1,184 @@
+"""Runs on disk: one made up, and any run changed by hand. All are written by the harness's one writer."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+
+from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.runs import folder
+from harness.runs.decisions import Decisions, schema
+from harness.runs.formats import FORMAT
+from harness.runs.metrics import Grid, World
+from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
+from harness.runs.summary import counted, scores
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+Row = dict[str, Any]
+Change = Callable[[Row], object]
+
+_FROZEN = FrozenScenes(
+    name="made-up", sha256="0" * 64, scenes=0, episodes=0, limit=None, delay_allowance_s=1.0, path="nowhere"
+)
+_DRIVEN = ClosedLoop(scenario={"name": "made-up"}, first_seed=0, episodes=0, late_against="nobody")
+
+
+def made_up(
+    out: Path,
+    decision: Change = lambda row: None,
+    episode: Change = lambda row: None,
+    answer: Change = lambda row: None,
+    closed_loop: bool = False,
+    points: Sequence[OperatingPoint] = (POINTS["single-local"], POINTS["6g"]),
+    seeds: Sequence[int] = (0, 1),
+    episodes: int = 4,
+    steps: int = 2,
+    helpers: int = 3,
+    **stated: Any,
+) -> Path:
+    """A run in which everybody is sure of IDLE, which is safe, and every ego asks under V2V and hears all.
+
+    Args:
+        out: its folder.
+        decision: changes a row of decisions.parquet.
+        episode: changes a row of episodes.csv.
+        answer: changes a row of answers.jsonl.
+        closed_loop: whether it was driven.
+        points: its conditions.
+        seeds: of the channel.
+        episodes: how many.
+        steps: decisions of each.
+        helpers: v2, v3, ... of each decision point.
+        stated: further fields of run.json.
+    """
+    scenes = [(f"{e:05d}-{step}", e, step) for e in range(episodes) for step in range(steps)]
+    viewers = [f"v{n + 1}" for n in range(1 + helpers)]
+    rows = [
+        _changed(_decision(scene, e, step, point, seed, viewers, closed_loop), decision)
+        for scene, e, step in scenes for point in points for seed in seeds
+    ]  # fmt: skip
+    ends = [
+        _changed({"condition": p.name, "seed": s, "episode": e, "layout_seed": e, "danger": "none",
+                  "success": True, "failure": "", "delay_s": 0.0}, episode)
+        for p in points for s in seeds for e in range(episodes)
+    ]  # fmt: skip
+    said = [_changed(_answer(scene, viewer), answer) for scene, *_ in scenes for viewer in viewers]
+    world = msgspec.structs.replace(_DRIVEN if closed_loop else _FROZEN, episodes=episodes)
+    manifest = {
+        "format": FORMAT, "name": out.name, "created": "2026-01-01T00:00:00+00:00", "command": "harness eval",
+        "tags": [], "model": {"name": "made-up", "engine": "proxy"},
+        "prompt": {"version": "v2", "sha256": "0" * 64, "released": True},
+        "world": msgspec.to_builtins(world), "actions": ACTIONS,
+        "conditions": [asdict(point) for point in points], "seeds": seeds, "thinking": False,
+        "answer": "json", "batch_size": 8, "dtype": None, "latency_source": None,
+        "latency": Latency("card", "made up", 0.145, 0.145), "identity": {"engine": "proxy"},
+        "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0"},
+    }  # fmt: skip
+    return _write(out, {**manifest, **stated}, rows, ends, said)
+
+
+def change(
+    run: Path,
+    decision: Change = lambda row: None,
+    episode: Change = lambda row: None,
+    answer: Change = lambda row: None,
+) -> None:
+    """Change each row of a run's tables; the summary and what an episode has from decisions stay.
+
+    A row is a mapping by column, None where unknown.
+    """
+    read = folder.read(run)
+    rows = [_changed(row, decision) for row in read.decisions.table.to_pylist()]
+    ends = [_changed(msgspec.structs.asdict(one), episode) for one in read.episodes]
+    said = [_changed(msgspec.structs.asdict(one), answer) for one in read.answers]
+    decisions = _decisions(rows, read.actions, read.decisions.helpers)
+    manifest = read.manifest
+    folder.write(run, manifest, decisions, _all(ends, Episode), _all(said, Answer), read.scores)
+
+
+def configure(run: Path, **values: object) -> None:
+    """Change what run.json says; it need not be possible."""
+    stated = msgspec.json.decode((run / "run.json").read_bytes())
+    (run / "run.json").write_bytes(msgspec.json.encode({**stated, **values}))
+
+
+def rows_of(run: Path, condition: str | None = None) -> list[Row]:
+    """Decisions as mappings by column, None where unknown."""
+    rows = folder.read(run).decisions.table.to_pylist()
+    return [row for row in rows if condition in (None, row["condition"])]
+
+
+def answers_of(run: Path) -> list[Answer]:
+    """Answers, in the order of the file."""
+    return list(folder.read(run).answers)
+
+
+def _write(
+    out: Path, stated: Mapping[str, Any], rows: Sequence[Row], ends: Sequence[Row], said: Sequence[Row]
+) -> Path:
+    manifest = msgspec.convert(msgspec.to_builtins(stated), Manifest)
+    helpers = max((int(name[7:]) for name in rows[0] if name.startswith("helper_")), default=0)
+    decisions = _decisions(rows, manifest.actions, helpers)
+    answers = _all(said, Answer)
+    numbers = tuple(dict.fromkeys(end["episode"] for end in ends))
+    grid = Grid(tuple(str(c["name"]) for c in manifest.conditions), manifest.seeds, numbers)
+    episodes = counted(grid, decisions, _all(ends, Episode))
+    world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
+    summary = scores(world, grid, decisions, episodes, answers)
+    folder.write(out, manifest, decisions, episodes, answers, summary)
+    return out
+
+
+def _decisions(rows: Sequence[Row], actions: Sequence[str], helpers: int) -> Decisions:
+    return Decisions(pa.Table.from_pylist(list(rows), schema(actions, helpers)), tuple(actions), helpers)
+
+
+def _all(rows: Sequence[Row], kind: Any) -> Any:
+    return [kind(**row) for row in rows]
+
+
+def _changed(row: Row, change: Change) -> Row:
+    change(row)
+    return row
+
+
+def _decision(
+    scene: str, episode: int, step: int, point: OperatingPoint, seed: int, viewers: Sequence[str],
+    closed_loop: bool,
+) -> Row:  # fmt: skip
+    asks = point.profile is not None
+    share = 1 / len(viewers) if asks else 1.0
+    latency_ms = 145.0 + 75.0 * asks
+    row: Row = {
+        "scene": scene, "episode": episode, "step": step, "danger": None, "condition": point.name,
+        "seed": seed, "action": "IDLE", "messages": len(viewers[1:]) * asks, "own_failed": False,
+        "triggered": asks, "entropy_nats": 0.0, "normalised_entropy": 0.0, "own_weight": share,
+        "latency_ms": latency_ms, "deadline_missed": False, "fusion_ms": 0.0 if asks else None,
+        "effective_loss": 0.0 if asks else None, "observed_loss": 0.0 if asks else None,
+        **{f"fused_{action}": float(action == "IDLE") for action in ACTIONS},
+    }  # fmt: skip
+    if closed_loop:
+        row |= {"acts_at_s": step + latency_ms / 1000, "acted": True}
+    else:
+        row |= {"safe": True, "delay_s": 0.0}
+        row |= {f"safe_{action}": action == "IDLE" for action in ACTIONS}
+        row |= {f"delay_s_{action}": 0.0 if action == "IDLE" else None for action in ACTIONS}
+    for place, viewer in enumerate(viewers[1:], 1):
+        sent = {"helper": viewer, "delivered": True, "on_time": True, "arrival_ms": 60.0, "weight": share}
+        row |= {f"{name}_{place}": value if asks else None for name, value in sent.items()}
+    return row
+
+
+def _answer(scene: str, viewer: str) -> Row:
+    helper = viewer != "v1"
+    return {
+        "scene": scene, "viewer": viewer, "role": "helper" if helper else "ego", "raw": '{"sure": "IDLE"}',
+        "finish_reason": "stop", "error": None, "prompt_tokens": None, "completion_tokens": None,
+        "seconds": None, "batch_size": 1, "label_mass": None, "retries": 0, "cached": False, "slow_s": 0.0,
+        "prompt_sha256": "0" * 64, "status": "strict", "verdict": "strict", "repairs": (),
+        "intent": (0.0, 1.0, 0.0), "mass": 1.0, "detail": "fits the schema",
+        "message": {"evidence": "clear", "risk": "low"} if helper else None,
+    }  # fmt: skip

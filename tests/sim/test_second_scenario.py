@@ -1,0 +1,135 @@
+"""A scenario of another package, in one file, goes through all that the one that ships goes through."""
+
+import io
+import json
+import pickle
+from dataclasses import replace
+
+import pytest
+from one_way_crossing import SCENARIO
+
+from harness.core.errors import UserError
+from harness.dataset.build import build
+from harness.dataset.load import load
+from harness.dataset.verify import check
+from harness.prompts import versions
+from harness.report.drawing.scene import draw
+from harness.world import scenarios
+from harness.world.drivers import DRIVERS
+from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.planner import plan
+from harness.world.reference import drive_all
+from harness.world.world import World
+
+MEETING, FREE = 1, 2  # seeds
+NAME = SCENARIO.name
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory):
+    """A package with an entry point, as pip leaves it."""
+    site = tmp_path_factory.mktemp("site")
+    info = site / "one_way-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: one-way\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built") / "one-way"
+    build(SCENARIO, folder, 2, MEETING, 2, lambda done: None)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frozen(folder):
+    return load(folder)
+
+
+def test_it_is_found_by_its_entry_point_and_travels_as_name_and_parameters():
+    assert NAME in scenarios.names()
+    assert scenarios.get(NAME) is SCENARIO
+    harder = replace(SCENARIO, parameters=replace(SCENARIO.parameters, braking_mps2=5.0))
+    assert pickle.loads(pickle.dumps(harder)) == harder
+    assert len(pickle.dumps(harder)) < 1000
+
+
+def test_drivers_meet_its_danger_or_wait_for_it():
+    meeting, free = drive_all(SCENARIO, MEETING), drive_all(SCENARIO, FREE)
+    results = {driver: (meeting[driver].result, free[driver].result) for driver in DRIVERS}
+    assert results == {
+        "cruise": ("collision", "cleared"),
+        "brake": ("time_out", "time_out"),
+        "local-view": ("cleared", "cleared"),
+        "full-view": ("cleared", "cleared"),
+    }
+    assert (meeting["cruise"].partner, meeting["cruise"].fault) == ("v3", "ego")
+
+
+def test_both_vehicles_see_its_danger_in_its_sector():
+    world = World.start(SCENARIO, MEETING)
+    world.act("IDLE")
+    state = world.state()
+    for viewer in ("v1", "v2"):
+        graph = scene_graph(SCENARIO, state, viewer)
+        assert [(c["with"], c["sector"]) for c in graph["conflicts"]] == [("v3", "west")]
+        assert [s["sector"] for s in graph["sectors"]] == ["west"]
+        assert [n["lane"] for n in graph["nodes"] if n["id"] == "v3"] == ["street-west"]
+    world.act("IDLE")
+    assert plan(SCENARIO, truth_graph(SCENARIO, world.state())) == "SLOWER"
+
+
+def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
+    assert check(folder) == []
+    assert (frozen.scenario, frozen.actions, len(frozen.scenes)) == (SCENARIO, SCENARIO.actions, 8)
+    assert {s.record["danger"]["sector"] for s in frozen.scenes} == {"west", None}
+    build(SCENARIO, tmp_path / "one-way", 2, MEETING, 1, lambda done: None)
+    assert (tmp_path / "one-way/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
+
+
+def test_a_dataset_of_a_scenario_that_is_not_here_is_refused_in_a_line(folder, tmp_path):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "scenario": "one-way-crosing"}))
+    with pytest.raises(UserError, match=r"manifest.json: unknown scenario .*did you mean 'one-way-crossing'"):
+        load(tmp_path)
+
+
+def test_prompts_list_its_actions_and_say_its_words(frozen, tmp_path):
+    graph = frozen.scenes[1].record["graphs"]["v2"]
+    [system, user] = versions.load("v2").render(graph, frozen.actions, words=frozen.scenario.words)
+    assert '"LANE_RIGHT":p' in system["content"]
+    assert "v3 west:" in user["content"]
+    draft = replace(
+        versions.load("v2"),
+        texts=dict.fromkeys(
+            ("ego", "helper"),
+            "{% block system %}You {{ words.task }}.{% endblock %}{% block user %}{% endblock %}",
+        ),
+    )
+    assert (
+        draft.render(graph, frozen.actions, words=SCENARIO.words)[0]["content"]
+        == "You cross a one-way street."
+    )
+
+
+def test_it_is_drawn(frozen):
+    picture = io.BytesIO()
+    draw(frozen.scenes[1], picture, "svg", "v2")
+    assert picture.getvalue().startswith(b"<?xml")
+
+
+def test_the_command_drives_and_evaluates_it_and_reports(harness, folder):
+    shown = harness("scenario", "show", NAME)
+    assert (shown[0], "decisions = 4\n" in shown[1]) == (0, True)
+    checked = harness("scenario", "check", NAME, "--episodes", "2", "--workers", "1")
+    assert checked[0] == 0
+    ran = harness("eval", "--model", "proxy", "--dataset", folder, "--out", "run")
+    assert ran[0] == 0, ran
+    assert harness("report", "run", "--out", "page.html")[0] == 0
+    drove = harness("drive", "--scenario", NAME, "--episodes", "2", "--seeds", "0", "--out", "driven")
+    assert drove[0] == 0, drove
+    assert harness("report", "driven", "--out", "driven.html")[0] == 0

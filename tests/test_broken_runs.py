@@ -1,0 +1,193 @@
+"""A run that is broken, or of another version, is one line that names the file and what to do."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from run_on_disk import change, configure, made_up, rows_of
+
+import harness
+from harness.core.errors import UserError
+from harness.runs import folder
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "decisions.parquet": lambda run: folder.read(run).decisions,
+    "answers.jsonl": lambda run: folder.read(run).answers,
+    "episodes.csv": lambda run: folder.read(run).episodes,
+    "summary.csv": lambda run: folder.read(run).scores,
+    "run.json": folder.read,
+}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return made_up(tmp_path / "run")
+
+
+def refused(run: Path, file: str) -> str:
+    with pytest.raises(UserError) as raised:
+        READERS[file](run)
+    line = str(raised.value)
+    assert line.isprintable()
+    assert str(run / file) in line
+    assert line.endswith("; make the run again")
+    return line
+
+
+@pytest.mark.parametrize("file", READERS)
+@pytest.mark.parametrize("data", [b"", b"\xff\xfe\x00", b"{", b"[" * 100_000, b'a\n1,2,3\n"', b"PAR1PAR1"])
+def test_no_bytes_are_taken_for_a_file(file: str, data: bytes, run: Path) -> None:
+    if file != "answers.jsonl" or data:  # a replay may have none
+        (run / file).write_bytes(data)
+        refused(run, file)
+
+
+@pytest.mark.parametrize("file", [name for name in READERS if name != "run.json"])
+def test_a_file_that_is_missing_or_a_folder_is_named(file: str, run: Path) -> None:
+    (run / file).unlink()
+    assert "No such file" in refused(run, file)
+    (run / file).mkdir()
+    refused(run, file)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_table_of_decisions(share: float, run: Path) -> None:
+    data = (run / "decisions.parquet").read_bytes()
+    (run / "decisions.parquet").write_bytes(data[: int(len(data) * share)])
+    refused(run, "decisions.parquet")
+
+
+def rewritten(run: Path, rewrite: Callable[[pa.Table], pa.Table]) -> None:
+    file = run / "decisions.parquet"
+    pq.write_table(rewrite(pq.ParquetFile(file).read()), file)
+
+
+def put(name: str, values: Any) -> Callable[[pa.Table], pa.Table]:
+    """Another column of this name."""
+    return lambda t: t.set_column(t.schema.get_field_index(name), name, pa.array(values))
+
+
+N = 32  # decisions of the made-up run
+
+
+@pytest.mark.parametrize(
+    ("rewrite", "said"),
+    [
+        (lambda t: t.drop_columns(["latency_ms"]), "it lacks latency_ms"),
+        (lambda t: t.drop_columns(["fused_IDLE", "weight_2"]), "it lacks fused_IDLE, weight_2"),
+        (put("condition", ["7g"] * N), "unknown condition '7g'"),
+        (put("action", ["HONK\x1b"] * N), "unknown action 'HONK"),
+        (put("action", pa.array([None] * N, pa.string())), "action is unknown"),
+        (put("condition", pa.array([None] * N, pa.string())), "condition is unknown"),
+        (put("seed", [9] * N), "a decision of another seed or episode"),
+        (put("seed", [0, None] * (N // 2)), "seed is unknown"),
+        (put("episode", [-1] * N), "a decision of another seed or episode"),
+        (put("step", [None] * N), "step is unknown"),
+        (put("latency_ms", ["soon"] * N), "is broken"),
+        (put("latency_ms", [[1.0]] * N), "is broken"),
+        (put("latency_ms", [float("inf")] * N), "latency_ms is infinite"),
+        (lambda t: t.slice(1), "not every decision of episodes.csv is there"),
+        (lambda t: pa.concat_tables([t, t.slice(0, 1)]), "a decision is there twice"),
+        (lambda t: pa.concat_tables([t.slice(1), t.slice(5, 1)]), "a decision is there twice"),
+        (lambda t: t.slice(0, 0), "not every decision of episodes.csv is there"),
+    ],
+)
+def test_a_wrong_table_of_decisions_says_what_is_wrong(
+    rewrite: Callable[[pa.Table], pa.Table], said: str, run: Path
+) -> None:
+    assert len(rows_of(run)) == N
+    rewritten(run, rewrite)
+    assert said in refused(run, "decisions.parquet")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (b"strict", b"\xff", "utf-8"),
+        (b'"ego"', b'"driver"', "role"),
+        (b"[0.0,1.0,0.0]", b"[1.0]", "answer 00000-0/v1 has 1 probabilities"),
+        (b'"status"', b'"state"', "status"),
+    ],
+)
+def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, run: Path) -> None:
+    file = run / "answers.jsonl"
+    file.write_bytes(file.read_bytes().replace(old, new, 1))
+    assert said in refused(run, "answers.jsonl")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda text: "\n".join(text.splitlines()[:-1]), "not every episode is there once"),
+        (lambda text: text + text.splitlines()[-1] + "\n", "not every episode is there once"),
+        (lambda text: text.replace("True", "perhaps"), "'perhaps'"),
+        (lambda text: text.replace(",True,", ",,"), "success is unknown in some rows"),
+        (lambda text: text.replace("6g", "7g"), "not every episode is there once"),
+        (lambda text: text.replace("failure", "fail"), "Column 'failure'"),
+    ],
+)
+def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str, run: Path) -> None:
+    file = run / "episodes.csv"
+    file.write_text(wrong(file.read_text()))
+    assert said in refused(run, "episodes.csv")
+
+
+@pytest.mark.parametrize("values", [{"world": "small"}, {"seeds": ["x"]}, {"actions": None}, {"world": {}}])
+def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) -> None:
+    configure(run, **values)
+    assert next(iter(values)) in refused(run, "run.json")
+
+
+@pytest.mark.parametrize("old", ["swarmdrive-run/1", "swarmdrive-drive/1"])
+def test_a_run_of_an_older_format_names_the_version_that_reads_it(old: str, run: Path) -> None:
+    configure(run, format=old)
+    with pytest.raises(UserError, match=r"harness 0\.1 reads it: run again, or install that version$"):
+        folder.read(run)
+
+
+@pytest.mark.parametrize("value", [None, 2, [], "swarmdrive-run/9", "\x1b"])
+def test_a_run_of_no_known_format_is_refused(value: object, run: Path) -> None:
+    configure(run, format=value)
+    with pytest.raises(UserError, match=r"has format .*, not 'swarmdrive-run/2'") as raised:
+        folder.read(run)
+    assert str(raised.value).isprintable()
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null"])
+def test_a_manifest_that_is_no_object_is_refused(text: str, run: Path) -> None:
+    (run / "run.json").write_text(text)
+    with pytest.raises(UserError, match="has format 'None'"):
+        folder.read(run)
+
+
+@pytest.mark.parametrize("file", [name for name in READERS if name != "run.json"])
+def test_tables_raise_the_same(file: str, run: Path) -> None:
+    (run / file).write_bytes(b"\xff")
+    table = {"decisions.parquet": "decisions", "answers.jsonl": "answers"}.get(file, Path(file).stem)
+    with pytest.raises(harness.UserError, match=file):
+        getattr(harness.load(run), table)
+
+
+def test_names_of_folders_are_no_columns(tmp_path: Path) -> None:
+    run = made_up(tmp_path / "seed=7" / "condition=x")
+    assert set(folder.read(run).decisions.whole("seed")) == {0, 1}
+
+
+def test_text_of_any_kind_is_read_as_it_was_written(run: Path) -> None:
+    said = 'a "b",\n\r\n=1 null NaN \u202e'
+    change(run, episode=lambda row: row.update(failure=said, partner=said))
+    assert {(e.failure, e.partner, e.fault) for e in folder.read(run).episodes} == {(said, said, None)}
+
+
+def test_a_change_by_hand_is_read_again(run: Path) -> None:
+    change(
+        run, decision=lambda row: row.update(latency_ms=3.0), episode=lambda row: row.update(failure="late")
+    )
+    read = folder.read(run)
+    assert (read.decisions["latency_ms"] == 3.0).all()
+    assert {episode.failure for episode in read.episodes} == {"late"}
+    assert json.loads((run / "run.json").read_text())["name"] == "run"

@@ -1,0 +1,249 @@
+"""Channels and rules that the harness does not have, one of each, and what holds for every plug-in.
+
+The two are of `tests/plugin`, here put where an entry point would put them.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from packaged import register
+from swarm_extras import FOG, SMOOTHING, Fog
+
+from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Draws, Links, Radio
+from harness.coordination.consensus import RULES, Messages, Rule
+from harness.coordination.coordinate import Coordination, Fusion, coordinate
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
+from harness.core.plugins import Plugins
+
+
+@pytest.fixture(autouse=True)
+def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CHANNELS._loaded, "fog", FOG)
+    monkeypatch.setitem(RULES._loaded, "smoothing", SMOOTHING)
+
+
+def step(
+    point: OperatingPoint, helper, crosses, state=None, own=(0.5, 0.5), range_m=(10.0,), link=None
+) -> Coordination:
+    """One step of episodes (E,), each with one helper as far from the conflict zone as the ego."""
+    helper, crosses = np.array(helper, dtype=float), np.array(crosses)
+    shape = crosses.shape
+    intents = Intents(
+        own=np.broadcast_to(own, (*shape, 2)),
+        helpers=helper[..., None, :],
+        valid=np.ones((*shape, 1), dtype=bool),
+        distance_m=np.full((*shape, 2), 10.0),
+        range_m=np.broadcast_to(range_m, (*shape, 1)),
+        payload_bits=np.zeros((*shape, 1)),
+        inference_s=np.full((*shape, 2), 0.1),
+    )
+    link = np.where(crosses, 0.99, 0.0)[..., None, None] * np.ones(2)
+    return coordinate(point, intents, Draws(link, np.zeros((*shape, 1))), Fusion(state=state))
+
+
+def test_a_rule_with_memory_is_driven_step_by_step():
+    """Now it is .75, then .5 as nobody is heard, then .25: means with what was before are .75, .625, .4375.
+
+    The ego that hears nobody acts on its own intent, and the rule remembers that it did.
+    A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
+    """
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    first = step(point, [(1.0, 0.0), (0.5, 0.5)], [True, True])
+    assert first.fused.tolist() == [[0.75, 0.25], [0.5, 0.5]]
+    second = step(point, [(1.0, 0.0), (0.5, 0.5)], [False, True], first.state)
+    assert second.lost.tolist() == [1, 0]
+    assert second.fused.tolist() == [[0.5, 0.5], [0.5, 0.5]]
+    assert second.state.tolist() == [[0.625, 0.375], [0.5, 0.5]]
+    third = step(point, [(0.0, 1.0), (0.5, 0.5)], [True, True], second.state)
+    assert third.fused.tolist() == [[0.4375, 0.5625], [0.5, 0.5]]
+    assert third.action.tolist() == [1, 0]
+
+
+def test_an_episode_takes_its_memory_along_wherever_its_row_is():
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    state = step(point, [(1.0, 0.0), (0.0, 1.0)], [True, True]).state
+    alone = step(point, [(0.0, 1.0)], [True], state[[1]])
+    assert alone.fused.tolist() == [[0.25, 0.75]]
+    single = step(point, (0.0, 1.0), True, state[1])
+    assert single.fused.tolist() == [0.25, 0.75]
+
+
+def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
+    """Sure of the first action, it does not ask. The rule keeps half of (.9, .1) and half of (.25, .75)."""
+    point = OperatingPoint("x", "6g", tau_nats=0.5, consensus="smoothing")
+    doubt = step(point, (0.0, 1.0), True)
+    sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
+    assert not sure.triggered
+    assert sure.fused.tolist() == [0.9, 0.1]
+    assert sure.state == pytest.approx([0.575, 0.425])
+
+
+def test_a_rule_without_memory_leaves_no_state():
+    assert step(OperatingPoint("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (1, 0)
+
+
+def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
+    """An unsure ego and three helpers; their draws are all the same."""
+    intents = Intents(
+        np.full(2, 0.5), np.full((3, 2), 0.5), np.ones(3, bool), np.ones(4), np.array(range_m), np.zeros(3),
+        np.full(4, 0.1),
+    )  # fmt: skip
+    return intents, Draws(np.full((3, 2), link), np.zeros(3))
+
+
+def test_a_channel_may_lose_each_link_by_itself():
+    """1 % a metre: where all draws are .35, the links of 10 and 30 m are up and that of 50 is not."""
+    point = OperatingPoint("x", "fog", tau_nats=0.5)
+    decision = coordinate(point, *three(link=0.35))
+    assert decision.delivered.tolist() == [True, True, False]
+    assert decision.arrival_s == pytest.approx([0.11, 0.11, np.inf])
+    assert decision.loss == pytest.approx(0.3), "the mean over those asked"
+    assert coordinate(replace(point, max_helpers=2), *three()).loss == pytest.approx(0.2)
+    assert np.isnan(coordinate(replace(point, max_helpers=0), *three()).loss)
+
+
+def test_a_points_overrides_are_fields_of_its_channel():
+    point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
+    assert point.channel() == Fog(latency_s=0.05)
+    assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
+    v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
+    assert v2x.channel() == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel() == NO_CHANNEL
+
+
+@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
+def test_an_override_that_a_channel_does_not_have_is_refused(override):
+    [name] = override
+    with pytest.raises(
+        UserError, match=f"'x': {name} is .*; it must be left out: channel profile fog has no"
+    ):
+        OperatingPoint("x", "fog", **override)
+
+
+# -- every plug-in, those of installed packages included ---------------------------------------------------
+
+
+def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws]:
+    rng = np.random.default_rng(seed)
+    asked = rng.random(shape) < 0.6
+    links = Links(
+        asked,
+        np.where(asked, rng.uniform(0, 0.1, shape), np.nan),
+        np.where(asked, rng.uniform(1, 90, shape), np.nan),
+        np.where(asked, rng.uniform(0, 8000, shape), np.nan),
+        asked | (rng.random(shape) < 0.5),
+        asked & (rng.random(shape) < 0.5),
+    )
+    return links, Draws(rng.random((*shape, 2)), rng.random(shape))
+
+
+@pytest.mark.parametrize("name", [*CHANNELS, "fog"])
+def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
+    channel = CHANNELS[name]
+    links, draws = links_and_draws((40, 4))
+    up, delay_s, loss = channel.deliver(links, draws)
+    assert up.shape == delay_s.shape == (40, 4)
+    assert loss.shape in ((40, 4), (40, 1))
+    assert np.array_equal(np.isfinite(delay_s), links.asked)
+    assert np.all((delay_s >= links.ready_s)[links.asked])
+    assert np.nanmin(loss) >= 0
+    assert np.nanmax(loss) <= 1
+    row = Links(**{field: getattr(links, field)[7] for field in links.__dataclass_fields__})
+    for batch, single in zip((up, delay_s, loss), channel.deliver(row, draws.take(7)), strict=True):
+        assert np.array_equal(batch[7], single, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", [*RULES, "smoothing"])
+def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
+    rule, rng = RULES[name], np.random.default_rng(1)
+    state = rule.start((20,), 3, 4)
+    alone = rule.start((), 3, 4)
+    for _ in range(3):
+        heard = rng.random((20, 3)) < 0.6
+        weights = np.insert(heard, 0, True, axis=-1) * rng.uniform(0.1, 1, (20, 4))
+        weights /= weights.sum(axis=-1, keepdims=True)
+        intents = np.where((weights > 0)[..., None], rng.dirichlet(np.ones(4), (20, 4)), np.nan)
+        messages = Messages(
+            intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3))
+        )
+        fused = rule.fuse(messages, state)
+        assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
+        assert (fused.policy >= 0).all()
+        row = Messages(**{field: getattr(messages, field)[7] for field in messages.__dataclass_fields__})
+        single = rule.fuse(row, alone)
+        assert single.policy == pytest.approx(fused.policy[7])
+        order = [2, 0, 1]
+        with_ego = [0, 3, 1, 2]
+        shuffled = replace(
+            messages, intents=intents[:, with_ego], weights=weights[:, with_ego], heard=heard[:, order]
+        )
+        if state.shape[-1] == 0:  # a rule with memory may remember who said what
+            assert rule.fuse(shuffled, state).policy == pytest.approx(fused.policy)
+        state, alone = fused.state, single.state
+
+
+# -- how packages add them ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package with a channel, and with four entries that do not work."""
+    register(
+        tmp_path,
+        "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
+        "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\n",
+        radios="from harness.coordination.channel import Radio\n"
+        "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
+        "ODD = 7\n",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CHANNELS, "_loaded", dict(CHANNELS.built_in))
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_package_adds_a_channel_and_replaces_none():
+    slow, v2x = (OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x"))
+    assert isinstance(slow, Radio)
+    assert isinstance(v2x, Radio)
+    assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
+    assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
+    with pytest.raises(
+        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, unmade, v2x"
+    ):
+        OperatingPoint("x", "slowradio")
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        (
+            "broken",
+            r"plug-in 'broken' \(swarmdrive.channels\): radios:NONE does not load \(.*'NONE'.*\); repair",
+        ),
+        (
+            "odd",
+            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair",
+        ),
+        (
+            "unmade",
+            r"plug-in 'unmade' \(swarmdrive.channels\): radios:Radio is of type type and no Channel; repair",
+        ),
+    ],
+)
+def test_a_package_that_does_not_work_is_one_line(name: str, says: str):
+    with pytest.raises(UserError, match=says) as error:
+        OperatingPoint("x", name)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_built_in_needs_no_look_at_the_packages(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Plugins, "_entries", lambda self: pytest.fail("looked"))
+    OperatingPoint("x", "6g", consensus="median")
+    assert isinstance(CHANNELS["6g"], Radio)
+    assert isinstance(Radio(0.0, 0.0, 1.0, "serial", 0.0), Channel)
+    assert isinstance(RULES["linear"], Rule)

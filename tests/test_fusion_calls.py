@@ -1,0 +1,417 @@
+"""ego-prompt: the ego's model is asked once more, with the messages that arrived."""
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import (
+    A_TENTH,
+    Scripted,
+    asker_of,
+    decisions,
+    figure,
+    run,
+    same_decisions,
+    same_files,
+    same_scores,
+    says,
+    spec_of,
+    sure,
+)
+from run_on_disk import answers_of, configure
+
+from harness.backends import cards
+from harness.backends.base import Completion, Request
+from harness.coordination.channel import Draws
+from harness.coordination.operating_point import POINTS, named_point
+from harness.core.errors import UserError
+from harness.core.files import digest
+from harness.dataset.load import Dataset
+from harness.evaluate import run as evaluation
+from harness.evaluate.fusion import FusionAnswers, codes_of, heard_in
+from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.spec import Spec
+from harness.evaluate.walk import Due, heard_codes
+from harness.prompts.versions import load as prompt
+from harness.runs.records import Answer, Latency
+from harness.studies.stored import Stored
+
+FUSION = named_point("6g:consensus=ego-prompt")
+LANGUAGE_MODEL = "swarm-tiny"  # its card: answers come from a script, or from itself
+EACH_ITS_OWN = Latency("measured", "each answer alone, batch 1", None, None)
+
+
+def due(link: Any, jitter: Any) -> Due:
+    """A decision in each of n moments, with these draws."""
+    n = len(link)
+    return Due(np.arange(n), np.arange(n), np.zeros(n, dtype=int), Draws(link, jitter))
+
+
+def clear(n: int, helpers: int = 3) -> Due:
+    """Every message crosses."""
+    return due(np.full((n, helpers, 2), 0.9), np.zeros((n, helpers)))
+
+
+def first_scene(small: Dataset) -> Dataset:
+    return replace(small, scenes=small.scenes[:1])
+
+
+def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:
+    """v2 and v4 are heard, v3's reply is lost: two lines of messages, with intent, risk and evidence."""
+    data = first_scene(small)
+    [scene] = data.scenes
+    lines = {
+        f"{scene.id}/v1": says((0.3, 0.4, 0.3)),
+        f"{scene.id}/v2": says((0.8, 0.1, 0.1), "helper").replace("clear", "one comes fast"),
+    }
+    asker = asker_of(spec_of(data, LANGUAGE_MODEL, points=(FUSION,), seeds=(0,)), Scripted(lines))
+    lossy = clear(1)
+    lossy.draws.link[0, 1] = 0.0
+    codes = heard_codes({FUSION: lossy, POINTS["v2x"]: lossy}, asker([scene]))
+    assert codes.tolist() == [0b101]
+    [request] = asker.fusion_requests([scene], codes)
+    assert request.id == f"{scene.id}/v1+v2+v4"
+    assert request.role == "ego"
+    text = request.messages[1]["content"]
+    [_, told] = text.split("MESSAGES")
+    assert "v2 low 0.80 0.10 0.10 one comes fast" in told
+    assert "v4 low 0.00 1.00 0.00 clear" in told
+    assert "v3" not in told
+
+
+def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset) -> None:
+    unsure = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
+    intents = asker_of(spec_of(small, LANGUAGE_MODEL, points=(FUSION,)), Scripted(unsure))(small.scenes)
+    n = len(small.scenes)
+    all_cross = clear(n)
+    slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
+    once = heard_codes({FUSION: all_cross}, intents)
+    assert len(once) == n
+    assert heard_codes({FUSION: all_cross, slow: all_cross}, intents).tolist() == once.tolist()
+    nobody = due(np.zeros((n, 3, 2)), all_cross.draws.jitter)
+    assert heard_codes({FUSION: nobody}, intents).size == 0
+
+
+def test_a_whole_run_makes_each_fusion_call_once(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Conditions and seeds that hear the same share a call, and the calls are announced together."""
+    backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes})
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: backend)
+    slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
+    spec = spec_of(small, LANGUAGE_MODEL, points=(FUSION, slow), latency="paper", seeds=(0, 1, 2))
+    announced: list[int] = []
+    answered: list[int] = []
+    evaluate(spec, tmp_path / "run", False, answered.append, more=announced.append)
+    calls = [name for name in backend.asked if "+" in name]
+    assert set(Counter(calls).values()) == {1}
+    assert announced == [len(calls)]
+    assert sum(answered) == len(backend.asked)
+    assert {a.id for a in answers_of(tmp_path / "run") if a.role == "merge"} == set(calls)
+
+
+def test_who_was_heard_has_one_code_a_decision() -> None:
+    heard = np.array([[False] * 3, [True, False, True], [True] * 3])
+    codes = codes_of(heard, np.arange(3))
+    assert codes.tolist() == [0, 8 + 5, 16 + 7]
+    assert [heard_in(code, 3) for code in codes.tolist()] == [(0, []), (1, [0, 2]), (2, [0, 1, 2])]
+
+
+def test_a_set_that_was_never_asked_about_is_no_guess() -> None:
+    answers = FusionAnswers(np.array([5]), np.array([[1.0, 0.0, 0.0]]), np.array([0.1]))
+    with pytest.raises(LookupError):
+        answers.at(np.array([0]))(np.array([[True, True, False]]))
+
+
+class Timed(Scripted):
+    """Fusion calls take the seconds that are written down for them, and other answers 0.1 s."""
+
+    def __init__(self, lines: dict[str, str | Completion], seconds: dict[str, float | None]) -> None:
+        super().__init__(lines)
+        self.seconds = seconds
+
+    def _say(self, request: Request) -> Completion:
+        return replace(super()._say(request), seconds=self.seconds.get(request.id, 0.1))
+
+
+def test_its_answers_keep_their_place_and_a_failed_one_says_so(small: Dataset) -> None:
+    scenes = small.scenes[:6]
+    one, other = f"{scenes[1].id}/v1+v3", f"{scenes[4].id}/v1+v2+v3+v4"
+    backend = Timed({one: sure("SLOWER"), other: "no idea"}, {one: 0.1, other: 0.2})
+    asker = asker_of(spec_of(small, LANGUAGE_MODEL), backend, EACH_ITS_OWN)
+    codes = np.array([1 << 3 | 2, 4 << 3 | 7])
+    heard = np.zeros((6, 3), dtype=bool)
+    heard[1, 1] = heard[4] = True
+    intents, seconds = asker.fusion_call(scenes, codes)(np.arange(6))(heard)
+    assert intents[1].tolist() == [1.0, 0.0, 0.0]
+    assert np.isnan(intents[[0, 2, 3, 4, 5]]).all()
+    assert seconds[[1, 4]].tolist() == [0.1, 0.2]
+    assert [asker.answers[name].verdict for name in (one, other)] == ["strict", "failed"]
+
+
+# -- how long it takes ----------------------------------------------------------------------------------
+
+
+def fusion_seconds(
+    small: Dataset, backend: Scripted, latency: Latency, by_step: bool
+) -> tuple[Sequence[float], Latency]:
+    """Seconds of a fusion call in two scenes, asked about together or step by step."""
+    asker = asker_of(spec_of(small, LANGUAGE_MODEL), backend, latency)
+    both, heard = small.scenes[:2], np.ones((1, 3), dtype=bool)
+    calls = asker.fusion_requests(both, np.array([7, 8 + 7]))
+    asker.ask_fusion(calls, calls)
+    if not by_step:
+        call = asker.fusion_call(both, np.array([7, 8 + 7]))(np.arange(2))
+        return call(np.ones((2, 3), dtype=bool))[1].tolist(), asker.latency
+    steps = [asker.fusion_call([scene], np.array([7]))(np.array([0]))(heard)[1] for scene in both]
+    return [float(seconds[0]) for seconds in steps], asker.latency
+
+
+@pytest.mark.parametrize("by_step", [False, True])
+@pytest.mark.parametrize("untimed", [0, 1])
+def test_a_call_without_a_time_takes_the_median_of_the_others_whatever_their_steps(
+    untimed: int, by_step: bool, small: Dataset
+) -> None:
+    """As one from the cache has none."""
+    names = [f"{scene.id}/v1+v2+v3+v4" for scene in small.scenes[:2]]
+    seconds: dict[str, float | None] = {names[untimed]: None, names[1 - untimed]: 0.3}
+    found, latency = fusion_seconds(small, Timed({}, seconds), EACH_ITS_OWN, by_step)
+    assert found == [0.3, 0.3]
+    assert latency == EACH_ITS_OWN, "nothing had to be timed apart"
+
+
+def test_where_no_call_has_a_time_a_sample_is_timed_once(small: Dataset) -> None:
+    """In batches no answer has a time of its own; one that is asked alone has."""
+
+    class Batches(Scripted):
+        def complete(self, requests: Sequence[Request]) -> list[Completion]:
+            said = super().complete(requests)
+            return [replace(c, seconds=0.25) for c in said] if len(said) == 1 else said
+
+    batches = Latency("measured", "median of single requests", 0.1, 0.2, n={"ego": 5, "helper": 15})
+    found, latency = fusion_seconds(small, Batches({}), batches, by_step=True)
+    assert found == [0.25, 0.25]
+    assert (latency.ego_s, latency.helper_s, latency.fusion_s) == (0.1, 0.2, 0.25)
+    assert latency.n == {"ego": 5, "helper": 15, "merge": 2}
+
+
+def test_a_declared_time_is_a_fusion_calls_too(small: Dataset) -> None:
+    found, latency = fusion_seconds(small, Timed({}, {}), A_TENTH, by_step=True)
+    assert found == [0.1, 0.1]
+    assert latency == A_TENTH
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "said"),
+    [
+        ("proxy", {}, "proxy is no language model and cannot merge messages"),
+        ("cruise", {}, "cruise is no language model"),
+        (LANGUAGE_MODEL, {"answer": "readout"}, "a readout gives no messages to merge; use --answer json"),
+    ],
+)
+def test_who_can_merge_nothing_is_told_so(
+    model: str, options: dict[str, Any], said: str, small: Dataset
+) -> None:
+    with pytest.raises(UserError, match=said):
+        spec_of(small, model, points=(FUSION,), **options)
+
+
+# -- with the model that ships --------------------------------------------------------------------------
+
+CONDITIONS = (POINTS["single-local"], POINTS["6g"], FUSION)
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
+    return run(spec, tmp_path_factory.mktemp("fusion") / "run")
+
+
+def test_it_pays_a_second_inference_where_it_heard_somebody(done: Evaluated) -> None:
+    """The paper's 145 ms twice and the exchange between; the same where nobody was asked."""
+    rules, calls = (decisions(done.out, name) for name in ("6g", FUSION.name))
+    assert any(d.triggered for d in calls)
+    for rule, again in zip(rules, calls, strict=True):
+        heard = any(m.on_time for m in again.messages)
+        fates, rule_fates = (
+            [(m.sender, m.delivered, m.on_time, m.arrival_ms) for m in d.messages] for d in (again, rule)
+        )
+        assert fates == rule_fates
+        assert not heard or {m.weight for m in again.messages} == {None}
+        assert again.latency_ms == pytest.approx(rule.latency_ms + 145 * heard)
+        if not heard:
+            assert again.fused == rule.fused
+    assert figure(done, FUSION.name, "fusion_ms").value > 0
+    assert figure(done, "6g", "fusion_ms").value == 0
+
+
+def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, small: Dataset) -> None:
+    answers = {answer.id: answer for answer in answers_of(done.out)}
+    again = 0
+    for d in decisions(done.out, FUSION.name):
+        heard = [m.sender for m in d.messages if m.on_time]
+        if heard:
+            intent = answers[f"{d.scene}/{'+'.join(['v1', *heard])}"].intent
+            assert d.fused == pytest.approx(intent, abs=1e-6)
+            again += 1
+    assert again > 10
+    for said in answers.values():
+        if said.heard:
+            senders = [answers[f"{said.scene}/{viewer}"] for viewer in said.heard]
+            told = [{"sender": a.viewer, "intent": list(a.intent), **a.message} for a in senders]
+            graph = small.scene(said.scene).record["graphs"]["v1"]
+            assert said.prompt_sha256 == digest(prompt("v2").render(graph, small.actions, told))
+
+
+def test_a_scenes_answers_are_the_egos_the_helpers_and_the_fusion_calls(done: Evaluated) -> None:
+    order = [(answer.scene, answer.role) for answer in answers_of(done.out)]
+    rank = {"ego": 0, "helper": 1, "merge": 2}
+    assert order == sorted(order, key=lambda place: (place[0], rank[place[1]]))
+    assert [role for _, role in order].count("merge") > 5
+
+
+def test_a_replay_and_another_batch_size_score_the_same(
+    done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
+    spec = spec_of(small, f"replay:{done.out}", points=CONDITIONS, latency="paper")
+    replayed = run(spec, tmp_path / "replay")
+    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper", batch_size=3)
+    three = run(spec, tmp_path / "three")
+    for twin in (replayed, three):
+        assert same_scores(twin, done)
+        assert same_decisions(twin.out, done.out)
+
+
+def killed(spec: Spec, out: Path, how: str, after: int) -> None:
+    """A run that dies when so many fusion calls are there, or as they are announced."""
+
+    class Killed(BaseException):
+        pass
+
+    called = False
+
+    def more(count: int) -> None:
+        nonlocal called
+        called = True
+        if how == "announced":
+            raise Killed
+
+    def progress(count: int) -> None:
+        nonlocal after
+        after -= count * called
+        if called and after <= 0:
+            raise Killed
+
+    with pytest.raises(Killed):
+        evaluate(spec, out, False, progress, more=more)
+
+
+@pytest.mark.parametrize("how", ["announced", "made"])
+def test_killed_among_the_fusion_calls_it_goes_on(
+    how: str, done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
+    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
+    killed(spec, tmp_path / "run", how, after=1)
+    run(spec, tmp_path / "run", resume=True)
+    assert same_files(tmp_path / "run", done.out)
+
+
+def measured(small: Dataset, batch_size: int) -> Spec:
+    """A language model whose times are its answers' own, or a sample's."""
+    card = replace(cards.load(LANGUAGE_MODEL), latency=cards.Latency("measured", None, "this test"))
+    spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, batch_size=batch_size)
+    return replace(spec, card=card)
+
+
+def opens(backend: Scripted) -> Callable[..., Scripted]:
+    return lambda *_, **__: backend
+
+
+def unsure(small: Dataset) -> dict[str, str | Completion]:
+    return {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
+
+
+def test_a_resumed_runs_fusion_calls_take_as_long_as_an_uninterrupted_runs(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One by one, each call has a time; one has none, and takes the median of all, kept ones included."""
+    names = [f"{s.id}/v1+v2+v3+v4" for s in small.scenes]
+    seconds: dict[str, float | None] = {name: 0.1 + n / 100 for n, name in enumerate(names)}
+    seconds[names[3]] = None
+    monkeypatch.setattr(evaluation, "open_backend", opens(Timed(unsure(small), seconds)))
+    spec = measured(small, batch_size=1)
+    whole = run(spec, tmp_path / "whole")
+    assert whole.manifest.latency == EACH_ITS_OWN
+    killed(spec, tmp_path / "run", "made", after=20)
+    resumed = run(spec, tmp_path / "run", resume=True)
+    assert same_files(tmp_path / "run", tmp_path / "whole")
+    assert resumed.manifest.latency == whole.manifest.latency
+    monkeypatch.undo()
+    run(spec_of(small, f"replay:{tmp_path / 'whole'}", points=CONDITIONS), tmp_path / "replayed")
+    assert same_decisions(tmp_path / "replayed", tmp_path / "whole")
+
+
+class Rendered(Scripted):
+    """A language model whose answers can be kept; an answer asked alone takes 0.1 s, and a batch any time."""
+
+    batch_size = 1
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        alone = self.batch_size == 1 or len(requests) == 1
+        return [replace(c, seconds=0.1 if alone else None) for c in super().complete(requests)]
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        return [str(request.messages) for request in requests]
+
+
+@pytest.mark.parametrize("batch_size", [1, 8])
+def test_fusion_calls_that_are_all_in_the_cache_are_timed_by_the_model_itself(
+    batch_size: int, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = Rendered(unsure(small))
+    backend.batch_size = batch_size
+    monkeypatch.setattr(evaluation, "open_backend", opens(backend))
+    spec, cache = measured(small, batch_size), tmp_path / "cache.sqlite"
+    for name in ("first", "again"):
+        done = evaluate(spec, tmp_path / name, False, lambda count: None, cache)
+        fused = [d for d in decisions(tmp_path / name, FUSION.name) if any(m.on_time for m in d.messages)]
+        assert fused
+        rules = {(d.scene, d.seed): d.latency_ms for d in decisions(tmp_path / name, "6g")}
+        for d in fused:
+            assert d.latency_ms == pytest.approx(rules[d.scene, d.seed] + 100, abs=2e-3)
+    said: list[Answer] = answers_of(tmp_path / "again")
+    assert all(a.cached and a.seconds is None for a in said)
+    assert (done.manifest.latency.ego_s, done.manifest.latency.fusion_s) == (0.1, 0.1)
+
+
+# -- in a sweep -----------------------------------------------------------------------------------------
+
+
+def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(done.out, tmp_path / "run"))
+    asked: list[int] = []
+    source = Stored(folder, more=asked.append)
+    [same] = source.walked(FUSION, 4, source.seeds)
+    assert asked == [], "the run's own seeds delivered nothing else"
+    assert same.ends["success_rate"].mean() == pytest.approx(figure(done, FUSION.name, "success_rate").value)
+    [fewer] = source.walked(FUSION, 2, source.seeds)
+    assert sum(asked) > 0
+    again: list[int] = []
+    source = Stored(folder, more=again.append)
+    for vehicles, before in ((4, same), (2, fewer)):
+        [now] = source.walked(FUSION, vehicles, source.seeds)
+        assert np.array_equal(now.columns["latency_ms"], before.columns["latency_ms"])
+    assert again == []
+
+
+def test_a_run_whose_prompt_has_changed_is_not_asked_more(done: Evaluated, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(done.out, tmp_path / "run"))
+    configure(folder, prompt={**done.manifest.prompt, "sha256": "0" * 64})
+    with pytest.raises(UserError, match="prompt v2 has changed since"):
+        list(Stored(folder).walked(FUSION, 3, (0,)))

@@ -1,0 +1,210 @@
+"""The seams from outside: `tests/plugin`, installed beside the harness, adds a rule, a channel and a backend.
+
+Commands run as typed, in a process of their own that has the package; this one only reads what they wrote.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from packaged import install
+
+import harness
+from harness.dataset.load import Dataset
+from harness.runs.tables import Tables
+
+CARD = """engine = "cautious"
+description = "Slows down where it sees a conflict"
+[latency]
+source = "card"
+inference_s = 0.01
+basis = "declared: for this test"
+"""
+SMOOTHED, FOG_SMOOTHED, CLOSE = "6g:consensus=smoothing", "fog:consensus=smoothing", "fog:radius_m=60"
+FROZEN, DRIVEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE), (SMOOTHED, FOG_SMOOTHED)
+ACTIONS, PLACES = ("SLOWER", "IDLE", "FASTER"), (1, 2, 3)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project with a card of the package's engine; beside it lies the package."""
+    folder = tmp_path_factory.mktemp("plugged-in") / "project"
+    (folder / "models").mkdir(parents=True)
+    (folder / "swarmdrive.toml").touch()
+    (folder / "models" / "mine.toml").write_text(CARD)
+    install(folder.parent / "site")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frozen(project: Path, small_path: Path) -> Tables:
+    conditions = [f"--condition={name}" for name in FROZEN]
+    typed(project, "eval", "--model", "mine", "--dataset", small_path, *conditions, "--out", "frozen")
+    return harness.load(project / "frozen")
+
+
+@pytest.fixture(scope="module")
+def driven(project: Path) -> Tables:
+    conditions = [f"--condition={name}" for name in DRIVEN]
+    drive = ("drive", "--model", "mine", *conditions, "--episodes", "2", "--seeds", "0:2")
+    typed(project, *drive, "--out", "driven")
+    return harness.load(project / "driven")
+
+
+def typed(project: Path, *words: str | Path, package: bool = True, code: int = 0) -> str:
+    """What a command says: on stdout, or on stderr where it ends otherwise than with 0."""
+    site = [str(project.parent / "site")] if package else []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*site, str(Path(__file__).parents[1])])}
+    command = [sys.executable, "-m", "harness", *map(str, words)]
+    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    return done.stderr if code else done.stdout
+
+
+def decided(run: Tables, condition: str) -> pd.DataFrame:
+    """The decisions under a condition, each episode's in their order."""
+    found = run.decisions[run.decisions.condition == condition]
+    return found.sort_values(["seed", "episode", "step"], ignore_index=True)
+
+
+def replies(decisions: pd.DataFrame) -> pd.DataFrame:
+    """A row a message of these decisions."""
+    names = ("helper", "delivered", "on_time", "arrival_ms", "weight")
+    parts = [
+        decisions[["scene", "seed", *(f"{name}_{n}" for name in names)]].set_axis(
+            ["scene", "seed", *names], axis=1
+        )
+        for n in PLACES
+    ]
+    return pd.concat(parts).dropna(subset="helper").astype({"scene": str, "helper": str, "delivered": bool})
+
+
+def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """What smoothing makes of the answers, and the linear pool, (n, A): by hand, decision by decision."""
+    said = {
+        (answer.scene, answer.viewer): np.array([getattr(answer, f"intent_{action}") for action in ACTIONS])
+        for answer in run.answers.itertuples()
+    }
+    memory: dict[tuple[int, int], np.ndarray] = {}
+    policies, pools = [], []
+    for row in decisions.to_dict("records"):
+        heard = [n for n in PLACES if row[f"on_time_{n}"] is True]
+        own = said[row["scene"], "v1"]
+        now = row["own_weight"] * own
+        for n in heard:
+            now = now + row[f"weight_{n}"] * said[row["scene"], row[f"helper_{n}"]]
+        episode = row["seed"], row["episode"]
+        memory[episode] = now if row["step"] == 0 else (now + memory[episode]) / 2
+        policies.append(memory[episode] if heard else own)
+        pools.append(now)
+    return np.array(policies), np.array(pools)
+
+
+def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):
+    assert frozen.config["identity"] == {"engine": "cautious", "version": 1}
+    graphs = {scene.record["scene"]: scene.record["graphs"] for scene in small.scenes}
+    answers = frozen.answers
+    assert len(answers) == sum(map(len, graphs.values()))
+    wary = np.array([bool(graphs[a.scene][a.viewer]["conflicts"]) for a in answers.itertuples()])
+    assert 0 < wary.sum() < len(wary)
+    expected = np.where(wary[:, None], (0.6, 0.3, 0.1), (0.2, 0.4, 0.4))
+    assert answers[[f"intent_{action}" for action in ACTIONS]].to_numpy() == pytest.approx(expected)
+    assert set(answers.status) == {"strict"}
+
+
+@pytest.mark.parametrize("condition", DRIVEN)
+@pytest.mark.parametrize("kind", ["frozen", "driven"])
+def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request: pytest.FixtureRequest):
+    run: Tables = request.getfixturevalue(kind)
+    decisions = decided(run, condition)
+    policies, pools = smoothed(run, decisions)
+    fused = decisions[[f"fused_{action}" for action in ACTIONS]].to_numpy()
+    assert fused == pytest.approx(policies, abs=5e-6)
+    assert np.abs(policies - pools).max() > 0.05, "it is no linear pool"
+
+
+def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, small: Dataset):
+    """An answer takes 10 ms, its way 10 ms more; one crossing is lost with 1 % a metre."""
+    range_m = {}
+    for scene in small.scenes:
+        at = {
+            vehicle["id"]: (vehicle["x_m"], vehicle["y_m"]) for vehicle in scene.record["state"]["vehicles"]
+        }
+        for viewer in scene.viewers:
+            range_m[scene.record["scene"], viewer] = float(np.hypot(*np.subtract(at[viewer], at["v1"])))
+    for condition, farthest_m in (("fog", 100.0), (CLOSE, 60.0)):
+        decisions = decided(frozen, condition)
+        sent = replies(decisions)
+        assert sent.delivered.any()
+        assert not sent.delivered.all()
+        assert set(sent.arrival_ms[sent.delivered]) == {20.0}
+        sent["range_m"] = [range_m[place] for place in zip(sent.scene, sent.helper, strict=True)]
+        assert sent.range_m.max() <= farthest_m
+        asked = decisions[decisions.messages > 0].set_index(["scene", "seed"])
+        mean_m = sent.groupby(["scene", "seed"]).range_m.mean()
+        assert asked.effective_loss.to_dict() == pytest.approx((0.01 * mean_m).to_dict(), abs=1e-6)
+        assert set(asked.latency_ms) == {20.0}
+
+
+def test_what_crosses_the_fog_crosses_a_better_channel_by_the_same_luck(frozen: Tables):
+    fog, clear = replies(decided(frozen, "fog")), replies(decided(frozen, "6g"))
+    assert fog[["scene", "seed", "helper"]].equals(clear[["scene", "seed", "helper"]])
+    assert (clear.delivered | ~fog.delivered).all()
+    assert fog.delivered.sum() < clear.delivered.sum()
+
+
+def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):
+    over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
+    typed(project, "sweep", "frozen", *over, "--quiet")
+    table = pd.read_csv(project / "frozen" / "sweep-consensus" / "conditions.csv")
+    swept = table.set_index(["condition", "value", "metric", "interval"])["mean"].sort_index()
+    own = frozen.summary.set_index(["condition", "metric", "interval"]).value.sort_index()
+    for name, point in (("6g", SMOOTHED), ("fog", FOG_SMOOTHED)):
+        for value, condition in (("linear", name), ("smoothing", point)):
+            played = swept[name, value]
+            assert played.to_dict() == pytest.approx(own[condition][played.index].to_dict())
+    success = swept["fog", :, "success_rate", "episodes"]
+    assert success["linear"] != success["smoothing"]
+
+
+@pytest.mark.parametrize(("kind", "package"), [("frozen", True), ("driven", True), ("frozen", False)])
+def test_a_report_of_a_run_needs_no_package(
+    project: Path, kind: str, package: bool, request: pytest.FixtureRequest
+):
+    request.getfixturevalue(kind)
+    typed(project, "report", kind, "--out", "page.html", package=package)
+    page = (project / "page.html").read_text()
+    assert all(name in page for name in ("mine", "cautious", SMOOTHED, "fog"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--condition", "fogg"), "unknown operating point 'fogg'; did you mean 'fog'? known: 6g, fog, "),
+        (("--condition", "fog:loss=0"), "loss is 0.0; it must be left out: channel profile fog has no such"),
+        (("--condition", "6g:consensus=smooth"), "unknown consensus 'smooth'; did you mean 'smoothing'?"),
+    ],
+)
+def test_a_mistake_is_one_line_that_knows_the_package(project: Path, words: tuple[str, str], said: str):
+    message = typed(project, "eval", "--model", "mine", *words, code=2)
+    assert said in message
+    assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--condition", "fog"), "unknown operating point 'fog'; known: 6g, single-local, v2x"),
+        (("--model", "mine"), "unknown engine in model card"),
+    ],
+)
+def test_without_the_package_its_names_mean_nothing(project: Path, words: tuple[str, str], said: str):
+    message = typed(project, "eval", *words, package=False, code=2)
+    assert said in message
+    assert message.count("\n") == 1
