@@ -96,7 +96,7 @@ def _shown(run: Run) -> str:
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return f"{printable(world.name, 40)} {printable(world.sha256, 12)}"
-    return f"driven live from layout seed {world.first_seed}"
+    return f"driven in closed loop from layout seed {world.first_seed}"
 
 
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:

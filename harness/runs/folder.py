@@ -78,7 +78,11 @@ class Run:
     def source(self) -> str:
         """The source of its episodes, for people."""
         world = self.manifest.world
-        return world.name if isinstance(world, FrozenScenes) else f"{world.scenario['name']} (driven live)"
+        return (
+            world.name
+            if isinstance(world, FrozenScenes)
+            else f"{world.scenario['name']} (driven in closed loop)"
+        )
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:

@@ -68,7 +68,7 @@ def axis_of(name: str) -> Axis:
     if name in AXES:
         return AXES[name]
     if name not in SETTINGS:
-        raise unknown("--over", name, (*AXES, *SETTINGS))
+        raise unknown("--over", name, {*AXES, *SETTINGS})
     return Axis(name, name.replace("_", " "), name, 1.0, "")
 
 

@@ -36,7 +36,7 @@ class Standing:
 
 
 def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
-    """Each driver's standing over the dataset's episodes; every one of them is driven live again.
+    """Each driver's standing over the dataset's episodes; every one of them is driven again in closed loop.
 
     Raises:
         UserError: the dataset was built from another scenario than the one that would be driven.

@@ -1,4 +1,4 @@
-"""The paper's panels driven live."""
+"""The paper's panels driven in closed loop."""
 
 import json
 from collections.abc import Callable

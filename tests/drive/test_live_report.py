@@ -56,7 +56,7 @@ def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
         assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
         gap = found.score(name, "least_gap_m")
         assert f"{gap.value:.1f} m" in page.text
-    assert "3 episodes of occluded-intersection driven live (layout seeds 6 to 8)" in page.text
+    assert "3 episodes of occluded-intersection driven in closed loop (layout seeds 6 to 8)" in page.text
     for metric in ("collision rate", "time to clear", "least gap", "hard brakings per episode"):
         assert metric in page.text
     assert "decision that leads to a collision" not in page.text  # a frozen run's unsafe rate
