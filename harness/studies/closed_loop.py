@@ -46,7 +46,7 @@ def panels() -> dict[str, list[Setting]]:
 def run_closed_loop(
     spec: Spec, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
 ) -> "pd.DataFrame":
-    """Drive all grid points, and draw Figures A and B. What a kill left in `out` is gone on with.
+    """Drive all grid points, and draw Figures A and B. A study that was stopped in `out` continues.
 
     Writes `run/` (a live run's folder), `conditions` as CSV and JSON Lines, `closed-loop.json`, and the
     figures as SVG, PDF and PNG.

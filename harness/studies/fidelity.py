@@ -1,7 +1,7 @@
 """Frozen against closed: how far the success that frozen scenes tell is that of driving.
 
-Runs on frozen scenes and live runs of the same model, prompt and answer mode are held against each other
-episode by episode: the same layout, condition and seed of the channel's luck.
+Runs on frozen scenes and live runs of the same model, prompt and answer mode are compared episode by
+episode: the same layout, condition and seed of the channel's luck.
 """
 
 from collections.abc import Iterator, Sequence

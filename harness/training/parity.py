@@ -1,4 +1,4 @@
-"""Parity: one model through two engines. The same prompts, held against each other token by token.
+"""Parity: one model through two engines. The same prompts, compared token by token.
 
 transformers in float32 is the reference. llama.cpp is held to it twice: with the very same float32 weights,
 exported on the spot, and with the GGUF file that the model's card names.
