@@ -73,8 +73,8 @@ def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) ->
     What an answer is declared to be slower than its card comes on top.
     """
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
-    by_place: Floats = np.array([latency.ego_s, *[latency.helper_s] * (slow.shape[1] - 1)])
-    return by_place + slow
+    by_place = [latency.ego_s, *[latency.helper_s] * (slow.shape[1] - 1)]
+    return np.asarray(slow + np.array(by_place))
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
