@@ -37,7 +37,7 @@ from harness.world import simulator
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
-LATENCY = Latency("card", "the proxy's card", 0.145, 0.145)
+LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
 # Functions whose time makes up a part: frames, what is seen, and who drives. The rest is the harness's own.
 PARTS: dict[str, tuple[Any, str]] = {
     "highway-env": (World, "_step"),

@@ -46,22 +46,20 @@ Proxy.complete = complete
 sys.argv = ["harness", "eval", "--model", "proxy", *sys.argv[1:]]
 main()
 """
-# The first answers are those that latency is measured by: one to warm up, then a scene's ego and its helpers.
+# Answers of the first scene's ego and its three helpers.
 FIRST_DECISION = """
 import os, sys
 from harness.backends.llama_cpp.child import Child
 from harness.cli import main
 
-answered, complete = [], Child.complete
+complete = Child.complete
 
-def count(self, requests):
-    answered.extend(complete(self, requests))
-    if len(answered) >= 5:
-        assert all(c.finish_reason == "stop" for c in answered), answered
-        os._exit(0)
-    return answered[-len(requests):]
+def answer_first(self, requests):
+    answered = complete(self, requests[:4])
+    assert all(c.finish_reason == "stop" for c in answered), answered
+    os._exit(0)
 
-Child.complete = count
+Child.complete = answer_first
 sys.argv = ["harness", "eval", "--model", "swarm-tiny", "--no-cache", *sys.argv[1:]]
 main()
 """

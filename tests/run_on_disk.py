@@ -74,7 +74,7 @@ def made_up(
         "world": msgspec.to_builtins(world), "actions": ACTIONS,
         "conditions": [asdict(point) for point in points], "seeds": seeds, "thinking": False,
         "answer": "json", "batch_size": 8, "dtype": None, "latency_source": None,
-        "latency": Latency("card", "made up", 0.145, 0.145), "identity": {"engine": "proxy"},
+        "latency": Latency("card", "made up", 0.145, 0.145, 0.145), "identity": {"engine": "proxy"},
         "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0"},
     }  # fmt: skip
     return _write(out, {**manifest, **stated}, rows, ends, said)

@@ -8,9 +8,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from evaluating import Scripted, decisions, failed, same_decisions, spec_of
+from evaluating import Scripted, failed, same_decisions, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
@@ -249,9 +248,8 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options: Any) -> Evaluated:
-    card = replace(cards.resolve(str(tiny)), max_new_tokens=6)
-    latency = options.pop("latency", Latency("card", 0.1, "declared: for this test"))
-    card = replace(card, latency=latency)
+    latency = Latency("card", 0.1, "declared: for this test")
+    card = replace(cards.resolve(str(tiny)), max_new_tokens=6, latency=latency)
     points = tuple(POINTS.values())
     source = FrozenSource(data)
     spec = Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
@@ -281,49 +279,6 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     evaluate(spec, tmp_path / "replayed", False, lambda done: None)
     assert answers_of(tmp_path / "replayed") == answers_of(tmp_path / "again")
     assert same_decisions(tmp_path / "replayed", tmp_path / "again")
-
-
-MEASURED = Latency("measured", None, "this machine")
-
-
-def test_batches_are_timed_though_every_answer_is_kept(
-    tiny: Path, small_path: Path, tmp_path: Path, file: Path
-) -> None:
-    data = load(small_path, limit=1)
-    for name in ("first", "again"):
-        done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=4)
-        assert done.manifest.latency.n["ego"] > 0
-        assert done.manifest.latency.ego_s > 0
-    assert done.manifest.cached_answers > 0
-
-
-def test_one_by_one_the_cached_answers_take_the_median_of_those_that_were_asked(
-    tiny: Path, small_path: Path, tmp_path: Path, file: Path
-) -> None:
-    few, data = load(small_path, limit=1), load(small_path, limit=2)
-    tiny_run(tiny, few, tmp_path / "few", file, latency=MEASURED, batch_size=1)
-    done = tiny_run(tiny, data, tmp_path / "run", file, latency=MEASURED, batch_size=1)
-    assert done.manifest.latency.each_its_own
-    own = [a for a in answers_of(tmp_path / "run") if a.viewer == "v1"]
-    assert all(a.seconds is None for a in own if a.cached)
-    assert any(a.cached for a in own)
-    typical = float(np.median([a.seconds for a in own if a.seconds is not None]))
-    expected = [1000 * (a.seconds or typical) for a in own]
-    found = [d.latency_ms for d in decisions(tmp_path / "run", "single-local")]
-    assert found == pytest.approx(expected, abs=1e-3)
-
-
-def test_one_by_one_with_every_answer_kept_a_sample_is_timed(
-    tiny: Path, small_path: Path, tmp_path: Path, file: Path
-) -> None:
-    data = load(small_path, limit=1)
-    for name in ("first", "again"):
-        done = tiny_run(tiny, data, tmp_path / name, file, latency=MEASURED, batch_size=1)
-    latency = done.manifest.latency
-    assert latency.n["ego"] > 0
-    assert all(a.seconds is None for a in answers_of(tmp_path / "again"))
-    for decision in decisions(tmp_path / "again", "single-local"):
-        assert decision.latency_ms == pytest.approx(1000 * latency.ego_s, abs=1e-3)
 
 
 def test_a_served_models_answers_are_kept_and_its_key_is_not(

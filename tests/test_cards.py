@@ -19,7 +19,7 @@ engine = "openai"
 description = "d"
 weights = "some-model"
 [latency]
-source = "measured"
+source = "paper"
 basis = "b"
 [server]
 base_url = "https://models.example/v1"
@@ -69,7 +69,7 @@ def test_every_shipped_card_loads_under_its_file_name() -> None:
 def test_language_models_declare_no_latency_that_was_not_measured() -> None:
     for card in cards.load_all():
         if capabilities(card.engine).renders:
-            assert (card.latency.source, card.latency.inference_s) == ("measured", None), card.name
+            assert (card.latency.source, card.latency.inference_s) == ("paper", None), card.name
             from_hub = capabilities(card.engine).has_weights and "/" in str(card.weights)
             assert card.licence or not from_hub, card.name
 
@@ -90,7 +90,7 @@ def test_the_proxy_cites_the_papers_latency_and_the_language_model_declares_none
         32768,
         "Apache-2.0",
     )
-    assert (qwen.latency.source, qwen.latency.inference_s) == ("measured", None)
+    assert (qwen.latency.source, qwen.latency.inference_s) == ("paper", None)
 
 
 def test_a_card_may_have_weights_for_another_engine() -> None:
@@ -129,7 +129,7 @@ description = "d"
 weights = "a/b"
 revision = "v1"
 [latency]
-source = "measured"
+source = "paper"
 basis = "b"
 [engines.llama-cpp]
 weights = "a/b-GGUF"
@@ -153,7 +153,7 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
         (('weights = "a/b-GGUF"', ""), ["[engines.llama-cpp]", "weights", "goes with"]),
         (('[engines.llama-cpp]\nweights = "a/b-GGUF"', "[engines]\nllama-cpp = 3"), ["= '3'", "a table"]),
         (
-            ('source = "measured"', 'source = "card"\ninference_s = 0.1'),
+            ('source = "paper"', 'source = "card"\ninference_s = 0.1'),
             ["[engines.llama-cpp] has no latency; add it"],
         ),
         (('revision = "v1"', 'file = "b.gguf"'), ["file", "llama-cpp"]),
@@ -173,7 +173,7 @@ def test_a_gguf_file_is_a_model_named_after_it(tmp_path: Path) -> None:
     file.write_bytes(b"GGUF")
     plain = cards.resolve(str(file))
     assert (plain.name, plain.engine, plain.weights) == ("small-Q8_0", "llama-cpp", str(file.resolve()))
-    assert (plain.thinking, plain.latency.source, plain.file) == ("none", "measured", None)
+    assert (plain.thinking, plain.latency.source, plain.file) == ("none", "paper", None)
     file.write_bytes(b"GGUF" + bytes(1000) + b"{% if enable_thinking %}")
     assert cards.resolve(str(file)).thinking == "switch"
 
@@ -205,7 +205,7 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
         (("engine =", "motor ="), ["mine.toml", "motor", "engine"]),
         (('basis = "declared: none"', 'basis = "b"\nspeed = 3'), ["[latency]", "speed", "inference_s"]),
         (('"driver"', '"drivr"'), ["engine", "drivr", "did you mean 'driver'"]),
-        (('source = "card"', 'source = "guess"'), ["source", "guess", "measured"]),
+        (('source = "card"', 'source = "guess"'), ["source", "guess", "paper"]),
         (('description = "d"', "description = 3"), ["description", "3", "str"]),
         (('description = "d"', ""), ["description", "add it"]),
         (('description = "d"', 'description = "d"\ncontext_tokens = true'), ["context_tokens", "int"]),
@@ -214,7 +214,7 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
         (('"driver"', '"transformers"'), ["weights", "transformers"]),
         (('"driver"', '"proxy"\nprivileged = true'), ["privileged", "driver"]),
         (("inference_s = 0", ""), ["inference_s", "card"]),
-        (('source = "card"', 'source = "measured"'), ["inference_s", "card"]),
+        (('source = "card"', 'source = "paper"'), ["inference_s", "card"]),
         (("inference_s = 0", "inference_s = -1.0"), ["inference_s = -1.0", "0 or more"]),
         (("inference_s = 0", "inference_s = nan"), ["inference_s = nan", "0 or more"]),
         (("inference_s = 0", "inference_s = true"), ["inference_s", "float"]),
@@ -316,7 +316,7 @@ def test_a_faulty_proxy_is_declared_by_its_shares(shelf: Path) -> None:
         (("nan = 0.5", "slow_s = 0.5"), ["slow_tail", "slow_s", "together"]),
         (("nan = 0.5", "slow_s = inf"), ["slow_s = inf", "seconds"]),
         (
-            ('source = "card"\ninference_s = 0', 'source = "measured"'),
+            ('source = "card"\ninference_s = 0', 'source = "paper"'),
             ["slow tail", 'source = "card"'],
         ),
     ],
@@ -334,7 +334,7 @@ def test_a_directory_with_a_config_is_a_transformers_model_named_after_it(tmp_pa
     (checkpoint / "config.json").write_text("{}")
     card = cards.resolve(str(checkpoint))
     assert (card.name, card.engine, card.weights) == ("my-model", "transformers", str(checkpoint.resolve()))
-    assert (card.latency.source, card.thinking, card.dtype) == ("measured", "none", "auto")
+    assert (card.latency.source, card.thinking, card.dtype) == ("paper", "none", "auto")
 
 
 def test_a_directorys_thinking_switch_is_read_from_its_chat_template(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def engine(tiny: Path) -> LlamaEngine:
 
 
 def card_of(weights: Path, **fields: Any) -> Card:
-    latency = Latency("measured", None, "b")
+    latency = Latency("paper", None, "b")
     return Card("tiny", "llama-cpp", "d", latency, **{"weights": str(weights), **fields})
 
 

@@ -34,7 +34,7 @@ def test_the_list_has_every_card_in_eighty_columns(
     assert sorted(listed) == cards.names()
     assert "card 145 ms" in listed["proxy"]
     assert "yes" in listed["proxy"]
-    assert "measured" in listed["qwen3-4b"]
+    assert listed["qwen3-4b"].split()[3] == "paper"
     assert "\n  Deterministic rule on what its viewer sees\n" in out
     lines = out.splitlines()
     other = lines[lines.index(next(line for line in lines if line.startswith("qwen3-4b"))) + 1 :]

@@ -43,7 +43,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def card(url: str, kind: Kind = "generic", thinking: Thinking = "none", **server: Any) -> Card:
     where = Server(url, kind, **{"timeout_s": 20.0, "retries": 2, **server})
-    return Card("mine", "openai", "d", Latency("measured", None, "b"), "m", thinking=thinking, server=where)
+    return Card("mine", "openai", "d", Latency("paper", None, "b"), "m", thinking=thinking, server=where)
 
 
 def request(name: str = "s/v1", answer: AnswerMode = "json", thinking: bool = False, **more: Any) -> Request:
@@ -554,7 +554,7 @@ def test_after_a_run_the_key_is_nowhere(
         (tmp_path / "served.toml").write_text(
             'engine = "openai"\ndescription = "d"\nweights = "m"\n'
             f'[server]\nbase_url = "{there.url}"\nkey_env = "MY_KEY"\nretries = 1\n'
-            '[latency]\nsource = "measured"\nbasis = "b"\n'
+            '[latency]\nsource = "paper"\nbasis = "b"\n'
         )
         options = ["--model", "served", "--dataset", str(small_path), "--limit", "1", "--out", "run"]
         monkeypatch.setattr(sys, "argv", ["harness", "eval", *options])

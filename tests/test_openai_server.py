@@ -24,6 +24,7 @@ from harness.backends.servers import Server
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.asking import requests
+from harness.evaluate.latency import PAPER
 from harness.parsing.parse import parse
 
 NEEDED = ("torch", "transformers", "llama_cpp", "fastapi", "uvicorn", "starlette_context", "sse_starlette",
@@ -87,7 +88,7 @@ def card(url: str, monkeypatch: pytest.MonkeyPatch) -> Card:
     monkeypatch.setenv("TINY_KEY", KEY)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     server = Server(url, "llama-cpp-python", key_env="TINY_KEY", retries=0)
-    return Card("served", "openai", "d", Latency("measured", None, "b"), "tiny", server=server)
+    return Card("served", "openai", "d", Latency("paper", None, "b"), "tiny", server=server)
 
 
 @pytest.fixture
@@ -103,7 +104,7 @@ def some(data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int 
 
 
 def in_process(gguf: Path, asked: list[Request]) -> list[Completion]:
-    made = Card("tiny", "llama-cpp", "d", Latency("measured", None, "b"), str(gguf))
+    made = Card("tiny", "llama-cpp", "d", Latency("paper", None, "b"), str(gguf))
     return open_backend(made, batch_size=1).complete(asked)
 
 
@@ -167,7 +168,8 @@ def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset
     assert {a.error for a in answers} == {None}
     assert {a.status for a in answers} <= {"strict", "bad_sum"}
     assert all(a.seconds > 0 and a.prompt_tokens > 0 and a.completion_tokens > 0 for a in answers)
-    assert done.manifest.latency.source == "measured"
+    assert done.manifest.latency == PAPER
+    assert done.manifest.answer_times["ego"].n == len({a.scene for a in answers})
     assert done.manifest.identity["listed"] == {"id": "tiny", "owned_by": "me"}
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert len(files) == 5

@@ -71,7 +71,7 @@ def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_
 def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "model.gguf"
     file.write_bytes(b"GGUF")
-    latency = Latency("measured", None, "b")
+    latency = Latency("paper", None, "b")
     card = Card("mine", "llama-cpp", "d", latency, weights=str(file), sha256=sha256_bytes(b"GGUF"))
     assert held_to_digest(card, file) == file
     file.write_bytes(b"GGUX")

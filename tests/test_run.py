@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import pandas as pd
 import pytest
 from evaluating import FILES, decisions, figure, run, same_decisions, same_files, same_scores, spec_of
@@ -97,33 +96,6 @@ def test_prompts_too_long_for_the_model_are_counted_as_engine_errors(
     assert all(a.error.startswith("context overflow: ") and a.intent is None for a in errors)
     assert figure(done, "all", "failed_rate_ego", "answers").value == 1.0, "random weights write no JSON"
     assert figure(done, "6g", "fallback_rate").value == 1.0
-
-
-@pytest.mark.parametrize("batch_size", [1, 4])
-def test_a_model_without_declared_latency_is_timed_alone(
-    batch_size: int, tiny: Path, small_path: Path, tmp_path: Path
-) -> None:
-    data = load(small_path, limit=1)
-    spec = tiny_spec(tiny, data, batch_size=batch_size)
-    card = replace(spec.card, latency=Latency("measured", None, "this machine"), context_tokens=560)
-    done = run(replace(spec, card=card), tmp_path / "run")
-    latency = done.manifest.latency
-    assert latency.source == "measured"
-    found = [d.latency_ms for d in decisions(tmp_path / "run", "single-local")]
-    if batch_size == 1:
-        own = [a.seconds for a in answers_of(tmp_path / "run") if a.viewer == "v1"]
-        typical = float(np.median([s for s in own if s is not None]))
-        assert None in own, "an answer that failed has no time of its own"
-        expected = [1000 * (typical if s is None else s) for s in own]
-        assert (latency.ego_s, latency.helper_s) == (None, None)
-    else:
-        assert latency.n["ego"] > 0
-        expected = [1000 * latency.ego_s] * len(data.scenes)
-    assert found == pytest.approx(expected, abs=1e-3)
-    replayed = run(spec_of(data, f"replay:{tmp_path / 'run'}", seeds=(0,)), tmp_path / "again")
-    assert answers_of(tmp_path / "again") == answers_of(tmp_path / "run")
-    assert same_decisions(tmp_path / "again", tmp_path / "run")
-    assert replayed.manifest.latency == latency
 
 
 # -- replay ---------------------------------------------------------------------------------------------

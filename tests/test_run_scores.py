@@ -2,8 +2,6 @@
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -16,7 +14,6 @@ from evaluating import (
     failed,
     figure,
     says,
-    scenes_of,
     spec_of,
     sure,
     walked,
@@ -26,15 +23,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.backends import cards
-from harness.backends.base import Completion, Request, Role
+from harness.backends.base import Completion, Role
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
-from harness.evaluate import latency as latencies
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
 from harness.runs.folder import csv_text
-from harness.runs.records import Answer, Episode, Latency, Score, Variant
+from harness.runs.records import Answer, Latency, Score, Variant
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
@@ -271,69 +266,22 @@ def test_a_helper_whose_answer_failed_sends_nothing(
     assert value(told, "all", "failed_rate_helper", "answers") == (1 / 21, 21, 0)
 
 
-def test_an_unknown_time_is_unknown_and_never_zero(played: Dataset) -> None:
-    """Every ego answer failed before anything could be timed."""
-    spec = spec_of(played, points=(ALONE, CLEAR), seeds=(0,))
-    lines = {f"{s.id}/v1": failed(f"{s.id}/v1", "context overflow") for s in played.scenes}
-    backend = Scripted({**SAID, **lines})
-    assert np.isnan(asker_of(spec, backend, EACH_ITS_OWN)(played.scenes).inference_s[:, 0]).all()
-    told = walked(spec, backend, EACH_ITS_OWN)
-    for metric in ("latency_proxy_ms", "deadline_miss_rate"):
-        assert value(told, "single-local", metric) == (None, 0, 4)
-    for decision in told.records("single-local") + told.records("clear"):
-        assert (decision.latency_ms, decision.deadline_missed) == (None, None)
-    assert {e.latency_ms for e in told.episodes} == {None}
-    assert json.loads(msgspec.json.encode(told.episodes[0]))["latency_ms"] is None
-    head, first, *_ = csv_text(Episode, told.episodes).splitlines()
-    assert dict(zip(head.split(","), first.split(","), strict=True))["latency_ms"] == ""
-
-
-EACH_ITS_OWN = Latency("measured", "each answer alone, batch 1", None, None)
-
-
-def test_an_answer_without_a_time_takes_its_roles_median(small: Dataset) -> None:
+def test_every_answer_takes_what_is_declared_for_its_role(small: Dataset) -> None:
+    """Whatever it took; one that its proxy makes slower takes that on top, and who was not asked no time."""
     asked = {r.role: r for r in requests(spec_of(small), small.scenes[:1])}
 
-    def took(role: Role, seconds: float | None, slow_s: float = 0.0) -> Answer:
-        completion = Completion(
-            asked[role].id, sure("IDLE", role), None, None, "stop", seconds, 1, slow_s=slow_s
+    def took(role: Role, seconds: float | None, slow_s: float = 0.0, error: str | None = None) -> Answer:
+        said = Completion(
+            asked[role].id, sure("IDLE", role), None, None, "stop", seconds, 1, error, slow_s=slow_s
         )
-        return answer_of(asked[role], completion)
-
-    def every(rows: Sequence[Sequence[Answer | None]]) -> dict[str, Answer]:
-        return {f"{i}/{j}": a for i, row in enumerate(rows) for j, a in enumerate(row) if a}
+        return answer_of(asked[role], said)
 
     answers: list[list[Answer | None]] = [
-        [took("ego", 0.1), took("helper", 0.5), None],
-        [took("ego", None), took("helper", 0.7), None],
-        [took("ego", 0.3), took("helper", None), took("helper", 0.6)],
+        [took("ego", 0.3), took("helper", 0.5, slow_s=0.4), None],
+        [took("ego", None, error="context overflow"), took("helper", None), took("helper", 9.0)],
     ]
-    seconds = inference_s(EACH_ITS_OWN, answers, every(answers))
-    expected = [[0.1, 0.5, np.nan], [0.2, 0.7, np.nan], [0.3, 0.6, 0.6]]
-    assert seconds == pytest.approx(np.array(expected), nan_ok=True)
-    step = inference_s(EACH_ITS_OWN, answers[2:], every(answers))
-    assert step == pytest.approx(seconds[2:]), "the median is the run's, not a step's"
-    answers[0][1] = took("helper", 0.5, slow_s=0.4)
-    declared = inference_s(Latency("card", "b", 0.1, 0.2), answers, every(answers))
-    expected = [[0.1, 0.6, np.nan], [0.1, 0.2, np.nan], [0.1, 0.2, 0.2]]
-    assert declared == pytest.approx(np.array(expected), nan_ok=True)
-
-
-def test_an_answer_that_failed_is_no_sample_of_a_models_latency(small: Dataset) -> None:
-    """A server that refuses at once would look fast: of five egos' answers, one fails after no time."""
-
-    class Timed(Scripted):
-        def _say(self, request: Request) -> Completion:
-            first = request.id == "00000-0/v1"
-            return replace(super()._say(request), seconds=0.0 if first else 0.3, error="x" if first else None)
-
-    card = replace(cards.load("proxy"), latency=cards.Latency("measured", None, "this test"))
-    spec, backend = replace(spec_of(small), card=card), Timed({})
-    assert latencies.declared(spec, backend) is None
-    sample = list(requests(spec, latencies.sample(scenes_of(spec))))
-    latency = latencies.measured(spec, backend, sample)
-    assert (latency.ego_s, latency.helper_s) == (0.3, 0.3)
-    assert latency.n["ego"] == 4
+    seconds = inference_s(Latency("card", "b", 0.1, 0.2, 0.3), answers)
+    assert seconds == pytest.approx(np.array([[0.1, 0.6, np.nan], [0.1, 0.2, 0.2]]), nan_ok=True)
 
 
 NASTY = st.text(max_size=40) | st.sampled_from(

@@ -274,7 +274,7 @@ def test_weights_that_are_nowhere_say_where_they_were_looked_for_and_how_to_get_
 
 
 def test_a_directory_that_has_gone_is_said_so(tmp_path: Path) -> None:
-    card = Card("gone", "transformers", "d", Latency("measured", None, "b"), weights=str(tmp_path / "gone"))
+    card = Card("gone", "transformers", "d", Latency("paper", None, "b"), weights=str(tmp_path / "gone"))
     with pytest.raises(UserError, match=r"no directory .*gone'.*give another directory"):
         open_backend(card)
 

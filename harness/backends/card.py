@@ -14,7 +14,7 @@ from harness.core.errors import UserError, printable, unknown
 
 Dtype = Literal["float32", "bfloat16", "auto"]
 Thinking = Literal["none", "switch", "always"]
-LatencySource = Literal["card", "measured"]
+LatencySource = Literal["card", "paper"]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 0-9 a-f")]
 
 
@@ -23,8 +23,8 @@ class Latency:
     """Time of one answer.
 
     Attributes:
-        source: `card` takes `inference_s` as it stands; `measured` takes each run's own batch-1 seconds.
-        inference_s: declared seconds of one answer; None when measured.
+        source: `card` takes `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms.
+        inference_s: declared seconds of one answer; None if the paper's count.
         basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
     """
 
@@ -112,7 +112,7 @@ def read(path: Path) -> list[Card]:
     table.pop("engines", None)
     cards = [_card(table, where, path.stem)]
     shared = {key: value for key, value in table.items() if key not in _ANEW}
-    if cards[0].latency.source == "measured":  # one that was declared says nothing of another engine
+    if cards[0].latency.source == "paper":  # one that was declared says nothing of another engine
         shared["latency"] = table["latency"]
     for engine, anew in others.items():
         at = f"{where} [engines.{printable(engine)}]"
@@ -130,7 +130,7 @@ def read(path: Path) -> list[Card]:
 
 
 def _whole(table: dict[str, Any]) -> dict[str, Any]:
-    """A table with the `inference_s` that a measured latency leaves out."""
+    """A table with the `inference_s` that is left out where no time is declared."""
     latency = table.get("latency")
     return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
 

@@ -128,7 +128,7 @@ def _path(text: str) -> Path | None:
 
 
 def _made(name: str, engine: str, weights: str, description: str, thinking: Thinking = "none") -> Card:
-    latency = Latency("measured", None, "batch-1 seconds of the run")
+    latency = Latency("paper", None, "none declared: the paper's")
     return Card(name, engine, description, latency, weights=weights, thinking=thinking)
 
 

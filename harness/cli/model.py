@@ -35,7 +35,7 @@ def list_models(as_json: options.Json = False) -> None:
     typer.echo(line.format("name", "engine", "thinking", "latency", "runs here"))
     for card, lack in rows:
         seconds = card.latency.inference_s
-        latency = "measured" if seconds is None else f"card {seconds * 1000:g} ms"
+        latency = "paper" if seconds is None else f"card {seconds * 1000:g} ms"
         here = f"no: {lack}" if lack else "yes"
         name, _, other = card.name.partition(":")
         # A card's other engines stand below it.

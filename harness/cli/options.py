@@ -9,9 +9,8 @@ from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.evaluate.spec import Latency as LatencySource
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = LatencySource = str
+    AnswerMode = str
 
 MOST_SEEDS = 1000
 MOST_WORKERS = 256
@@ -37,8 +36,11 @@ ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded
 Device = Annotated[str | None, Option(help="cpu or cuda.")]
 Dtype = Annotated[str | None, Option(help="float32, bfloat16 or auto, in place of the card's.")]
 Latency = Annotated[
-    LatencySource | None,
-    Option(help="Inference times: card, measured (batch 1, here) or paper (145 ms). Default: the card's."),
+    str | None,
+    Option(
+        help="Inference times: paper (145 ms), card, ego=SECONDS,helper=SECONDS,fusion=SECONDS, or measured "
+        "(batch 1, on this machine if it is idle). Default: the card's, else the paper's."
+    ),
 ]
 Resume = Annotated[bool, Option("--resume", help="Continue a run that was stopped.")]
 NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that an earlier run has.")]

@@ -83,11 +83,9 @@ def show(
 def _origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
     """Where a run's times come from and how its answers were read."""
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
-    if (m.latency.load_a_core or 0) > 1:
-        yield (
-            f"timed on a busy machine ({m.latency.load_a_core} processes a core): "
-            "let it run alone, or use --latency card or paper"
-        )
+    for role, took in m.answer_times.items():
+        low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
+        yield f"{role} answers took {half} ms (5 to 95 %: {low} to {high}; n = {took.n}); decides nothing"
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks anew)"
     if m.engine_errors:

@@ -17,7 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
-from harness.evaluate.latency import fusion_s, inference_s, lacks_fusion, with_fusion
+from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
 from harness.prompts import readout
@@ -170,13 +170,13 @@ class Asker:
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages."""
         ids = [_fusion_id(*each) for each in _heard(moments, codes)]
-        if lacks_fusion(self.latency, self.answers) or not self.answers.keys() >= set(ids):
+        if not self.answers.keys() >= set(ids):
             asked = self.fusion_requests(moments, codes)
-            self.ask_fusion([request for request in asked if request.id not in self.answers], asked)
+            self.ask_fusion([request for request in asked if request.id not in self.answers])
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
-        return FusionAnswers(codes, intents, fusion_s(self.latency, answers, self.answers)).at
+        return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
 
     def fusion_requests(self, moments: Sequence[Scene], codes: Ints) -> list[Request]:
         """The requests of the fusion calls with these sets of messages."""
@@ -186,13 +186,11 @@ class Asker:
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
         return asked
 
-    def ask_fusion(self, owed: Sequence[Request], needed: Sequence[Request]) -> None:
-        """Make the fusion calls that are owed, and time a sample of those needed if no time is known."""
+    def ask_fusion(self, owed: Sequence[Request]) -> None:
+        """Make the fusion calls that are owed."""
         if owed:
             self._more(len(owed))
             self.ask(owed)
-        if needed and lacks_fusion(self.latency, self.answers):
-            self.latency = with_fusion(self.latency, self._backend(), needed)
 
     def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
         width, actions = max(map(len, answers)), len(self.spec.actions)
@@ -212,8 +210,7 @@ class Asker:
                     bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
             row += [None] * (width - len(row))
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)
-        seconds = inference_s(self.latency, answers, self.answers)
-        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, seconds)
+        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, inference_s(self.latency, answers))
 
 
 def _heard(moments: Sequence[Scene], codes: Ints) -> Iterator[tuple[Scene, list[str]]]:

@@ -23,7 +23,8 @@ from harness.core.memory import uncollected
 from harness.core.parallel import spread
 from harness.dataset.load import Scene
 from harness.evaluate import latency as latencies
-from harness.evaluate.asking import Asker, fusion_request, requests
+from harness.evaluate import timing
+from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.spec import Spec, versions
 from harness.evaluate.walk import heard_codes, table, walk
@@ -105,31 +106,22 @@ def _frozen(
 ) -> Evaluated:  # fmt: skip
     scenes = source.dataset.scenes
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
-    with working(spec, out, backend.identity()) as work:
-        # Times are those of the backend itself: the cache answers in no time.
-        latency = latencies.declared(spec, backend) or latencies.kept(work / "latency.json")
-        trial = partial(requests, spec, latencies.sample(scenes))
-        if latency is None:
-            latency = latencies.measured(spec, backend, list(trial()))
+    latency = _latency(spec, out, backend, lambda: timing.spread_over(scenes))
+    with working(spec, out, backend.identity(), latency) as work:
         asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
         asker.ask(list(requests(spec, scenes)))
-        if latency.each_its_own and latencies.lacks_times(asker.answers):
-            asker.latency = latencies.timed(backend, list(trial()))
-        latencies.keep(work / "latency.json", asker.latency)
         if any(point.asks_again for point in spec.points):
-            calls = _fusion_calls(spec, source, asker)
-            asker.ask_fusion(calls, calls)
-            latencies.keep(work / "latency.json", asker.latency)
+            asker.ask_fusion(_fusion_calls(spec, source, asker))
         with uncollected():
             walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
-        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), asker.latency)
+        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), latency)
 
 
 def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Request]:
     """All fusion calls of a run, scene by scene: what frozen scenes show depends on no decision.
 
-    They are made before the walk, so that the time of one may count for another, whatever their steps.
+    They are made before the walk, so that they fill batches, whatever their steps.
     """
     world = FrozenWorld(source.dataset, spec.seeds)
     asked: list[Request] = []
@@ -147,9 +139,8 @@ def _closed_loop(
     # Compiled templates do not travel between processes.
     spec = replace(spec, prompt=replace(spec.prompt))
     # Engines are opened where they answer: a forked process has none of their threads.
-    [(identity, latency)] = spread(_begin, [spec], workers, lambda done: None)
-    with working(spec, out, identity) as work:
-        latency = latencies.keep(work / "latency.json", latencies.kept(work / "latency.json") or latency)
+    [(identity, latency)] = spread(partial(_begin, out=out), [spec], workers, lambda done: None)
+    with working(spec, out, identity, latency) as work:
         size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
         chunks = [range(at, min(at + size, source.episodes)) for at in range(0, source.episodes, size)]
         sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
@@ -182,38 +173,20 @@ def _driven(
     return part
 
 
-def _begin(spec: Spec) -> tuple[dict[str, Any], Latency]:
-    """Identity of the model and latency of its decisions in the closed loop.
-
-    An answer's own seconds depend on what else the machine does, so a measured latency is always the median
-    of a sample: the same in every episode, with any number of workers.
-    """
+def _begin(spec: Spec, out: Path) -> tuple[dict[str, Any], Latency]:
+    """Identity of the model and latency of its decisions in the closed loop."""
     backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, None)
-    latency = latencies.declared(spec, backend)
-    if latency:
-        return backend.identity(), latency
-    scenes = cast("LiveSource", spec.source).trial(latencies.SAMPLE, spec.ego_alone)
-    trial = replace(spec, batch_size=2)
-    latency = latencies.measured(trial, backend, list(requests(trial, scenes)))
-    if latency.ego_s is None or latency.helper_s is None:
-        raise UserError(
-            f"--model {printable(spec.card.name)}: none of {len(scenes)} trial answers could be timed, and "
-            "an episode needs a latency; see what `harness model check` says"
-        )
-    if any(point.asks_again for point in spec.points):
-        asker = Asker(trial, lambda: backend, latency)
-        asker.ask(list(requests(trial, scenes)))
-        fusion = list(_with_every_message(trial, scenes, asker.answers))
-        if fusion:
-            latency = latencies.with_fusion(latency, backend, fusion)
-    return backend.identity(), msgspec.structs.replace(latency, fusion_s=latency.fusion_s or latency.ego_s)
+    source = cast("LiveSource", spec.source)
+    return backend.identity(), _latency(
+        spec, out, backend, lambda: source.trial(timing.SCENES, spec.ego_alone)
+    )
 
 
-def _with_every_message(spec: Spec, scenes: Sequence[Scene], answers: dict[str, Answer]) -> Iterator[Any]:
-    for scene in scenes:
-        said = {v: answers[f"{scene.id}/{v}"] for v in scene.viewers}
-        if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
-            yield fusion_request(spec, scene, said, heard)
+def _latency(spec: Spec, out: Path, backend: Backend, trial: Callable[[], Sequence[Scene]]) -> Latency:
+    """What a resumed run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
+    if (out / WORK / CONFIG).is_file():
+        return msgspec.convert(_begun(out / WORK)["latency"], Latency)
+    return latencies.known(spec.latency, spec.card, backend) or timing.measured(spec, backend, trial())
 
 
 @lru_cache(maxsize=2)
@@ -234,13 +207,17 @@ def _written(
     """Score a walk and write the run's files, the manifest last."""
     begun = _begun(work)
     spec = spec.tagged(begun)
+    again = spec
+    if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
+        again = replace(spec, latency=latencies.as_declared(latency))
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, numbers)
     episodes = counted(grid, walked.decisions, walked.episodes)
     answers = folder.ordered(walked.answers.values(), walked.decisions)
     summary = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
     manifest = msgspec.convert({
-        "format": FORMAT, "name": out.name, "created": begun["created"], "command": spec.command(out),
-        "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency), "identity": identity,
+        "format": FORMAT, "name": out.name, "created": begun["created"], "command": again.command(out),
+        "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency),
+        "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": identity,
         "cached_answers": sum(answer.cached for answer in answers),
         "engine_errors": sum(answer.error is not None for answer in answers),
         "versions": versions(),
@@ -275,6 +252,8 @@ def refuse(spec: Spec, out: Path, resume: bool) -> None:
         _same(spec.settings(), _begun(out / WORK)["settings"], out)
     elif out.exists() and (not out.is_dir() or any(p.name != WORK for p in out.iterdir())):
         raise UserError(f"--out {shown} exists and is no run; choose another folder")
+    if spec.latency == latencies.MEASURED and not (out / WORK / CONFIG).is_file():
+        timing.refuse_busy()
 
 
 def _begun(work: Path) -> dict[str, Any]:
@@ -302,7 +281,7 @@ def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
 
 
 @contextmanager
-def working(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
+def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -> Iterator[Path]:
     """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
     work, existed = out / WORK, out.exists()
     new = not (work / CONFIG).is_file()
@@ -323,7 +302,7 @@ def working(spec: Spec, out: Path, identity: dict[str, Any]) -> Iterator[Path]:
                 (work / "answers.jsonl").unlink(missing_ok=True)
                 begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"),
                          "settings": spec.settings(), "identity": digest(identity),
-                         "tags": spec.tags}  # fmt: skip
+                         "tags": spec.tags, "latency": msgspec.to_builtins(latency)}  # fmt: skip
                 write_whole(work / CONFIG, canonical_json(begun))
             yield work
     except BlockingIOError:

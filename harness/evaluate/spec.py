@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self, get_args
+from typing import Any, Protocol, Self, get_args
 
 import msgspec
 
@@ -17,12 +17,12 @@ from harness.backends.registry import capabilities, registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
+from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.prompts.versions import Prompt
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
 
-Latency = Literal["card", "measured", "paper"]
 TAG_CHARACTERS = 40
 
 
@@ -78,7 +78,8 @@ class Spec:
         batch_size: most requests that go through the engine together.
         device: engine's device, or None for its choice.
         dtype: number format, or None for the card's.
-        latency: where inference times come from, or None for the card's choice.
+        latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
+            reads them; None for the card's, else the paper's.
         tags: words to find the run by, which change nothing in it.
     """
 
@@ -92,7 +93,7 @@ class Spec:
     batch_size: int = 8
     device: str | None = None
     dtype: str | None = None
-    latency: Latency | None = None
+    latency: str | None = None
     tags: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -151,16 +152,16 @@ class Spec:
         shown, can = f"--latency {printable(self.latency)}", capabilities(self.card.engine)
         if self.latency is None:
             return
-        if self.latency not in get_args(Latency):
-            raise unknown("--latency", self.latency, get_args(Latency))
-        if can.own_latency and self.latency != "paper":
+        if self.latency not in NAMES:
+            declared(self.latency)
+        elif can.own_latency and self.latency != "paper":
             raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
-        if self.latency == "measured" and not can.language_model:
+        elif self.latency == MEASURED and not can.language_model:
             raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
-        if self.latency == "card" and self.card.latency.inference_s is None:
+        elif self.latency == "card" and self.card.latency.inference_s is None:
             raise UserError(
                 f"{shown}: the card of {printable(self.card.name)} declares no inference time; "
-                "use measured or paper, or add inference_s to the card"
+                "use paper or measured, or add inference_s to the card"
             )
 
     def tagged(self, begun: Mapping[str, Any]) -> Self:

@@ -23,7 +23,6 @@ from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
-from harness.runs.records import Latency
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -105,14 +104,14 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "inference_s": inference_s(run.manifest.latency),
-                "merge_s": run.manifest.latency.fusion_s,
+                "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
+                "merge_s": latency.fusion_s,
                 "points": {
                     c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}
                     for c in run.manifest.conditions
                 },
             }
-            for run in runs.runs
+            for run, latency in ((run, run.manifest.latency) for run in runs.runs)
         ],
         "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
         "ground": {
@@ -123,11 +122,6 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "policies": policies(),
         "timeline": timeline(),
     }  # fmt: skip
-
-
-def inference_s(latency: Latency) -> dict[str, float | None] | None:
-    """Seconds of one inference by role; None where each answer has its own time."""
-    return None if latency.each_its_own else {"ego": latency.ego_s, "helper": latency.helper_s}
 
 
 def environment(*more: Path) -> Environment:
@@ -141,7 +135,8 @@ def environment(*more: Path) -> Environment:
     )
     templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown,
-        "latency_source": words.latency_source, "mapping": msgspec.to_builtins, "columns": _table,
+        "latency_source": words.latency_source, "answer_times": words.answer_times,
+        "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
     return templates
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
-from harness.runs.records import Latency, Score
+from harness.runs.records import Latency, Score, Times
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -67,13 +67,23 @@ def success_of(score: Score) -> str:
 def latency_source(latency: Latency) -> str:
     """Where the inference time comes from, and how long it is."""
     source = {
-        "measured": "measured where it ran, one answer at a time",
+        "measured": "measured where it ran, before the run",
         "card": "stated by the model card, not measured here",
         "paper": "the paper's, not measured here",
+        "declared": "declared by who ran it, not measured here",
     }[latency.source]
     by_role = {"ego": latency.ego_s, "helper": latency.helper_s, "ego with messages": latency.fusion_s}
-    times = [f"{role} {s * 1000:.0f} ms" for role, s in by_role.items() if s is not None]
-    return f"{', '.join(times) or 'each answer has its own time'}; {source} ({latency.basis})"
+    times = ", ".join(f"{role} {s * 1000:.0f} ms" for role, s in by_role.items())
+    return f"{times}; {source} ({latency.basis})"
+
+
+def answer_times(times: Mapping[str, Times]) -> str:
+    """How long a run's own answers took."""
+    told = []
+    for role, took in times.items():
+        low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
+        told.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
+    return ", ".join(told) or "not known, since no answer was asked alone"
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

@@ -71,31 +71,33 @@ class Answer(Struct, frozen=True, kw_only=True):
         return "+".join((self.viewer, *self.heard))
 
 
+class Times(Struct, frozen=True):
+    """How long some answers took, each asked alone: how many, and percentiles in seconds."""
+
+    n: int
+    median_s: float
+    p5_s: float
+    p95_s: float
+
+
 class Latency(Struct, frozen=True, omit_defaults=True):
-    """How long inference takes, decided once a run.
+    """How long inference takes, fixed before a run: it decides who is heard in time.
 
     Attributes:
-        source: `card`, `measured` or `paper`.
+        source: `card`, `paper`, `declared` (by the user) or `measured`.
         basis: where the numbers come from.
-        ego_s: seconds of one inference of the ego; None where each answer's own time counts.
+        ego_s: seconds of one inference of the ego.
         helper_s: of a helper.
-        fusion_s: of the ego's fusion call; None where each answer's own time counts, or none is needed.
-        n: answers behind a measured time, by role.
-        load_a_core: processes that wanted a core while it was measured, a core; None where unknown.
+        fusion_s: of the ego's fusion call.
+        sample: the answers behind a measured time, by role.
     """
 
-    source: Literal["card", "measured", "paper"]
+    source: Literal["card", "paper", "declared", "measured"]
     basis: str
-    ego_s: float | None
-    helper_s: float | None
-    fusion_s: float | None = None
-    n: dict[str, int] = {}
-    load_a_core: float | None = None
-
-    @property
-    def each_its_own(self) -> bool:
-        """Whether each answer's own time counts."""
-        return self.ego_s is None and self.helper_s is None
+    ego_s: float
+    helper_s: float
+    fusion_s: float
+    sample: dict[str, Times] = {}
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
@@ -290,6 +292,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     dtype: str | None
     latency_source: str | None
     latency: Latency
+    answer_times: dict[str, Times] = field(default_factory=dict)
     identity: dict[str, Any]
     cached_answers: int
     engine_errors: int

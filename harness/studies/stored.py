@@ -22,16 +22,15 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Scene
-from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs.folder import dataset_of, read
 from harness.studies.play import Walked, walk_through
 
-# What fusion calls that none of the run's conditions needed say, and how long they take, in the run's folder.
-CALLS, TIMES = "fusion-calls.jsonl", "fusion-calls.json"
+CALLS = "fusion-calls.jsonl"  # what fusion calls that none of the run's conditions needed say
 
 
 class Stored:
@@ -68,9 +67,8 @@ class Stored:
         if len(self._dataset.scenes) != len(mine):
             raise UserError(f"{printable(folder)} has scenes that its dataset has not; make the run again")
         self.vehicles = max(len(scene.viewers) for scene in self._dataset.scenes)
-        own = latencies.kept(folder / TIMES) or manifest.latency
         self._asker = Asker(
-            self._spec(), self._open, latencies.PAPER if latency == "paper" else own, folder / CALLS,
+            self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / CALLS,
             {answer.id: answer for answer in self.run.answers}, done, more,
         )  # fmt: skip
         self._world = lru_cache(maxsize=2)(partial(FrozenWorld, self._dataset))
@@ -109,11 +107,7 @@ class Stored:
         """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
         try:
             with alone(self.run.path / f".{CALLS}.lock"):
-                before = self._asker.latency
-                call = self._asker.fusion_call(moments, codes)
-                if self._asker.latency != before:
-                    latencies.keep(self.run.path / TIMES, self._asker.latency)
-                return call
+                return self._asker.fusion_call(moments, codes)
         except BlockingIOError:
             raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
 

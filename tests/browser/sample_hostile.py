@@ -7,7 +7,7 @@ from run_on_disk import configure, made_up
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
 from harness.runs.folder import csv_text, read
-from harness.runs.records import FrozenScenes, Latency, Score
+from harness.runs.records import FrozenScenes, Latency, Score, Times
 
 WAYS_IN = (
     "{}", '">{}', "'>{}", "</td></tr></table>{}", "</title>{}", "</style>{}", "</script>{}", "</textarea>{}",
@@ -92,7 +92,8 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
         world=world,
         dtype=mine,
         latency_source=mine,
-        latency=Latency("card", mine, 0.1, 0.1, n={mine: 1}),
+        latency=Latency("card", mine, 0.1, 0.1, 0.1, {mine: Times(1, 0.1, 0.1, 0.1)}),
+        answer_times={mine: Times(1, 0.1, 0.1, 0.1)},
         versions={"harness": mine, mine: mine},
     )
     configure(folder, answer=mine)

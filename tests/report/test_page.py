@@ -29,9 +29,9 @@ from harness.prompts import versions as prompts
 from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
-from harness.report.words import headline, latency_source
+from harness.report.words import answer_times, headline, latency_source
 from harness.runs.folder import csv_text, read
-from harness.runs.records import Latency, Score
+from harness.runs.records import Latency, Score, Times
 
 V2 = prompts.load("v2")
 
@@ -311,17 +311,25 @@ def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
     ("latency", "words"),
     [
         (
-            Latency("card", "cited", 0.145, 0.2),
-            "ego 145 ms, helper 200 ms; stated by the model card, not measured here (cited)",
+            Latency("card", "cited", 0.145, 0.2, 0.3),
+            "ego 145 ms, helper 200 ms, ego with messages 300 ms; "
+            "stated by the model card, not measured here (cited)",
         ),
         (
-            Latency("measured", "batch 1", None, None),
-            "each answer has its own time; measured where it ran, one answer at a time (batch 1)",
+            Latency("measured", "batch 1", 0.1, 0.1, 0.1),
+            "ego 100 ms, helper 100 ms, ego with messages 100 ms; "
+            "measured where it ran, before the run (batch 1)",
         ),
     ],
 )
 def test_the_source_of_latency_in_words(latency, words):
     assert latency_source(latency) == words
+
+
+def test_what_answers_took_in_words():
+    assert answer_times({}) == "not known, since no answer was asked alone"
+    told = answer_times({"ego": Times(240, 0.0312, 0.0281, 0.0403), "merge": Times(1, 0.2, 0.2, 0.2)})
+    assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), merge 200 ms (5 to 95 %: 200 to 200; n = 1)"
 
 
 def copied(run, tmp_path):

@@ -129,8 +129,10 @@ def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
         if name not in pair.conditions
     )  # fmt: skip
     for name in {**a, **b}:
-        # A description changes nothing, and how often a time was measured is no setting.
-        if a.get(name) != b.get(name) and not name.startswith(("model.description", "latency.n.", *left_out)):
+        # A description changes nothing, and the sample behind a time is no setting.
+        if a.get(name) != b.get(name) and not name.startswith(
+            ("model.description", "latency.sample.", *left_out)
+        ):
             yield name, a.get(name), b.get(name)
 
 

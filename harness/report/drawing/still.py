@@ -110,7 +110,7 @@ def _outline(name: str) -> Outline:
 def _messages(played: Played, still: Still) -> Iterator[Artist]:
     """Each reply on its way from its helper to the ego; one that was lost goes half of it."""
     latency = played.manifest.latency
-    sent_s = max(latency.ego_s or 0.0, latency.helper_s or 0.0)
+    sent_s = max(latency.ego_s, latency.helper_s)
     ego = still.state.ego
     for message in still.decision.messages if still.open else ():
         end_s = (message.arrival_ms or still.decision.latency_ms or 0.0) / 1000

@@ -58,17 +58,12 @@ function policyRows(told, chosen, actions) {
 }
 
 // Inference as the run took it: one time for all, one a role, or each answer's own.
-function inferenceMs(answer, seconds) {
-  if (seconds == null) return 1000 * (answer.seconds ?? 0);
-  return 1000 * (typeof seconds === "object" ? seconds[answer.role] ?? seconds.ego ?? 0 : seconds);
-}
-
 function timelineRows(told, chosen, run) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
   for (const a of first(told.answers)) {
     const m = chosen.messages.find((m) => m.from === a.viewer), who = `${a.viewer}, ${a.role}`;
     if (a.role !== "ego" && !m) continue;
-    const ready = inferenceMs(a, run.inference_s);
+    const ready = 1000 * run.inference_s[a.role];
     if (ready) rows.push({ who, what: "inference", from: 0, to: ready });
     if (!m) continue;
     const to = m.delivered ? m.arrival_ms : Math.min(latency_ms, 1000 * (point.window_s ?? 0));
@@ -77,7 +72,7 @@ function timelineRows(told, chosen, run) {
   }
   // ego-prompt infers once more when the exchange is over; a rule takes no time.
   const again = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time);
-  const fusion = again ? 1000 * (run.merge_s ?? 0) : 0;
+  const fusion = again ? 1000 * run.merge_s : 0;
   if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: latency_ms - fusion, to: latency_ms });
   if (latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: latency_ms });
   return rows;

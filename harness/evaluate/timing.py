@@ -1,0 +1,74 @@
+"""Inference times measured before a run: by name only, and on an idle machine only."""
+
+import os
+from collections.abc import Sequence
+
+from harness.backends.base import Backend
+from harness.core.errors import UserError, printable
+from harness.dataset.load import Scene
+from harness.evaluate.asking import answer_of, fusion_request, requests
+from harness.evaluate.latency import EXAMPLE, MEASURED, times
+from harness.evaluate.spec import Spec
+from harness.runs.records import Latency
+
+SCENES = 5  # that are timed
+IDLE = 0.25  # processes that want a core, a core, at most
+
+
+def refuse_busy() -> None:
+    """Raise UserError unless the machine has been idle for a minute."""
+    load = load_a_core()
+    if load is None or load > IDLE:
+        reason = (
+            "this system does not say how busy it is" if load is None else
+            f"the machine is busy ({load:.2f} processes a core in the last minute; at most {IDLE:g})"
+        )  # fmt: skip
+        wait = "" if load is None else "wait until it is idle, or "
+        raise UserError(
+            f"--latency {MEASURED}: {reason}; {wait}declare times with --latency paper or {EXAMPLE}"
+        )
+
+
+def load_a_core() -> float | None:
+    """Processes that wanted a core in the last minute, a core; None where the system does not say."""
+    try:
+        return os.getloadavg()[0] / (os.cpu_count() or 1)
+    except (OSError, AttributeError):
+        return None
+
+
+def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
+    """So many scenes as are timed, evenly spread."""
+    return scenes[:: max(1, len(scenes) // SCENES)][:SCENES]
+
+
+def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
+    """The median time of a role's answers in these scenes, each asked alone.
+
+    A role without an answer that can be timed is given the ego's time.
+
+    Args:
+        spec: the evaluation.
+        backend: the model itself: a cache answers in no time.
+        scenes: what is asked about.
+
+    Raises:
+        UserError: no answer of the ego can be timed.
+    """
+    first = list(requests(spec, scenes))
+    backend.complete(first[:1])  # the first answer of a process pays for warming up
+    answers = {r.id: answer_of(r, backend.complete([r])[0]) for r in first}
+    fusion = []
+    for scene in scenes if spec.answer != "readout" else ():
+        said = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
+        if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
+            fusion.append(fusion_request(spec, scene, said, heard))
+    sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
+    if "ego" not in sample:
+        raise UserError(
+            f"--latency {MEASURED}: no answer of {printable(spec.card.name)} could be timed in {len(scenes)} "
+            f"scenes; see what `harness model check` says, or declare times such as {EXAMPLE}"
+        )
+    ego, helper, merge = (sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge"))
+    basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
+    return Latency("measured", basis, ego, helper, merge, sample)

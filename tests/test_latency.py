@@ -1,0 +1,264 @@
+"""Where inference times come from, and that how fast a machine is changes no row of a run."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from evaluating import Scripted, run, says, spec_of
+from run_on_disk import answers_of
+
+from harness.backends.base import Completion, Request
+from harness.backends.cards import Latency as CardLatency
+from harness.backends.cards import resolve
+from harness.coordination.operating_point import POINTS, named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.evaluate import run as evaluation
+from harness.evaluate import timing
+from harness.evaluate.latency import LONGEST_S, PAPER, as_declared, declared, known, times
+from harness.evaluate.timing import IDLE, measured
+from harness.runs.records import Latency, Times
+
+LANGUAGE_MODEL = "swarm-tiny"
+ROWS = ("decisions.parquet", "episodes.csv", "summary.csv")
+
+
+# -- which one counts -----------------------------------------------------------------------------------
+
+
+def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
+    silent, nobody = resolve(LANGUAGE_MODEL), Scripted({})
+    fast = replace(silent, latency=CardLatency("card", 0.03, "measured: my car, today"))
+    of_card = Latency("card", "measured: my car, today", 0.03, 0.03, 0.03)
+    assert known(None, silent, nobody) == known("paper", silent, nobody) == PAPER
+    assert (PAPER.ego_s, PAPER.helper_s, PAPER.fusion_s) == (0.145, 0.145, 0.145)
+    assert known(None, fast, nobody) == known("card", fast, nobody) == of_card
+    assert known("paper", fast, nobody) == PAPER
+    assert known("measured", fast, nobody) is None
+    told = known("ego=0.2,helper=0.1", fast, nobody)
+    assert told == Latency("declared", "declared: --latency ego=0.2,helper=0.1", 0.2, 0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("ego=0.171", (0.171, 0.171, 0.171)),
+        ("ego=0.171,helper=0.164", (0.171, 0.164, 0.171)),
+        ("fusion=0.2,helper=0,ego=5e-05", (5e-05, 0.0, 0.2)),
+    ],
+)
+def test_what_is_left_out_takes_as_long_as_the_ego(text: str, seconds: tuple[float, ...]) -> None:
+    said = declared(text)
+    assert (said.ego_s, said.helper_s, said.fusion_s) == seconds
+    again = declared(as_declared(said))
+    assert (again.ego_s, again.helper_s, again.fusion_s) == seconds
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "mine", "0.1", "ego", "ego=", "ego=x", "ego=nan", "ego=-1", "ego=inf", f"ego={LONGEST_S + 1}",
+     "helper=0.1", "ego=0.1,ego=0.2", "ego=0.1,", "ego=0.1,car=0.2", "ego=0.1 helper=0.2", "ego=0.1\x1b[2J"],
+)  # fmt: skip
+def test_anything_else_is_one_line(text: str, harness: Callable[..., Any]) -> None:
+    code, out, err = harness("eval", "--limit", "1", "--latency", text)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("harness: --latency '")
+    assert "give card, measured, paper, or seconds of one answer" in err
+    assert "\x1b" not in err
+
+
+def test_a_replay_keeps_its_runs_times_unless_others_are_declared(small: Dataset, tmp_path: Path) -> None:
+    first = run(spec_of(small, latency="ego=0.02,helper=0.01"), tmp_path / "run")
+    replay = f"replay:{tmp_path / 'run'}"
+    assert run(spec_of(small, replay), tmp_path / "again").manifest.latency == first.manifest.latency
+    other = run(spec_of(small, replay, latency="ego=0.3"), tmp_path / "other").manifest.latency
+    assert (other.ego_s, other.helper_s) == (0.3, 0.3)
+
+
+# -- measured, by name ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("load", "said"),
+    [
+        (IDLE + 0.01, "the machine is busy (0.26 processes a core in the last minute; at most 0.25); wait"),
+        (None, "this system does not say how busy it is; declare times with --latency paper or ego="),
+    ],
+)
+def test_a_busy_machine_measures_nothing(
+    load: float | None, said: str, harness: Callable[..., Any], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(timing, "load_a_core", lambda: load)
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: pytest.fail("the model was opened"))
+    for command in (["eval"], ["drive"], ["campaign", "closed-loop"]):
+        code, out, err = harness(*command, "--model", LANGUAGE_MODEL, "--latency", "measured", "--quiet")
+        assert (code, out) == (2, "")
+        assert err.startswith(f"harness: --latency measured: {said}")
+        assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_system_without_a_load_average_is_none_that_is_idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (3.0, 0.0, 0.0))
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    assert timing.load_a_core() == 0.75
+
+    def missing() -> None:
+        raise OSError
+
+    monkeypatch.setattr(os, "getloadavg", missing)
+    assert timing.load_a_core() is None
+
+
+class Clock(Scripted):
+    """An ego takes 0.2 s, a helper 0.1 s and a fusion call 0.4 s, but for the completions written down."""
+
+    def _say(self, request: Request) -> Completion:
+        done = super()._say(request)
+        if request.id in self.lines:
+            return done
+        return replace(done, seconds=0.4 if "+" in request.id else 0.2 if request.role == "ego" else 0.1)
+
+
+def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset) -> None:
+    """Of five egos one failed at once and one was tried twice: three count."""
+    scenes = timing.spread_over(small.scenes)
+    good = says((0.2, 0.6, 0.2))
+    ids = [f"{scene.id}/v1" for scene in scenes]
+    backend = Clock({
+        ids[1]: Completion(ids[1], "", None, None, "error", 0.001, 1, "refused"),
+        ids[2]: Completion(ids[2], good, None, None, "stop", 7.0, 1, retries=1),
+        ids[3]: Completion(ids[3], good, None, None, "stop", 0.3, 1),
+    })  # fmt: skip
+    spec = spec_of(small, LANGUAGE_MODEL)
+    latency = measured(spec, backend, scenes)
+    helpers = sum(len(scene.viewers) - 1 for scene in scenes)
+    assert (latency.ego_s, latency.helper_s, latency.fusion_s) == (0.2, 0.1, 0.4)
+    assert latency.sample["ego"] == Times(3, 0.2, 0.2, 0.29)
+    assert (latency.sample["helper"].n, latency.sample["merge"].n) == (helpers, len(scenes))
+    assert latency.source == "measured"
+    # Letters have no messages to fuse, and a role without a time has the ego's.
+    readout = measured(replace(spec, answer="readout"), Clock({}), scenes)
+    assert (readout.fusion_s, sorted(readout.sample)) == (0.2, ["ego", "helper"])
+
+
+def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
+    lines = {
+        f"{s.id}/v1": Completion(f"{s.id}/v1", "", None, None, "error", 0.1, 1, "no") for s in small.scenes
+    }
+    with pytest.raises(UserError, match="no answer of swarm-tiny could be timed in 5 scenes; see what"):
+        measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(small.scenes))
+
+
+# -- and what answers took decides nothing ----------------------------------------------------------------
+
+
+def test_no_seconds_retries_or_batches_move_a_row(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same words said slowly, at the third attempt, one by one, or at once in batches."""
+
+    class Slow(Scripted):
+        def _say(self, request: Request) -> Completion:
+            return replace(super()._say(request), seconds=len(self.asked) / 7, retries=2)
+
+    class First(Scripted):
+        def _say(self, request: Request) -> Completion:
+            return replace(super()._say(request), seconds=0.5)
+
+    lines = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
+    points = (*POINTS.values(), named_point("6g:consensus=ego-prompt"))
+    found = []
+    for name, backend, batch_size in (
+        ("a", Scripted(lines), 8),
+        ("b", Slow(lines), 1),
+        ("c", First(lines), 3),
+    ):
+        monkeypatch.setattr(evaluation, "open_backend", lambda *_, backend=backend, **__: backend)
+        spec = spec_of(small, LANGUAGE_MODEL, points=points, batch_size=batch_size)
+        found.append(run(spec, tmp_path / name).manifest)
+        assert same_rows(tmp_path / name, tmp_path / "a")
+    assert [m.latency for m in found] == [PAPER] * 3
+    assert found[0].answer_times == found[1].answer_times == {}, "no time, or none of a first attempt"
+    assert found[2].answer_times["ego"] == Times(len(small.scenes), 0.5, 0.5, 0.5)
+
+
+def test_times_by_hand(small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small), tmp_path / "run")
+    one = answers_of(tmp_path / "run")[0]
+    took = [msgspec.structs.replace(one, seconds=s / 100) for s in range(101)]
+    assert times(took) == {"ego": Times(101, 0.5, 0.05, 0.95)}
+
+
+def same_rows(one: Path, other: Path) -> bool:
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in ROWS)
+
+
+@contextmanager
+def busy_machine() -> Iterator[None]:
+    """A process a core that does nothing but work."""
+    program = [sys.executable, "-c", "while True: pass"]
+    busy = [subprocess.Popen(program) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def engine() -> str:
+    for package, engine in (("llama_cpp", "llama-cpp"), ("torch", "transformers")):
+        if find_spec(package):
+            return engine
+    return pytest.skip("needs the llama-cpp or the transformers extra")
+
+
+@pytest.mark.parametrize(
+    "command", [("eval", "--limit", "1"), ("drive", "--episodes", "1", "--workers", "1")]
+)
+def test_a_measured_run_repeated_from_its_manifest_on_a_busy_machine_has_the_same_rows(
+    command: Sequence[str], engine: str, harness: Callable[..., Any], small_path: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Measured while idle; then twice under load: as it was asked, and each answer alone and timed."""
+    monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
+    data = ("--dataset", small_path) if command[0] == "eval" else ("--first-seed", "100")
+    points = ("--condition", "single-local", "--condition", "6g", "--condition", "6g:consensus=ego-prompt")
+    code, _, err = harness(
+        *command, *data, *points, "--model", LANGUAGE_MODEL, "--engine", engine, "--seeds", "0:2",
+        "--latency", "measured", "--no-cache", "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert code == 0, err
+    first = json.loads((tmp_path / "run/run.json").read_text())
+    latency = first["latency"]
+    assert (latency["source"], latency["sample"]["ego"]["n"]) == (
+        "measured",
+        5 if command[0] == "eval" else 1,
+    )
+    program, *words = shlex.split(first["command"])
+    stated = f"ego={latency['ego_s']},helper={latency['helper_s']},fusion={latency['fusion_s']}"
+    assert words[words.index("--latency") + 1] == stated
+    with busy_machine():
+        for name, other in (("again", ()), ("alone", ("--batch-size", "1"))):
+            again = [*words, "--no-cache", *other, "--out", str(tmp_path / name)]
+            subprocess.run([sys.executable, "-m", program, *again], check=True, capture_output=True)
+            assert same_rows(tmp_path / name, tmp_path / "run")
+    times_of = json.loads((tmp_path / "alone/run.json").read_text())["answer_times"]
+    said = answers_of(tmp_path / "alone")
+    assert {role: t["n"] for role, t in times_of.items()} == {
+        role: sum(a.role == role for a in said) for role in ("ego", "helper", "merge")
+    }
+    assert all(0 < t["p5_s"] <= t["median_s"] <= t["p95_s"] for t in times_of.values())
