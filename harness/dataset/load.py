@@ -125,7 +125,7 @@ def find(name: str) -> Path:
 
 
 def argument(path: Path) -> str:
-    """What finds a dataset's folder again: its name, else its path, relative to the current folder if below."""
+    """What finds a dataset again: its name, else its path, from the current folder where it lies below."""
     try:
         if find(path.name).resolve() == path.resolve():
             return path.name
