@@ -327,7 +327,7 @@ def test_every_prompt_keeps_its_token_budget(
 def test_no_evidence_takes_a_fusion_call_over_its_budget(
     version: str, senders: int, small: Dataset, vocabulary: Path
 ) -> None:
-    """v1 and v2 pass 400 tokens here: three messages of 40 characters have no room for a token each."""
+    """v1 and v2 exceed 400 tokens here: three messages of 40 characters have no room for a token each."""
     prompt, count = prompts.load(version), counter(vocabulary)
     assert count is not None
     assert count([{"content": EVIDENCE}]) == len(EVIDENCE)
