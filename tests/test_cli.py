@@ -89,12 +89,12 @@ def one_line(said: Said) -> str:
         (["--verbose"], "No such option: --verbose"),
         (["prompt", "shwo"], "No such command 'shwo'"),
         (["prompt", "show", "v2"], "Missing option '--scene'"),
-        (["prompt", "show", "v3", "--scene", "00000-0"], "unknown prompt 'v3'"),
+        (["prompt", "show", "v9", "--scene", "00000-0"], "unknown prompt 'v9'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
         (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer 'v77'"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
         (["prompt", "lock", "v2"], "prompt v2 is released already; copy it to a new version"),
-        (["prompt", "lock", "v3"], "unknown prompt 'v3'"),
+        (["prompt", "lock", "v9"], "unknown prompt 'v9'"),
         (["prompt", "show", "v2", "--viewer"], "Option '--viewer' requires an argument"),
         (["model", "check"], "Missing argument 'name'"),
     ],
@@ -166,7 +166,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
 
 def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     listed = json.loads(harness("prompt", "list", "--json").out)
-    assert [p["version"] for p in listed] == ["v1", "v2"]
+    assert [p["version"] for p in listed] == ["paper", "v1", "v2", "v3"]
     args = ("prompt", "show", "v2", "--scene", "00001-2", "--dataset", small_path)
     shown = json.loads(harness(*args, "--json").out)
     assert list(shown) == ["v1", "v2", "v3", "v4"]
@@ -178,7 +178,8 @@ def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
     said = harness("prompt", "list")
-    assert [line.split()[:2] for line in said.out.splitlines()] == [["v1", "released"], ["v2", "released"]]
+    versions = ["paper", "v1", "v2", "v3"]
+    assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions]
     assert max(map(len, said.out.splitlines())) <= 80
     said = harness("prompt", "show", "v2", "--scene", "00001-2", "--viewer", "v1", "--dataset", small_path)
     assert said.out.startswith("--- v1 system\nYou drive car v1")
@@ -195,10 +196,13 @@ def test_a_prompt_outside_its_budget_ends_with_one(
     args = ("prompt", "check", "v2", "--dataset", small_path, "--tokenizer", tmp_path / "words.json")
     said = harness(*args)
     assert said.code == 1
-    assert "outside the budget: scene 00000-0 viewer v1: 2 tokens" in said.out
+    assert "outside the budget: 168 of 168 prompts; the first are\nscene 00000-0 viewer v1: 2" in said.out
+    assert "scene 00000-0 viewer v1 with messages of 3: 2 tokens" in said.out
     told = json.loads(harness(*args, "--json").out)
-    assert told["tokens"]["ego"] == {"n": 24, "least": 2, "mean": 2.0, "most": 2}
-    assert len(told["outside"]) == 96
+    two = {"least": 2, "mean": 2.0, "most": 2}
+    assert told["tokens"] == {"ego": {"n": 24, **two}, "helper": {"n": 72, **two}, "fusion": {"n": 72, **two}}
+    assert {o["messages"] for o in told["outside"]} == {0, 1, 2, 3}
+    assert len(told["outside"]) == 168
 
 
 @pytest.mark.parametrize("text", ["0:5", "0,1,2,3,4"])

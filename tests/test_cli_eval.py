@@ -4,9 +4,13 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 from evaluating import same_files
+
+from harness.core.resources import DATASET
+from harness.dataset import load
 
 Said = tuple[int, str, str]
 
@@ -54,6 +58,21 @@ def test_the_same_again_is_refused_and_resumed_it_says_the_same(
     code, out, err = harness(*args[:-4], "--seeds", "1", "--out", "run", "--resume")
     assert (code, out) == (2, "")
     assert err.startswith("harness: --resume: run was begun with another seeds; repeat its settings")
+
+
+def test_a_dataset_in_the_command_has_its_name_or_a_path_from_here(
+    small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = load.find(DATASET)
+    copytree(small_path, tmp_path / "data/mine")
+    monkeypatch.chdir(tmp_path)
+    assert load.argument(shipped) == DATASET
+    assert load.argument(tmp_path / "data/mine") == load.argument(Path("data/mine")) == "data/mine"
+    monkeypatch.chdir(tmp_path / "data")
+    assert load.argument(tmp_path / "data/mine") == "mine"
+    (tmp_path / "data/mine").rename(DATASET)
+    assert load.argument(Path(DATASET)) == DATASET
+    assert load.argument(shipped) == str(shipped), "that name now means the folder here"
 
 
 def test_the_command_in_the_manifest_runs_it_again(

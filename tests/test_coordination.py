@@ -189,6 +189,19 @@ def test_a_points_own_loss_replaces_the_profiles():
     assert play(replace(V2X, loss=0.2), link=draws).delivered.tolist() == [False, True, False]
 
 
+def test_the_papers_proxy_stands_for_the_egos_distance_in_equation_2():
+    """Over 6g everybody is heard. Weights are 1/3.5 : 1/10 : 1/20 : 1/5, the ego's .449 and not .125."""
+    near = play(replace(SIXG, ego_distance_m=3.5))
+    closeness = np.array([1 / 3.5, 1 / 10, 1 / 20, 1 / 5])
+    assert near.weights == pytest.approx(closeness / closeness.sum())
+    assert near.weights[0] == pytest.approx(0.449, abs=5e-4)
+    assert play(SIXG).weights[0] == pytest.approx(0.125)
+    assert near.fused[1] == pytest.approx(near.weights @ np.array([0.4, 0.1, 0.2, 0.0]))
+    assert play(replace(SIXG, ego_distance_m=0.5)).weights == pytest.approx(
+        play(replace(SIXG, ego_distance_m=1.0)).weights
+    ), "min_distance_m bounds it as well"
+
+
 def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
     draws = ((0.9, 0.05), (0.9, 0.9), (0.05, 0.9))
     decision = play(replace(V2X, roadside_edge=True), link=draws)

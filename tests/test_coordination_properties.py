@@ -43,6 +43,7 @@ points = st.builds(
     st.sampled_from(COOPERATIVE),
     tau_nats=st.floats(0, 1.2),
     max_helpers=st.integers(0, 5),
+    ego_distance_m=st.none() | st.floats(0.1, 50),
     roadside_edge=st.booleans(),
     on_demand=st.booleans(),
     consensus=st.sampled_from(sorted(POOLS)),

@@ -1,11 +1,12 @@
 """The openai backend against a server that misbehaves on purpose; a real one is in test_openai_server.py."""
 
+import csv
 import json
 import re
 import socket
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from time import sleep
@@ -570,3 +571,25 @@ def test_after_a_run_the_key_is_nowhere(
         assert "5ecret" not in text
     assert any("[key]" in text for text in texts)
     assert "MY_KEY" in (tmp_path / "run" / "run.json").read_text()
+
+
+def test_the_papers_cloud_comparator_is_a_card_with_its_round_trip_declared(
+    harness: Callable[..., tuple[int, str, str]],
+    small_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The card on docs/latency.md, whose server here answers at once: every decision takes 510 ms."""
+    page = (resources.root() / "docs/latency.md").read_text()
+    [text] = re.findall(r"```toml\n(.+?)```", page, re.DOTALL)
+    (tmp_path / resources.MARKER).touch()
+    (tmp_path / "models").mkdir()
+    monkeypatch.setenv("CLOUD_KEY", KEY)
+    with serving(lambda asked: asked.reply(completion(GOOD))) as there:
+        (tmp_path / "models/cloud.toml").write_text(text.replace("https://api.example.com/v1", there.url))
+        options = ("--dataset", small_path, "--limit", "2", "--condition", "single-local", "--out", "run")
+        code, _, err = harness("eval", "--model", "cloud", *options, "--no-cache")
+    assert (code, err) == (0, "")
+    rows = csv.DictReader((tmp_path / "run/summary.csv").read_text().splitlines())
+    means = {row["metric"]: row["value"] for row in rows}
+    assert (float(means["latency_proxy_ms"]), float(means["deadline_miss_rate"])) == (510.0, 1.0)

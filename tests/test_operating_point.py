@@ -54,6 +54,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ({"window_s": 0}, "window_s is 0; it must be seconds above 0"),
         ({"radius_m": 0.0}, "radius_m is 0.0; it must be metres above 0"),
         ({"min_distance_m": 0}, "min_distance_m is 0; it must be metres above 0"),
+        ({"ego_distance_m": 0}, "ego_distance_m is 0; it must be metres above 0"),
         ({"loss": 1.01}, "loss is 1.01; it must be a probability from 0 to 1"),
         ({"max_helpers": 2.0}, "max_helpers is 2.0; it must be a whole number, 0 or more"),
         ({"max_helpers": True}, "max_helpers is True"),

@@ -17,6 +17,7 @@ from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset
 from harness.prompts import versions as prompts
+from harness.prompts.densest import EVIDENCE, densest_messages
 
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = prompts.names()
@@ -94,6 +95,30 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
 def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
     said = text_of(prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS))
     assert name in said
+
+
+# Section III-C, Prompt Engineering for Multimodal Perception.
+PAPER = {
+    "helper": "You are a neighboring vehicle assisting the ego car. From your local view, report only the "
+              "most decision-relevant evidence for the conflict zone, summarize the visible risk, and send "
+              "one compact semantic message with a recommended maneuver and confidence score.",
+    "ego": "You are the ego vehicle. Combine your local scene graph with the received cooperative messages, "
+           "reason step by step over occlusion, conflict-zone risk, and message agreement, and then output "
+           "only the final JSON action distribution over A. Prioritize safety over efficiency when the "
+           "evidence is uncertain or conflicting.",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("role", prompts.ROLES)
+def test_the_papers_prompt_begins_with_its_own_words(role: str) -> None:
+    [system, _] = prompts.load("paper").render(graph(role, [CAR], []), ACTIONS)
+    assert system["content"].split("\n")[0] == PAPER[role]
+
+
+@pytest.mark.parametrize("case", [case for case, (_, messages) in CASES.items() if not messages])
+def test_v3_differs_from_v2_in_messages_alone(case: str) -> None:
+    v2, v3 = (prompts.load(v).render(CASES[case][0], ACTIONS) for v in ("v2", "v3"))
+    assert v3 == v2
 
 
 # -- versions that are wrong ----------------------------------------------------------------------------
@@ -295,6 +320,22 @@ def test_every_prompt_keeps_its_token_budget(
                 continue
             n = count(prompt.render(seen, small.actions, messages))
             assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
+
+
+@pytest.mark.parametrize("senders", [1, 2, 3])
+@pytest.mark.parametrize("version", ["paper", "v3"])
+def test_no_evidence_takes_a_fusion_call_over_its_budget(
+    version: str, senders: int, small: Dataset, vocabulary: Path
+) -> None:
+    """v1 and v2 exceed 400 tokens here: three messages of 40 characters have no room for a token each."""
+    prompt, count = prompts.load(version), counter(vocabulary)
+    assert count is not None
+    assert count([{"content": EVIDENCE}]) == len(EVIDENCE)
+    for scene in small.scenes:
+        ego, *helpers = scene.viewers
+        messages = densest_messages(helpers[:senders], small.actions)
+        n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages))
+        assert 200 <= n <= 400, f"{version} {scene.id}: {n} tokens"
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -6,7 +6,7 @@ import typer
 
 from harness.core.errors import UserError, printable
 
-PROMPT = "v2"  # what one's own prompt begins as
+PROMPT = "v3"  # what one's own prompt begins as
 
 
 def command(

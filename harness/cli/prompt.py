@@ -1,14 +1,21 @@
 """`harness prompt`: the versions, the text a model is sent, and its token budget."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from harness.cli import options
 from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
 from harness.core import resources
 from harness.core.errors import UserError, printable, unknown
+
+if TYPE_CHECKING:
+    from harness.dataset.load import Scene
+
+FUSION = "fusion"  # the ego's call with messages
 
 app = typer.Typer(help="List prompt versions; show, check or release one.", no_args_is_help=True)
 
@@ -66,24 +73,40 @@ def check(
     tokenizer: Path | None = typer.Option(None, help="tokenizer.json, its folder, or a Qwen2 GGUF."),
     as_json: options.Json = False,
 ) -> None:
-    """Render every scene and count tokens against the budget. Exit code 1 if a prompt is outside it."""
+    """Render every prompt of every scene and count tokens. Exit code 1 if one is outside the budget.
+
+    The ego's fusion call is rendered with the messages of one helper, of two, and of all.
+    """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
     from harness.prompts import versions as prompts
+    from harness.prompts.densest import densest_messages
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     count = counter(tokenizer)
     least, most = prompt.token_budget
-    sizes: dict[str, list[int]] = {role: [] for role in prompts.ROLES}
+    sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION)}
     outside: list[dict[str, Any]] = []
-    for scene in data.scenes:
-        for v, graph in scene.record["graphs"].items():
-            messages = prompt.render(graph, data.actions, words=data.scenario.words)
-            if count:
-                n = count(messages)
-                sizes[graph["role"]].append(n)
-                if not least <= n <= most:
-                    outside.append({"scene": scene.id, "viewer": v, "tokens": n})
+
+    def render(scene: "Scene", viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
+        graph = scene.record["graphs"][viewer]
+        rendered = prompt.render(graph, data.actions, messages, data.scenario.words)
+        if count:
+            n = count(rendered)
+            sizes[FUSION if messages else graph["role"]].append(n)
+            if not least <= n <= most:
+                at = {"scene": scene.id, "viewer": viewer, "messages": len(messages), "tokens": n}
+                outside.append(at)
+
+    with bar("scenes", len(data.scenes), as_json) as progress:
+        for scene in data.scenes:
+            ego, *helpers = scene.viewers
+            dense = densest_messages(helpers, data.actions)
+            for viewer in scene.viewers:
+                render(scene, viewer)
+            for n in range(1, len(dense) + 1):
+                render(scene, ego, dense[:n])
+            progress(1)
     stats = {role: spread_of(n) for role, n in sizes.items() if n}
     if as_json:
         figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}
@@ -99,8 +122,12 @@ def check(
             typer.echo(
                 "tokens not counted: give --tokenizer (the model's tokenizer.json, its folder, or a GGUF)"
             )
+        if outside:
+            total = sum(map(len, sizes.values()))
+            typer.echo(f"outside the budget: {len(outside)} of {total} prompts; the first are")
         for o in outside[:10]:
-            typer.echo(f"outside the budget: scene {o['scene']} viewer {o['viewer']}: {o['tokens']} tokens")
+            heard = f" with messages of {o['messages']}" if o["messages"] else ""
+            typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}: {o['tokens']} tokens")
     if outside:
         raise typer.Exit(1)
 

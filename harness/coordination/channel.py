@@ -94,10 +94,10 @@ class Radio:
         bandwidth_bps: bits per second while a reply is on air.
         access: `serial`, replies share one medium and are served one after another, so that the k-th
             pays k slots; `parallel`, all replies are on air at once.
-        jitter_s: largest extra delay of a reply; the delay is uniform in [0, jitter_s).
+        jitter_s: largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s).
         density_coupled: the loss follows from the vehicles in the radius, the ego included, asked or not.
-        roadside_edge: replies also travel over a roadside edge node, in a second hop as long as the first.
-            The two paths are declared independent. Requests are direct.
+        roadside_edge: replies also travel over a roadside edge node, in a second hop as long as the first,
+            its jitter included. The two paths are declared independent. Requests are direct.
     """
 
     latency_s: float
@@ -113,8 +113,8 @@ class Radio:
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
         loss = loss if self.density_coupled else np.maximum(self.loss, loss)
-        slot_s = (2 if self.roadside_edge else 1) * (self.latency_s + links.payload_bits / self.bandwidth_bps)
-        slot_s = np.where(links.asked, slot_s + self.jitter_s * draws.jitter, 0.0)
+        hop_s = self.latency_s + links.payload_bits / self.bandwidth_bps + self.jitter_s * draws.jitter
+        slot_s = np.where(links.asked, (2 if self.roadside_edge else 1) * hop_s, 0.0)
         ready_s = np.where(links.asked, links.ready_s, np.inf)
         serial = self.access == "serial"
         delay_s = served_s(ready_s, slot_s, links.range_m) if serial else ready_s + slot_s

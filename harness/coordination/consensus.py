@@ -26,7 +26,8 @@ class Messages:
         heard: which replies came in time, `(..., H)`.
         arrival_s: when, from the start of the decision, `(..., H)`: the message's age, for every vehicle saw
             the scene at 0. inf where lost or not asked.
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
+        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its
+            operating point declares, if it does.
         range_m: distance to the ego, `(..., H)`.
     """
 

@@ -80,7 +80,10 @@ def fuse(
     """The policy of each decision, once it is known who was heard; arguments as in `coordinate`."""
     fusion = fusion or Fusion()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
-    weights = inverse_distance_weights(intents.distance_m, heard.on_time, point.min_distance_m)
+    distance_m = intents.distance_m
+    if point.ego_distance_m is not None:
+        distance_m = np.insert(distance_m[..., 1:], 0, point.ego_distance_m, axis=-1)
+    weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
     anybody = np.any(heard.on_time, axis=-1)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus == EGO_PROMPT:
@@ -93,7 +96,7 @@ def fuse(
         state = np.zeros((*failed.shape, 0))
     else:
         rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
-        messages = Messages(p, weights, heard.on_time, heard.arrival_s, intents.distance_m, intents.range_m)
+        messages = Messages(p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m)
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
         fused, weights, state = rule.fuse(messages, state)
     fused = np.where((anybody & ~failed)[..., None], fused, heard.own)

@@ -26,6 +26,8 @@ class OperatingPoint:
         radius_m: the paper's R; helpers farther from the ego are not asked.
         max_helpers: the cooperative neighbourhood; of more helpers the nearest are asked.
         min_distance_m: lower bound of d in the paper's Eq. 2.
+        ego_distance_m: the ego's d in Eq. 2, in place of its distance to the centroid of the conflict zone;
+            None keeps that. The paper's preset declares a proxy of 3.5 m (section IV-A).
         fallback: what a failed ego answer becomes: `uniform`, all actions alike, or `brake`, all mass on
             the first action, which is the most conservative one.
         consensus: consensus rule, or `ego-prompt`.
@@ -44,6 +46,7 @@ class OperatingPoint:
     radius_m: float = 100.0
     max_helpers: int = 3
     min_distance_m: float = 1.0
+    ego_distance_m: float | None = None
     fallback: str = "uniform"
     consensus: str = "linear"
     loss: float | None = None
@@ -66,6 +69,8 @@ class OperatingPoint:
         self._number("window_s", "seconds above 0")
         self._number("radius_m", "metres above 0")
         self._number("min_distance_m", "metres above 0")
+        if self.ego_distance_m is not None:
+            self._number("ego_distance_m", "metres above 0")
         if self.loss is not None:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
         if self.latency_s is not None:

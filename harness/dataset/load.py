@@ -124,6 +124,17 @@ def find(name: str) -> Path:
     raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
 
 
+def argument(path: Path) -> str:
+    """What finds a dataset again: its name, else its path, from the current folder where it lies below."""
+    try:
+        if find(path.name).resolve() == path.resolve():
+            return path.name
+    except UserError:  # nothing of that name, or two
+        pass
+    whole, here = path.resolve(), Path.cwd().resolve()
+    return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
+
+
 def shared(one: Dataset, other: Dataset) -> int:
     """How many scenes of one are in the other too: of the same layout seed, or in the same state."""
     seeds = {scene.record["episode_seed"] for scene in other.scenes}

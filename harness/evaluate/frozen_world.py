@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Ints
-from harness.dataset.load import Dataset, Scene
+from harness.dataset.load import Dataset, Scene, argument
 from harness.evaluate.success import Verdict, judge_choices, table
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs.decisions import by_action
@@ -54,7 +54,7 @@ class FrozenSource:
 
     def options(self) -> list[tuple[str, object]]:
         """The dataset's folder and the limit."""
-        return [("--dataset", self.dataset.path), ("--limit", self.limit)]
+        return [("--dataset", argument(self.dataset.path)), ("--limit", self.limit)]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from dataclasses import asdict
 from pathlib import Path
 
+from harness.core.resources import DATASET
+from harness.dataset.load import find, load
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 PAGE = (Path(__file__).parents[2] / "docs/scenarios/occluded-intersection.md").read_text()
@@ -16,6 +18,12 @@ def test_the_pages_table_has_every_parameter_with_its_value():
         for name, value in asdict(SCENARIO.parameters).items()
     }
     assert stated == values
+
+
+def test_the_page_counts_the_shipped_episodes_with_a_danger():
+    dangers = {scene.record["episode"]: scene.record["danger"] for scene in load(find(DATASET)).scenes}
+    dangerous = sum(danger["sector"] is not None for danger in dangers.values())
+    assert f"`danger_share`; {dangerous} of the {len(dangers)} shipped" in " ".join(PAGE.split())
 
 
 def test_the_page_names_the_actions():
