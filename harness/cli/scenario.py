@@ -7,6 +7,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import as_mapping, console, echo_json, shown, table
 from harness.cli.progress import bar
+from harness.core.seeds import purpose, stated
 
 if TYPE_CHECKING:
     from harness.world.scenario import Scenario
@@ -74,7 +75,7 @@ def check(
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenario":
-    """The scenario. Raises UserError if there is none, or where those episodes cannot be driven."""
+    """The scenario. Raises UserError if there is none, or where those layouts cannot be driven together."""
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
@@ -82,6 +83,7 @@ def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenar
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    purpose(seed, episodes)
     return scenario
 
 
@@ -120,6 +122,5 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     table(heads, rows)
     off_road = sum(round(of["off_road"].value * episodes) for of in outcomes.values())
     console().print(
-        f"n = {episodes} episodes, seeds {seed} to {seed + episodes - 1}; Wilson intervals; "
-        f"off the road: {off_road}"
+        f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: {off_road}"
     )
