@@ -35,6 +35,7 @@ CUT = {
     "harness campaign closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
     "harness scenario check": "--episodes 2 --workers 1",  # of 100 and of 500
+    "harness scenario audit": "--layouts 24 --workers 1",  # of 300
     "harness distill": "--samples 16,16,16,16",  # of 226 000 sequences
     "harness parity": "--prompts 1",  # of 64, on two engines
 }
@@ -43,7 +44,8 @@ CUT = {
 CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
     "harness compare reports/v1 reports/v2"
-    " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0
+    " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0,
+    "harness scenario audit occluded-intersection": 1,  # so few layouts tell something by accident
 }
 
 # Held against the program's options, and not run.

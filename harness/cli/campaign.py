@@ -9,6 +9,7 @@ from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.sweep import tables
 from harness.core.errors import printable
+from harness.core.seeds import FIRST, purpose
 
 app = typer.Typer(help="Run a whole study: the paper's, or its panels closed-loop.", no_args_is_help=True)
 
@@ -59,7 +60,7 @@ def closed_loop(
     prompt: options.Prompt = "v2",
     answer: options.Answer = "json",
     episodes: int = typer.Option(300, help="Layouts, each driven under every grid point and seed."),
-    first_seed: int = typer.Option(0, help="Layout seed of the first."),
+    first_seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
     seeds: options.Seeds = "0:5",
     workers: options.ModelWorkers = 2,
     batch_size: options.BatchSize = 8,
@@ -79,6 +80,7 @@ def closed_loop(
 
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
+    purpose(first_seed, episodes)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(

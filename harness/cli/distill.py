@@ -11,7 +11,7 @@ import typer
 
 from harness.cli.progress import drawn
 from harness.core.errors import UserError, printable
-from harness.core.resources import DATASET
+from harness.core.seeds import FIRST, purpose, stated
 
 SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
@@ -25,7 +25,6 @@ def command(
     samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
     seed: int = typer.Option(0, help="Seed of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
-    apart_from: str = typer.Option(DATASET, help="Dataset to evaluate it on: no scene may be in both."),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
@@ -45,11 +44,11 @@ def command(
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
     counts = _counts(samples, max(batch, 4 * len(versions)))
     data = load.load(load.find(dataset))
-    other = load.load(load.find(apart_from))
-    if both := load.shared(data, other):
+    seeds = data.manifest.seed, data.manifest.episodes
+    if purpose(*seeds) != "train":
         raise UserError(
-            f"{printable(dataset)} and {printable(apart_from)} share {both} scenes; "
-            "build the one with other seeds (`harness dataset build --seed`)"
+            f"{printable(dataset)} has {stated(*seeds)}; a model learns from train seeds alone: "
+            f"`harness dataset build {data.scenario.name} --seed {FIRST['train']}`"
         )
 
     from harness.backends.transformers.engine import device_of
@@ -62,7 +61,6 @@ def command(
         facts = run(data, versions, plan, out, show, device_of(device), threads)
     apart = facts["held_out"]
     typer.echo(
-        f"no scene of {printable(apart_from)} is among the {len(data.scenes)} trained on\n"
         f"held-out KL {apart['kl_nats']:.3f} nats (mean label {apart['kl_of_the_mean_nats']:.3f}, "
         f"n = {apart['questions']})\n"
         f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"

@@ -11,6 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core.errors import UserError, printable
 from harness.core.resources import DATASET, folder
+from harness.core.seeds import purpose, stated
 
 ALL = "all"
 COLUMNS = (
@@ -66,6 +67,7 @@ def command(
     first_seed = shipped["seed"] if first_seed is None else first_seed
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
+    purpose(first_seed, episodes)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     options.in_range("--save-video", save_video, 0, episodes)
     names = POINTS if condition in (None, [], [ALL]) else condition
@@ -99,9 +101,9 @@ def command(
     if silent:
         return
     notes = (
-        f"n = {episodes} episodes (layout seeds {first_seed} to {first_seed + episodes - 1}) × "
-        f"{len(spec.seeds)} channel seeds;\nintervals over episodes; missed: decisions that outlast the "
-        "window;\ngap: the least; clear: seconds to clear, where the ego did; both are means",
+        f"n = {episodes} episodes × {len(spec.seeds)} channel seeds; {stated(first_seed, episodes)};\n"
+        "intervals over episodes; missed: decisions that outlast the window;\n"
+        "gap: the least; clear: seconds to clear, where the ego did; both are means",
     )
     show(done, "closed loop", COLUMNS, notes, tight=True)
     if videos:

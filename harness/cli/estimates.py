@@ -31,10 +31,12 @@ def shown(estimate: "Estimate", scale: float = 100.0) -> str:
     return interval(estimate.value, estimate.low, estimate.high, scale)
 
 
-def interval(value: float | None, low: float | None, high: float | None, scale: float) -> str:
-    """`value [low, high]`, one decimal; a dash for what is not known."""
+def interval(
+    value: float | None, low: float | None, high: float | None, scale: float, decimals: int = 1
+) -> str:
+    """`value [low, high]`; a dash for what is not known."""
     ends = (math.nan if number is None else number for number in (value, low, high))
-    numbers = ("–" if math.isnan(number) else f"{scale * number:.1f}" for number in ends)
+    numbers = ("–" if math.isnan(number) else f"{scale * number:.{decimals}f}" for number in ends)
     return "{} [{}, {}]".format(*numbers)
 
 

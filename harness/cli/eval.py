@@ -11,6 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core import resources
 from harness.core.errors import UserError, printable
+from harness.core.seeds import stated
 
 if TYPE_CHECKING:
     from harness.dataset.load import Dataset as Frozen
@@ -96,9 +97,9 @@ def command(
     if silent:
         return
     notes = (
-        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds; intervals over episodes; "
-        "msgs an episode;",
-        "gain is over single-local, paired by episode",
+        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds; "
+        f"{stated(frozen.manifest.seed, len(frozen.episodes))};",
+        "intervals over episodes; msgs an episode; gain: over single-local, paired",
     )
     show(done, frozen.name, COLUMNS, notes)
     typer.echo(f"wrote {page}")

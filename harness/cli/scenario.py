@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import as_mapping, console, echo_json, shown, table
+from harness.cli.estimates import as_mapping, console, echo_json, interval, shown, table
 from harness.cli.progress import bar
+from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:
+    from harness.world.audit import Audit
     from harness.world.scenario import Scenario
 
-app = typer.Typer(help="List scenarios, show one, or drive the reference drivers.", no_args_is_help=True)
+app = typer.Typer(help="List scenarios, show one, drive or audit it.", no_args_is_help=True)
 
 
 @app.command("list")
@@ -73,15 +75,44 @@ def check(
         _table(episodes, seed, outcomes)
 
 
-def ready_to_drive(name: str, episodes: int, seed: int, workers: int) -> "Scenario":
-    """The scenario. Raises UserError if there is none, or where those episodes cannot be driven."""
+@app.command()
+def audit(
+    name: options.Scenario,
+    layouts: int = typer.Option(300, help="Layouts to look at."),
+    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
+    workers: options.Workers = 2,
+    as_json: options.Json = False,
+) -> None:
+    """Try to tell the hidden danger from what the ego sees. Exit code 1 if that can be done."""
+    scenario = ready_to_drive(name, layouts, seed, workers, "--layouts")
+    from harness.world.audit import audit as run
+
+    with bar(f"auditing {name}", layouts, as_json) as progress:
+        found = run(scenario, layouts, seed, progress, workers)
+    if as_json:
+        echo_json({
+            "scenario": name, "layouts": layouts, "seed": seed, "steps": found.steps, "tells": found.tells,
+            "worst": found.worst, "auc": {question: as_mapping(auc) for question, auc in found.auc.items()},
+            "told_by": found.told_by,
+        })  # fmt: skip
+    else:
+        _print(found)
+    if found.tells:
+        raise typer.Exit(1)
+
+
+def ready_to_drive(
+    name: str, episodes: int, seed: int, workers: int, counted: str = "--episodes"
+) -> "Scenario":
+    """The scenario. Raises UserError if there is none, or where those layouts cannot be driven together."""
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
     scenario = scenarios.get(name)
-    options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
+    options.in_range(counted, episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    purpose(seed, episodes)
     return scenario
 
 
@@ -120,6 +151,23 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     table(heads, rows)
     off_road = sum(round(of["off_road"].value * episodes) for of in outcomes.values())
     console().print(
-        f"n = {episodes} episodes, seeds {seed} to {seed + episodes - 1}; Wilson intervals; "
-        f"off the road: {off_road}"
+        f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: {off_road}"
     )
+
+
+def _print(found: "Audit") -> None:
+    from harness.world.audit import MOST_AUC
+
+    table(
+        ("can be told", "AUC [95 % CI]"),
+        [(question, interval(auc.value, auc.low, auc.high, 1.0, 2)) for question, auc in found.auc.items()],
+    )
+    text = console()
+    text.print(f"n = {found.layouts} layouts, {stated(found.seed, found.layouts)};")
+    text.print(f"decision points {found.steps[0]} to {found.steps[-1]}, while the danger is out of sight")
+    if not found.tells:
+        text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
+        return
+    text.print(f"it tells: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
+    for name, lost in found.told_by.items():
+        text.print(f"  {lost:.2f} {name}")

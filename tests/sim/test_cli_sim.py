@@ -50,7 +50,7 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
     assert found["drivers"]["brake"]["time_out"]["value"] == 1.0
     code, out, _ = harness("scenario", "check", NAME, "--episodes", 3, "--seed", 178, "--workers", 2)
     assert code == 0
-    assert "n = 3 episodes, seeds 178 to 180" in out
+    assert "n = 3 episodes, layout seeds 178 to 180 (tune)" in out
     assert max(map(len, out.splitlines())) <= 80
 
 

@@ -1,0 +1,41 @@
+"""Layout seeds by purpose, so that no layout is tuned or trained on and then reported.
+
+Constants of scenarios and wordings of prompts are chosen on tune seeds, models learn from train seeds, and
+every number that is quoted comes from report seeds. The rule is the same for every scenario.
+"""
+
+from itertools import pairwise
+from typing import Literal
+
+from harness.core.errors import UserError
+
+Purpose = Literal["tune", "train", "report"]
+
+FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # up to the next one's
+
+
+def purpose(first: int, count: int) -> Purpose:
+    """What the layout seeds `first` to `first + count - 1` are for.
+
+    Raises:
+        UserError: they are not all for one purpose.
+    """
+    found = _purposes(first, count)
+    if len(found) > 1:
+        ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]
+        raise UserError(
+            f"layout seeds {first} to {first + count - 1} are for {' and '.join(found)}; keep to one of "
+            f"{', '.join(ends)}, {FIRST['report']} and above (report)"
+        )
+    return found[0]
+
+
+def stated(first: int, count: int) -> str:
+    """Layout seeds as they stand beside a number: `layout seeds 0 to 239 (tune)`."""
+    return f"layout seeds {first} to {first + count - 1} ({' and '.join(_purposes(first, count))})"
+
+
+def _purposes(first: int, count: int) -> list[Purpose]:
+    names = list(FIRST)
+    ends = [*list(FIRST.values())[1:], first + count]
+    return [n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count]

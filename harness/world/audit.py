@@ -1,0 +1,283 @@
+"""Whether a scenario gives its hidden danger away: what the ego sees must not tell what it cannot see.
+
+A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of sight,
+whether there is one and where it comes from. A layout is never on both sides of the cross-validation, and
+only moments of one step are compared, since fewer dangers are still hidden the later it is. Where it does
+better than chance, so can any model: then being alone is not being blind.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
+from harness.core.parallel import spread
+from harness.core.statistics import Estimate, wilson
+from harness.world.drivers import choose
+from harness.world.perception.graph import scene_graph
+from harness.world.road import Road
+from harness.world.scenario import Scenario
+from harness.world.world import World
+
+MOST_AUC = 0.60  # above it, a scenario tells
+LEAST_AUC_LOST = 0.01  # by shuffling a number, for it to be named
+FOLDS = 5
+RESAMPLES = 1999
+BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
+DANGER, NONE = "danger", ""
+INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
+
+
+@dataclass(frozen=True)
+class Audit:
+    """How well a danger that is out of sight can be told from what is in sight.
+
+    Attributes:
+        scenario: its name.
+        layouts: how many.
+        seed: layout seed of the first.
+        steps: decision points that were compared: those at which at least half of the dangers are hidden.
+            Later, an empty road is an observation and no tell.
+        auc: of each question, the probability that a layout with it ranks above one without: `danger`, and
+            the sectors it can come from. Intervals are a bootstrap over layouts.
+        told_by: the numbers that gave it away and the AUC that is lost without each; none unless it tells.
+    """
+
+    scenario: str
+    layouts: int
+    seed: int
+    steps: tuple[int, ...]
+    auc: Mapping[str, Estimate]
+    told_by: Mapping[str, float]
+
+    @property
+    def worst(self) -> str:
+        """The question that is answered best."""
+        return max(self.auc, key=lambda question: self.auc[question].value)
+
+    @property
+    def tells(self) -> bool:
+        """Whether some question is answered too well."""
+        return self.auc[self.worst].value > MOST_AUC
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Moments of some layouts at which the danger is out of sight.
+
+    Attributes:
+        layout: (m,) of which layout each is.
+        step: (m,) at which decision.
+        danger: (m,) the sector its danger comes from; `NONE` where there is none.
+        names: what each number is.
+        numbers: (m, k), NaN where the ego knows none.
+    """
+
+    layout: Ints
+    step: Ints
+    danger: Any
+    names: tuple[str, ...]
+    numbers: Floats
+
+
+def audit(
+    scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: int = 1
+) -> Audit:
+    """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
+
+    Raises:
+        UserError: scikit-learn is missing, or too few of the layouts have a danger, or too few have none.
+    """
+    try:
+        import sklearn  # noqa: F401
+    except ImportError:
+        raise UserError(
+            "an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`"
+        ) from None
+    seeds = range(seed, seed + layouts)
+    moments = _moments(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
+    auc, told_by = judge(moments, tuple(scenario.road().sectors))
+    return Audit(scenario.name, layouts, seed, tuple(np.unique(moments.step).tolist()), auc, told_by)
+
+
+def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:
+    """The sector of a layout's danger, and the ego's numbers at every step until it is in sight."""
+    start = World.start(scenario, seed)
+    going: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
+    found = []
+    while going:
+        world, drivers = going.pop()
+        if world.outcome.ended or world.step >= scenario.parameters.decisions:
+            continue
+        graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
+        if world.layout.danger_id in {node["id"] for node in graph["nodes"]}:
+            continue
+        found.append((world.step, dict(numbers(graph, scenario.road()))))
+        ways: dict[str, tuple[str, ...]] = {}
+        for driver in drivers:
+            action = choose(scenario, driver, graph, None)
+            ways[action] = (*ways.get(action, ()), driver)
+        for action, some in ways.items():
+            on = world if len(ways) == 1 else world.branch()
+            on.act(action)
+            going.append((on, some))
+    return start.layout.danger or NONE, found
+
+
+def numbers(graph: Mapping[str, Any], road: Road) -> Iterator[tuple[str, float]]:
+    """A scene graph as numbers with names, the same names for every graph of a road."""
+    for name in ("speed_mps", "target_speed_mps", "zone_m"):
+        yield f"ego {name}", graph["ego"][name]
+    for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
+        nodes = [n for n in graph["nodes"] if n["lane"] == lane]
+        nodes.sort(key=lambda n: float(np.hypot(n["forward_m"], n["left_m"])))
+        node = nodes[0] if nodes else {}
+        yield f"{lane}: vehicles", float(len(nodes))
+        for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
+            yield f"{lane}: nearest {name}", _known(node.get(name))
+        yield f"{lane}: nearest is a truck", _known({"truck": 1.0, "car": 0.0}.get(node.get("type", "")))
+        yield f"{lane}: nearest indicator", _known(INDICATORS.get(node.get("indicator") or ""))
+        yield f"{lane}: nearest sensors", float(len(node.get("sensors", ())))
+    seen = {s["sector"]: s for s in graph["sectors"]}
+    for sector in road.sectors:
+        yield f"{sector}: seen_share", seen[sector]["seen_share"]
+        yield f"{sector}: hidden by", float(len(seen[sector]["by"]))
+        others = [c["other"] for c in graph["conflicts"] if c["sector"] == sector]
+        first: Mapping[str, Any] = min(others, key=lambda other: float(other["arc_m"]), default={})
+        yield f"{sector}: conflicts", float(len(others))
+        for name in ("arc_m", "time_s", "speed_mps"):
+            yield f"{sector}: first conflict {name}", _known(first.get(name))
+
+
+def _known(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _moments(found: list[tuple[str, list[tuple[int, dict[str, float]]]]], scenario: Scenario) -> Moments:
+    """All layouts' moments at the steps where at least half of the dangers are hidden."""
+    dangers = sum(danger != NONE for danger, _ in found)
+    for count, what in ((dangers, "have a danger"), (len(found) - dangers, "have none")):
+        if count < FOLDS:
+            raise UserError(
+                f"{count} of {len(found)} layouts of {scenario.name} {what}; an audit needs {FOLDS}, "
+                "give more with --layouts"
+            )
+    hidden = [
+        sum(danger != NONE and any(step == k for step, _ in moments) for danger, moments in found)
+        for k in range(scenario.parameters.decisions)
+    ]
+    steps = [k for k, count in enumerate(hidden) if 2 * count >= dangers]
+    rows = [
+        (layout, step, danger, values)
+        for layout, (danger, moments) in enumerate(found) for step, values in moments if step in steps
+    ]  # fmt: skip
+    if not rows:
+        raise UserError(
+            f"scenario {scenario.name} hides no danger: most are in sight from the start, so there is "
+            "nothing to audit"
+        )
+    layout, step, danger, values = zip(*rows, strict=True)
+    table = np.array([list(of.values()) for of in values])
+    return Moments(np.array(layout), np.array(step), np.array(danger), tuple(values[0]), table)
+
+
+def judge(moments: Moments, sectors: tuple[str, ...]) -> tuple[dict[str, Estimate], dict[str, float]]:
+    """The AUC of each question, and what gave the best answered one away (`Audit`)."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+    from sklearn.model_selection import StratifiedGroupKFold
+
+    of = moments
+    varies = [k for k, column in enumerate(of.numbers.T) if len(np.unique(column[~np.isnan(column)])) > 1]
+    table, names = of.numbers[:, varies], [of.names[k] for k in varies]
+    classes = np.unique(of.danger)
+    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, of.danger, of.layout))
+    models = [
+        HistGradientBoostingClassifier(max_iter=40, max_leaf_nodes=8, early_stopping=False, random_state=0)
+        .fit(table[learnt], of.danger[learnt])
+        for learnt, _ in folds
+    ]  # fmt: skip
+
+    def answers(table: Floats) -> Floats:
+        """(m, classes), each by the model that has not seen its layout."""
+        told = np.zeros((len(table), len(classes)))
+        for model, (_, asked) in zip(models, folds, strict=True):
+            told[np.ix_(asked, np.searchsorted(classes, model.classes_))] = model.predict_proba(table[asked])
+        return told
+
+    def ranks(question: str, told: Floats) -> "Ranks":
+        if question == DANGER:
+            return Ranks.of(moments, 1 - told[:, classes == NONE][:, 0], of.danger != NONE)
+        return Ranks.of(moments, told[:, classes == question][:, 0], of.danger == question)
+
+    told = answers(table)
+    counts = {sector: len(np.unique(of.layout[of.danger == sector])) for sector in sectors}
+    questions = [DANGER, *(sector for sector, count in counts.items() if count >= FOLDS)]
+    auc = {question: ranks(question, told).estimate() for question in questions}
+    worst = max(auc, key=lambda question: auc[question].value)
+    lost: dict[str, float] = {}
+    if auc[worst].value > MOST_AUC:
+        for k, name in enumerate(names):
+            shuffled = table.copy()
+            shuffled[:, k] = _shuffled(table[:, k], of.step, name)
+            lost[name] = auc[worst].value - ranks(worst, answers(shuffled)).auc
+    most = sorted(lost, key=lambda name: -lost[name])[:5]
+    return auc, {name: lost[name] for name in most if lost[name] > LEAST_AUC_LOST}
+
+
+def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
+    """A column whose values have changed places within their step."""
+    shuffled, draws = column.copy(), noise.generator("audit", name)
+    for k in np.unique(step):
+        at = np.flatnonzero(step == k)
+        shuffled[at] = column[draws.permutation(at)]
+    return shuffled
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Pairs of a layout with what is asked for and one without, over the moments of each step.
+
+    Attributes:
+        above: (with, without) pairs of moments in which the one with it is ranked higher; a tie is half.
+        pairs: (with, without) all pairs of moments.
+    """
+
+    above: Floats
+    pairs: Floats
+
+    @classmethod
+    def of(cls, moments: Moments, score: Floats, there: Bools) -> "Ranks":
+        """The ranks by a score (m,), of layouts where it is there (m,) and where it is not."""
+        have, have_not = np.unique(moments.layout[there]), np.unique(moments.layout[~there])
+        above, pairs = np.zeros((2, len(have), len(have_not)))
+        for k in np.unique(moments.step):
+            one, other = (np.flatnonzero((moments.step == k) & side) for side in (there, ~there))
+            at = np.ix_(
+                np.searchsorted(have, moments.layout[one]), np.searchsorted(have_not, moments.layout[other])
+            )
+            apart = score[one][:, None] - score[other]
+            np.add.at(above, at, (apart > 0) + 0.5 * (apart == 0))
+            np.add.at(pairs, at, 1.0)
+        return cls(above, pairs)
+
+    @property
+    def auc(self) -> float:
+        """Share of pairs in which the one with it is ranked higher."""
+        return float(self.above.sum() / self.pairs.sum())
+
+    def estimate(self) -> Estimate:
+        """The AUC with a 95 % interval: percentiles of a bootstrap over layouts, n of them."""
+        have, have_not = self.pairs.shape
+        draws = noise.generator("audit", "bootstrap")
+        one = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)
+        other = draws.multinomial(have_not, np.full(have_not, 1 / have_not), RESAMPLES)
+        above, pairs = (((one @ of) * other).sum(axis=1) for of in (self.above, self.pairs))
+        low, high = np.quantile(above / pairs, [0.025, 0.975])
+        if low == high:  # all or nothing: layouts that are drawn again cannot differ
+            low, high = wilson(self.auc, min(have, have_not))
+        return Estimate(self.auc, float(low), float(high), have + have_not, 0)

@@ -1,0 +1,158 @@
+"""The audit finds a scenario that gives its danger away, and lets one be that does not."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import one_way_crossing
+import pytest
+
+from harness.core.errors import UserError
+from harness.world.audit import Moments, Ranks, audit, judge, numbers
+from harness.world.perception.graph import scene_graph
+from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters
+from harness.world.world import World
+
+pytest.importorskip("sklearn", reason="needs the audit extra")
+
+
+def moments(numbers, danger, step=None):
+    n = len(danger)
+    names = tuple(f"number {k}" for k in range(numbers.shape[1]))
+    step = np.zeros(n, dtype=int) if step is None else step
+    return Moments(np.arange(n), step, np.array(danger), names, numbers)
+
+
+def quiet(done):
+    pass
+
+
+# -- ranks, by hand ---------------------------------------------------------------------------------
+
+
+def test_an_auc_is_the_share_of_pairs_in_their_order_and_a_tie_is_half():
+    of = moments(np.zeros((5, 1)), ["left", "left", "", "", ""])
+    ranks = Ranks.of(of, np.array([0.9, 0.4, 0.4, 0.1, 0.95]), of.danger != "")
+    assert ranks.auc == pytest.approx((2 + 1.5) / 6)
+    assert ranks.estimate().n == 5
+
+
+def test_only_moments_of_one_step_are_compared():
+    """Late moments rank high whatever is hidden: that fewer dangers are left then is no tell."""
+    of = moments(np.zeros((4, 1)), ["left", "", "left", ""], np.array([0, 0, 1, 1]))
+    assert Ranks.of(of, np.array([0.2, 0.1, 0.8, 0.9]), of.danger != "").auc == 0.5
+
+
+def test_no_interval_has_zero_width():
+    of = moments(np.zeros((20, 1)), ["left", ""] * 10)
+    found = Ranks.of(of, (of.danger != "").astype(float), of.danger != "").estimate()
+    assert (found.value, found.high) == (1.0, 1.0)
+    assert found.low == pytest.approx(10 / (10 + 1.96**2), abs=1e-4)  # Wilson, 10 of 10
+
+
+def test_layouts_are_drawn_whole():
+    """Ten moments that are copies of one say no more than it does."""
+    rng = np.random.default_rng(0)
+    danger, score = np.array(["left", ""] * 20), rng.random(40)
+    once = Ranks.of(moments(np.zeros((40, 1)), danger), score, danger != "").estimate()
+    copies = Moments(
+        np.repeat(np.arange(40), 10), np.tile(np.arange(10), 40), np.repeat(danger, 10), ("x",),
+        np.zeros((400, 1)),
+    )  # fmt: skip
+    often = Ranks.of(copies, np.repeat(score, 10), copies.danger != "").estimate()
+    assert (often.low, often.high) == pytest.approx((once.low, once.high))
+
+
+# -- the classifier on numbers whose answer is known ------------------------------------------------
+
+
+@pytest.fixture
+def known():
+    """200 made-up layouts: eight numbers of noise; danger from two sectors, or none."""
+    rng = np.random.default_rng(1)
+    return rng.normal(size=(200, 8)), rng.choice(["left", "right", "", ""], 200)
+
+
+def test_noise_tells_nothing(known):
+    auc, told_by = judge(moments(*known), ("left", "right"))
+    assert set(auc) == {"danger", "left", "right"}
+    assert all(found.low < 0.5 < found.high for found in auc.values())
+    assert told_by == {}
+
+
+def test_a_number_that_tells_is_found_and_named(known):
+    table, danger = known
+    table[:, 5] += 4.0 * (danger == "left")
+    auc, told_by = judge(moments(table, danger), ("left", "right"))
+    assert auc["left"].value > 0.95
+    assert auc["right"].value < auc["danger"].value < auc["left"].value
+    assert next(iter(told_by)) == "number 5"
+
+
+def test_what_is_known_only_where_there_is_danger_tells_too(known):
+    table, danger = known
+    table[danger == "", 2] = np.nan
+    auc, told_by = judge(moments(table, danger), ("left", "right"))
+    assert auc["danger"].value == 1.0
+    assert list(told_by) == ["number 2"]
+
+
+# -- scenarios --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_truck_that_is_elsewhere_where_there_is_danger_is_found():
+    dials = Parameters(danger_share=0.5, sector_shares=(0.5, 0.5, 0.0), truck_share=1.0)
+    found = audit(replace(SCENARIO, parameters=dials), 40, 0, quiet)
+    assert found.tells
+    assert found.auc["danger"].value > 0.95
+    assert found.auc["danger"].low > 0.75
+    assert list(found.told_by) == ["oncoming: seen_share"]  # what a truck that is farther away hides
+
+
+def test_every_graph_gives_the_same_names():
+    road, names = SCENARIO.road(), set()
+    for seed in range(5):
+        state = World.start(SCENARIO, seed).state()
+        for viewer in ("v1", "v2"):
+            names.add(tuple(dict(numbers(scene_graph(SCENARIO, state, viewer), road))))
+    assert len(names) == 1
+    assert len(set(*names)) == len(*names)
+
+
+def test_a_scenario_that_hides_nothing_has_nothing_to_audit():
+    with pytest.raises(UserError, match=r"one-way-crossing hides no danger: most are in sight"):
+        audit(one_way_crossing.SCENARIO, 12, 0, quiet)
+
+
+def test_too_few_layouts_are_refused(harness):
+    code, out, err = harness("scenario", "audit", NAME, "--layouts", 6, "--workers", 1)
+    assert (code, out) == (2, "")
+    assert "an audit needs 5, give more with --layouts" in err
+    code, _, err = harness("scenario", "audit", NAME, "--layouts", 0)
+    assert (code, err) == (2, "harness: --layouts 0 is out of range; give 1 to 100000\n")
+
+
+def test_without_scikit_learn_one_line_says_what_to_install(harness, monkeypatch):
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    code, out, err = harness("scenario", "audit", NAME)
+    assert (code, out) == (2, "")
+    assert err == "harness: an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`\n"
+
+
+@pytest.mark.slow
+def test_the_command_says_the_same_to_people_and_to_machines(harness):
+    words = ("scenario", "audit", NAME, "--layouts", 40, "--seed", 0, "--workers", 1)
+    code, out, err = harness(*words, "--json")
+    found = json.loads(out)
+    assert err == ""
+    assert (found["layouts"], found["seed"], found["steps"][0]) == (40, 0, 0)
+    assert set(found["auc"]) <= {"danger", "left", "right", "oncoming"}
+    assert found["auc"]["danger"]["n"] == 40
+    assert found["tells"] == (found["auc"][found["worst"]]["value"] > 0.6) == (code == 1)
+    again, text, _ = harness(*words)
+    assert again == code
+    assert "n = 40 layouts, layout seeds 0 to 39 (tune);" in text
+    assert f"{found['auc']['danger']['value']:.2f} [" in text
+    assert max(map(len, text.splitlines())) <= 80
