@@ -62,8 +62,8 @@ def campaign() -> dict[str, float]:
 
 
 def draw(generator: np.random.Generator, episodes: int, helpers: int) -> None:
-    """As many numbers as `Calibrated` draws: four an episode and two a link, one and two a decision."""
-    generator.random((episodes, 4 + 2 * helpers))
+    """As many numbers as `Calibrated` draws: four an episode and a link, one and two a decision."""
+    generator.random((episodes, 4 + 4 * helpers))
     generator.random((episodes * STEPS, 1 + 2 * helpers))
 
 

@@ -1,10 +1,12 @@
 """`harness campaign`: whole studies."""
 
 from pathlib import Path
+from textwrap import fill
 
 import typer
 
 from harness.cli import options
+from harness.cli.estimates import WIDTH
 from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.sweep import tables
@@ -21,6 +23,7 @@ def paper(
     out: Path = typer.Option(Path("reports/paper"), help="Folder to write; replaces a study there."),
     episodes: int = typer.Option(1500, help="Episodes a seed, to compare operating points."),
     sweep_episodes: int = typer.Option(300, help="Episodes a seed at each grid point of a sweep."),
+    seeds: str = typer.Option("0:5", help="Seeds of episodes and channel: 0:5 is 0 to 4; or 3,7,9."),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -30,27 +33,29 @@ def paper(
 
     options.in_range("--episodes", episodes, 10, MOST_EPISODES)
     options.in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
+    draws = options.parse_seeds(seeds)
     silent = as_json or quiet
     settings = panels(episodes, sweep_episodes)
     with bar("grid points", sum(len(panel.settings) for panel in settings), silent) as progress:
-        ledger = run_paper(settings, out, progress)
+        ledger, equation_2 = run_paper(settings, draws, out, progress)
     if as_json:
         typer.echo(ledger.to_json(orient="records"))
     if silent:
         return
     typer.echo(f"{'row':<4}{'what':<31}{'paper':>13}{'ours [95 % CI]':>21}{'off':>6}")
     for row in map(shown, ledger[ledger.kind != "cited"].itertuples()):
-        fitted = "    *" if row["kind"] == "fitted" else ""
-        mark = {"misses": " MISS", "unclear": "    ?"}.get(row["verdict"], fitted)
+        mark = {"misses": " MISS", "unclear": " ?"}.get(row["verdict"], "")
+        mark += " *" if row["kind"] == "fitted" else ""
         typer.echo(
             f"{row['id']:<4}{row['what'][:30]:<31}{row['paper']:>13}{row['ours']:>21}{row['off']:>6}{mark}"
         )
     counts = tally(ledger)
-    typer.echo(
+    told = (
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
-        f"{counts['unclear']} unclear (?:\nthe interval reaches it, more --episodes would tell); "
-        f"{counts['predicted']} predicted, * fitted"
+        f"{counts['unclear']} unclear (?: the interval reaches it); {counts['predicted']} predicted, * fitted"
     )
+    typer.echo(fill(told, WIDTH))
+    typer.echo(fill(equation_2, WIDTH))
     typer.echo(f"wrote {printable(out / 'index.html')}")
 
 

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE
 from harness.report.drawing.pictures import styled
-from harness.studies.axes import axis_of
+from harness.studies.axes import CORE, axis_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,8 +23,13 @@ BESIDE = {"size": ("effective_loss", "loss of one crossing"), "tau": ("trigger_r
 
 
 @styled
-def composite_a(core: "pd.DataFrame") -> Figure:
-    """Latency, success and communication of the operating points, with 95 % intervals over seed means."""
+def composite_a(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Figure:
+    """Latency, success and communication of the operating points, with 95 % intervals over seed means.
+
+    Args:
+        core: a study's summary of them.
+        paper: the paper's values beside (`harness.studies.ledger.marks`).
+    """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)
     names = list(dict.fromkeys(core.condition))
@@ -41,9 +46,11 @@ def composite_a(core: "pd.DataFrame") -> Figure:
             mean, down, up = _value(core, name, metric, scale)
             axes.bar(x, mean, width=0.65, color=colours[name], edgecolor=INK, linewidth=0.5)
             axes.errorbar(x, mean, yerr=[[down], [up]], color=INK, capsize=2.5, linewidth=1.0)
+            theirs = _paper(paper, CORE, metric, condition=name)
+            _cross(axes, theirs, x)
             axes.annotate(
-                f"{mean:.1f}", (x, mean + up), xytext=(0, 2), textcoords="offset points", ha="center",
-                fontsize=6,
+                f"{mean:.1f}", (x, np.nanmax([mean, mean + up, *theirs.high])),
+                xytext=(0, 2 if theirs.empty else 4), textcoords="offset points", ha="center", fontsize=6,
             )  # fmt: skip
         if axes is latency:
             axes.bar(0, CLOUD_MS, width=0.65, color="white", edgecolor=GREY, hatch="////", linewidth=0.8)
@@ -58,13 +65,17 @@ def composite_a(core: "pd.DataFrame") -> Figure:
         axes.margins(y=margin)
         _plain(axes, "y")
     success.set_ylim(0, 108)
+    key: list[Any] = []
     if in_legend:
-        key = [Patch(facecolor=colour, edgecolor=INK, label=name) for name, colour in colours.items()]
+        key += [Patch(facecolor=colour, edgecolor=INK, label=name) for name, colour in colours.items()]
+    key += success.get_legend_handles_labels()[0][:1]  # the paper's values
+    if key:
         figure.legend(handles=key, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
     rate = talk.twinx()
     for n, name in enumerate(talking):
         mean, down, up = _value(core, name, "trigger_rate", 100.0)
         rate.errorbar(n + 0.2, mean, yerr=[[down], [up]], marker="D", color=INK, capsize=2, markersize=4)
+        _cross(rate, _paper(paper, CORE, "trigger_rate", condition=name), n + 0.33)
     rate.set(ylim=(0, 112), ylabel="trigger rate, % (diamonds)")
     rate.spines[["top"]].set_visible(False)
     _lettered(drawn)
@@ -72,12 +83,17 @@ def composite_a(core: "pd.DataFrame") -> Figure:
 
 
 @styled
-def along(panels: "Sequence[pd.DataFrame]", best_band: bool = False) -> Figure:
-    """Success along one axis a panel, several sources in one, with loss or trigger rate where it changes."""
+def along(panels: "Sequence[pd.DataFrame]", paper: "pd.DataFrame | None" = None) -> Figure:
+    """Success along one axis a panel, several sources in one, with loss or trigger rate where it changes.
+
+    Args:
+        panels: of a study's summary.
+        paper: the paper's values beside (`harness.studies.ledger.marks`), and the band that it calls best.
+    """
     figure = Figure(figsize=(2.5 * len(panels) + 0.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, panel in zip(drawn, panels, strict=True):
-        _along(axes, panel, best_band)
+        _along(axes, panel, paper)
     _lettered(drawn)
     key: dict[str, Any] = {}
     for axes in figure.axes:
@@ -88,7 +104,7 @@ def along(panels: "Sequence[pd.DataFrame]", best_band: bool = False) -> Figure:
     return figure
 
 
-def _along(axes: Any, panel: "pd.DataFrame", best_band: bool) -> None:
+def _along(axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None") -> None:
     variable = str(panel.variable.iloc[0])
     curves = [(axes, "success_rate", "success")]
     if variable in BESIDE:
@@ -118,9 +134,14 @@ def _along(axes: Any, panel: "pd.DataFrame", best_band: bool) -> None:
             where.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
     if ticks:
         axes.set_xticks(range(len(ticks)), ticks, rotation=30, ha="right", fontsize=7)
+    for where, metric, _ in curves:
+        theirs = _paper(paper, str(panel.panel.iloc[0]), metric)
+        _cross(where, theirs, theirs.value.to_numpy(dtype=float))
     for where, metric, _ in curves[1:]:
-        where.set_ylim(0, 112 if metric == "trigger_rate" else None)
-    if variable == "tau" and best_band:
+        where.set_ylim(0, 125 if metric == "trigger_rate" else None)
+        if metric == "trigger_rate":
+            where.set_yticks(range(0, 101, 20))
+    if variable == "tau" and paper is not None:
         axes.axvspan(*BEST_BAND, color="#ECECEC", zorder=0, label="best band of the paper")
     axes.set(xlabel=axis_of(variable).label, ylabel="success, %")
     _plain(axes, "y")
@@ -157,6 +178,30 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     _plain(axes, "both")
     figure.legend(loc="outside right upper", frameon=False, fontsize=7)
     return figure
+
+
+def _paper(marks: "pd.DataFrame | None", panel: str, metric: str, **place: str) -> "pd.DataFrame":
+    """What the paper says of a metric in a panel; nothing if its values are not to be drawn."""
+    import pandas as pd
+
+    if marks is None:
+        return pd.DataFrame(columns=["value", "low", "high"])
+    wanted = (marks.panel == panel) & (marks.metric == metric)
+    for column, value in place.items():
+        wanted &= marks[column] == value
+    return marks[wanted]
+
+
+def _cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
+    """Draw the paper's values at `x`: a cross, or the range that it gives."""
+    low, high = (theirs[end].to_numpy(dtype=float) for end in ("low", "high"))
+    x, single = np.broadcast_to(x, low.shape), low == high
+    if single.any():
+        look: dict[str, Any] = {"color": INK, "markersize": 4.5, "zorder": 5, "clip_on": False}
+        axes.plot(x[single], low[single], "x", label="the paper", **look)
+    if not single.all():
+        middle, half = (low + high)[~single] / 2, (high - low)[~single] / 2
+        axes.errorbar(x[~single], middle, half, fmt="none", ecolor=INK, capsize=2, linewidth=1, zorder=5)
 
 
 def _interval(rows: "pd.DataFrame") -> str:

@@ -1,6 +1,7 @@
 """Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
 
 import csv
+import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -81,7 +82,7 @@ def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: floa
     """Of a mean with its interval, where `least` to `most` is allowed."""
     if least <= mean <= most:
         return "within"
-    return "unclear" if ci_low <= most and ci_high >= least else "misses"
+    return "misses" if ci_low > most or ci_high < least else "unclear"  # also where no interval is known
 
 
 def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
@@ -103,6 +104,20 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
     return [{str(k): v for k, v in record.items()} for record in s.to_dict("records")]
 
 
+def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
+    """The paper's values for figures, a row a grid point: `panel`, `condition` and `metric` as we name them.
+
+    `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
+    """
+    ran = ledger[ledger.kind != "cited"]
+    return ran.assign(
+        condition=ran.condition.map(CONDITIONS),
+        metric=ran.metric.map({theirs: ours for theirs, (ours, *_) in METRICS.items()}),
+    ).rename(columns={"paper_low": "low", "paper_high": "high"})[
+        ["panel", "condition", "value", "metric", "low", "high"]
+    ]
+
+
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
     """Numbers of the paper that can be run; how many of them have which verdict, and are predicted."""
     ran = ledger[ledger.kind != "cited"]
@@ -122,12 +137,13 @@ def shown(row: Any) -> dict[str, Any]:
     value = f" {row.value:g}" if isinstance(row.value, float) else ""
     theirs = f"{row.paper_low:g}" + (f" to {row.paper_high:g}" if row.paper_high != row.paper_low else "")
     cited = row.kind == "cited"
+    ends = ("–" if math.isnan(end) else f"{end:.1f}" for end in (row.ci_low, row.ci_high))
     unit = UNITS.get(row.unit, f", {row.unit}")
     return {
         "id": row.id,
         "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
-        "ours": "" if cited else f"{row.ours:.1f} [{row.ci_low:.1f}, {row.ci_high:.1f}]",
+        "ours": "" if cited else f"{row.ours:.1f} [{', '.join(ends)}]",
         "off": "" if cited else f"{row.difference:+.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,

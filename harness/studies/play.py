@@ -1,7 +1,8 @@
 """Plays a source of intents at every point of a panel, and sums up with intervals."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -9,9 +10,17 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import Estimate, seed_interval
+from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.walk import Ask, World, columns, walk
-from harness.runs.metrics import METRICS, PERCENTILES, of_decisions, over_episodes, over_seeds, percentiles
+from harness.runs.metrics import (
+    METRICS,
+    PERCENTILES,
+    in_range,
+    of_decisions,
+    over_episodes,
+    over_seeds,
+    percentiles,
+)
 from harness.studies.axes import Setting
 
 if TYPE_CHECKING:
@@ -148,12 +157,30 @@ def _of_seed(walked: Walked, place: int) -> Floats:
 def _estimates(
     source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
+    over = over_seeds if source.same_episodes else over_own_episodes
     for name, values in metrics.items():
-        yield name, over_seeds(name, values), "seed means"
+        yield name, over(name, values), "seed means"
         if source.same_episodes:
             yield name, over_episodes(name, values), "episodes"
     for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
         yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
+
+
+def over_own_episodes(name: str, values: Floats) -> Estimate:
+    """Student's t over seeds that have episodes of their own, of a metric's values (S, E).
+
+    A stratified share of E episodes is exact but for rounding to whole ones, so that seeds may agree to the
+    last episode and be wrong by the same. Half an episode, the largest standard deviation that rounding up or
+    down can have, is the least that the means of a yes or no count as having.
+    """
+    estimate = seed_interval(known_mean(values, axis=1))
+    if name not in ENDS or estimate.n < 2:
+        return in_range(name, estimate)
+    from scipy.special import stdtrit
+
+    least = float(stdtrit(estimate.n - 1, 0.975)) * 0.5 / values.shape[1] / math.sqrt(estimate.n)
+    half = max(estimate.high - estimate.value, least)
+    return in_range(name, replace(estimate, low=estimate.value - half, high=estimate.value + half))
 
 
 def _episode_table(

@@ -5,11 +5,23 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
-from harness.studies.calibrated import ACTIONS, STEPS, Calibrated, Parameters, peaked, spread
+from harness.studies.calibrated import (
+    ACTIONS,
+    CUT,
+    FITTED_ON,
+    STEPS,
+    Calibrated,
+    Parameters,
+    peaked,
+    spread,
+    stratified,
+)
 from harness.studies.fit import fit
 from harness.studies.play import Walked
 
@@ -43,6 +55,65 @@ def test_an_intent_has_the_entropy_that_was_asked_for(nats: float):
     p = peaked(np.array([nats, nats]), np.array([0, 2]))
     assert entropy_nats(p) == pytest.approx([nats, nats], abs=1e-3)
     assert p.argmax(axis=1).tolist() == [0, 2]
+
+
+@given(st.lists(st.integers(0, 3), max_size=40), st.integers(0, 2**32))
+def test_of_a_kinds_rows_one_draw_lies_in_each_equal_part(kinds: list[int], seed: int) -> None:
+    drawn = stratified(np.random.default_rng(seed), np.array(kinds, dtype=int))
+    for kind in set(kinds):
+        of = drawn[np.array(kinds) == kind]
+        assert sorted((of * len(of)).astype(int)) == list(range(len(of)))
+
+
+def test_stratified_draws_are_uniform_and_columns_independent() -> None:
+    """A row's own draws, over 4 000 generators: any row of a small kind has every value alike often."""
+    kinds = np.array([0, 1, 0, 1, 0])
+    first, second = (
+        np.array([stratified(np.random.default_rng([column, seed]), kinds) for seed in range(4000)])
+        for column in (0, 1)
+    )
+    assert first.mean(axis=0) == pytest.approx(np.full(5, 0.5), abs=0.02)  # 4 standard errors
+    assert first.var(axis=0) == pytest.approx(np.full(5, 1 / 12), abs=0.006)
+    assert abs(np.corrcoef(first[:, 0], second[:, 0])[0, 1]) < 0.065
+
+
+def test_every_seed_has_every_kind_of_episode_in_its_share() -> None:
+    """Of 300, .689 x 300 = 206.7 guess rightly; the first helper saves .264 x .406 x 300 = 32.2."""
+    source = Calibrated(300)
+    first_alone = replace(SURE, max_helpers=1)
+    for seed in range(20):
+        alone = success(source, POINTS["single-local"], seed=seed)
+        saved = success(source, first_alone, seed=seed) & ~alone
+        assert alone.sum() in (206, 207)
+        assert saved.sum() in (31, 32, 33)
+
+
+def test_luck_is_spread_over_those_whom_it_decides() -> None:
+    """Of 32 whom only the first helper saves, .6 x .6 hear it at 40 % loss: 11.5, and never 7 or 16."""
+    source = Calibrated(300)
+    heard = []
+    for seed in range(40):
+        alone, all_heard, some_heard = (
+            success(source, point, vehicles=2, seed=seed)
+            for point in (POINTS["single-local"], SURE, replace(POINTS["6g"], loss=0.4))
+        )
+        heard.append((some_heard & ~alone).sum() / (all_heard & ~alone).sum())
+    assert np.mean(heard) == pytest.approx(0.36, abs=0.03)
+    # Plain draws have .085; what a Latin hypercube leaves is request and reply together.
+    assert np.std(heard) < 0.065
+
+
+def test_what_was_chosen_by_hand_is_listed_and_does_what_is_said() -> None:
+    p = Parameters()
+    ego, others = (
+        (mean - CUT * sd, mean + CUT * sd)
+        for mean, sd in ((p.ego_nats, p.ego_sd_nats), (p.others_nats, p.others_sd_nats))
+    )
+    assert ego[0] >= 0.7 - 1e-4  # A10, A11, B16: always above the paper's threshold
+    assert ego[1] < 0.95  # B20
+    assert 0.6 < others[0] < others[1] < 0.65  # B13, B15
+    assert STEPS * 3 == 18  # A8, A9
+    assert set(vars(p)) <= set(FITTED_ON)
 
 
 def test_draws_keep_to_their_range():
