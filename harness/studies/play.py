@@ -9,9 +9,17 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import Estimate, seed_interval
+from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.walk import Ask, World, columns, walk
-from harness.runs.metrics import METRICS, PERCENTILES, of_decisions, over_episodes, over_seeds, percentiles
+from harness.runs.metrics import (
+    METRICS,
+    PERCENTILES,
+    in_range,
+    of_decisions,
+    over_episodes,
+    over_seeds,
+    percentiles,
+)
 from harness.studies.axes import Setting
 
 if TYPE_CHECKING:
@@ -149,9 +157,11 @@ def _estimates(
     source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
     for name, values in metrics.items():
-        yield name, over_seeds(name, values), "seed means"
         if source.same_episodes:
+            yield name, over_seeds(name, values), "seed means"
             yield name, over_episodes(name, values), "episodes"
+        else:
+            yield name, in_range(name, seed_interval(known_mean(values, axis=1))), "seed means"
     for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
         yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
 
