@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from harness.core.statistics import (
     Estimate,
     brier,
     episode_interval,
     negative_log_likelihood,
-    paired_difference,
+    rate_difference,
     rate_interval,
     safe_target,
     seed_interval,
-    share_interval,
+    seed_rate_interval,
     wilson,
 )
 
@@ -91,21 +92,110 @@ def test_a_rate_lies_in_its_interval_and_the_interval_in_zero_to_one(successes, 
     assert 0 <= estimate.low <= estimate.value <= estimate.high <= 1
 
 
+def test_seeds_and_decisions_of_an_episode_are_worth_what_their_spread_says():
+    """Means of episodes 1, 1, .5, .5, mean .75: the squares sum to 1/4, and over 4 · 3 the variance is 1/48.
+
+    .75 · .25 over that is 9. All fourth powers are alike, so all 3 degrees of freedom count: t = 3.182, and 9
+    times (1.960 / 3.182)² is 3.414, less than the 4 episodes. With .8 and .7 the variance is 1/1200.
+    """
+    apart, near = rate_interval(np.array([1.0, 1.0, 0.5, 0.5])), rate_interval(np.array([0.8, 0.8, 0.7, 0.7]))
+    assert (apart.value, apart.low, apart.high) == pytest.approx((0.75, *wilson(0.75, 4)))
+    assert (near.low, near.high) == pytest.approx(wilson(0.75, 225 * (1.959964 / 3.182446) ** 2), rel=1e-6)
+
+
+def test_where_few_episodes_differ_the_spread_is_hardly_known():
+    """One of ten at .5, nine at 1: mean .95, squares .225, fourth powers .0411, 2 · .225² / .0360 = 2.81."""
+    rate = rate_interval(np.array([0.5] + [1.0] * 9))
+    t = stats.t.ppf(0.975, 2 * 0.225**2 / (0.45**4 + 9 * 0.05**4 - 0.225**2 / 10))
+    assert 0.95 * 0.05 / (0.225 / 90) * (1.959964 / t) ** 2 < 10, "so an episode counts as one"
+    assert (rate.low, rate.high) == pytest.approx(wilson(0.95, 10))
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_no_interval_of_a_rate_has_no_width_or_leaves_its_range(values):
+    estimate = rate_interval(np.array(values))
+    assert 0 <= estimate.low <= estimate.value <= estimate.high <= 1
+    assert estimate.low < estimate.high
+
+
 def test_a_pair_counts_only_where_both_are_known():
-    difference = paired_difference(np.array([3.0, 2.0, NAN, 5.0]), np.array([1.0, 2.0, 0.0, NAN]))
-    assert (difference.value, difference.n, difference.n_excluded) == (1.0, 2, 2)
-    assert difference.high - difference.value == pytest.approx(12.706, rel=1e-4)
+    difference = rate_difference(np.array([1.0, 0.0, NAN, 1.0]), np.array([0.0, 0.0, 0.0, NAN]))
+    assert (difference.value, difference.n, difference.n_excluded) == (0.5, 2, 2)
 
 
-def test_a_condition_does_not_differ_from_itself():
-    a = np.array([0.1, 0.7, 0.3])
-    assert paired_difference(a, a) == Estimate(0.0, 0.0, 0.0, 3, 0)
+def test_a_paired_difference_of_newcombe_1998():
+    """Statistics in Medicine 17:2635-2650, method 10: of 50 pairs 36 both, 12 the first, 2 the second alone.
+
+    By hand, p = .96 and q = .76 (Wilson's ends .8654, .9890 and .6259, .8570): the covariance is
+    .72 - .96 · .76 = -.0096, from which nothing is taken, so the correlation is -.0096 / (.1960 · .4271).
+    """
+    difference = rate_difference(
+        np.repeat([1.0, 1.0, 0.0], [36, 12, 2]), np.repeat([1.0, 0.0, 1.0], [36, 12, 2])
+    )
+    assert (difference.value, difference.low, difference.high) == pytest.approx(
+        (0.2, 0.0569, 0.3404), abs=5e-5
+    )
 
 
-def test_pairing_removes_what_both_conditions_share():
-    episodes = np.array([10.0, 20.0, 30.0, 40.0])
-    difference = paired_difference(episodes + 1, episodes)
-    assert (difference.value, difference.low, difference.high) == pytest.approx((1.0, 1.0, 1.0))
+def test_where_all_pairs_agree_some_of_other_episodes_might_not():
+    """Of 20 pairs half succeed: the covariance .25 less 1/20 leaves a correlation of .8."""
+    a = np.repeat([0.0, 1.0], 10)
+    low, high = wilson(0.5, 20)
+    half = math.sqrt(2 * (1 - 0.8)) * (high - 0.5)
+    difference = rate_difference(a, a)
+    assert (difference.value, difference.low, difference.high) == pytest.approx((0.0, -half, half))
+    assert high - 0.5 == pytest.approx(0.5 - low)
+
+
+@given(st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1)), min_size=2, max_size=12))
+def test_a_difference_of_rates_turns_its_sign_with_its_sides(pairs):
+    a, b = np.array(pairs).T
+    one, other = rate_difference(a, b), rate_difference(b, a)
+    assert (one.low, one.high) == pytest.approx((-other.high, -other.low), abs=1e-9)
+    assert -1 - 1e-9 <= one.low < one.high <= 1 + 1e-9
+    assert one.low <= one.value <= one.high
+
+
+def test_over_seeds_these_episodes_stay_what_they_are():
+    """Two of four episodes hang on the seed: the squares in them, 1/2 and 1/2, over 4 (2 - 1) are 1/4.
+
+    Of 8 values that is 2, and with two more that go another way 4: t(4) = 2.776 times 2 over 8.
+    """
+    estimate = seed_rate_interval(np.array([[1.0, 1.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]]))
+    half = 2.776445 * 2 / 8
+    assert (estimate.value, estimate.low) == pytest.approx((0.5, 0.5 - half))
+    assert estimate.high == 1.0, "and not 1.19"
+    assert (estimate.n, estimate.n_excluded) == (2, 0)
+
+
+def test_where_no_seed_changes_anything_one_might():
+    estimate = seed_rate_interval(np.repeat([[1.0] * 30 + [0.0] * 10], 5, axis=0))
+    assert estimate.value == 0.75
+    assert estimate.high - 0.75 == pytest.approx(stats.t.ppf(0.975, 160) * math.sqrt(2) / 200)
+
+
+def test_one_seed_of_a_rate_has_no_interval_either():
+    estimate = seed_rate_interval(np.array([[1.0, 0.0]]))
+    assert (estimate.value, estimate.n) == (0.5, 1)
+    assert math.isnan(estimate.low)
+
+
+def test_where_all_are_alike_students_t_knows_no_ends():
+    for values in ([3.0, 3.0, 3.0], [0.1 + 0.2, 0.3, 0.3]):
+        estimate = episode_interval(np.array(values))
+        assert estimate.value == pytest.approx(values[0])
+        assert math.isnan(estimate.low)
+        assert math.isnan(estimate.high)
+
+
+def test_values_of_an_episode_go_together_in_students_t_too():
+    """Totals of three episodes about the mean 2: -2, 0 and 2, so 3/2 · 8 over 6² is 1/3."""
+    values, of = np.array([1.0, 1.0, 2.0, 2.0, 3.0, 3.0]), np.array([7, 7, 8, 8, 9, 9])
+    estimate = episode_interval(values, of)
+    assert (estimate.value, estimate.n) == (2.0, 6)
+    assert estimate.high - 2.0 == pytest.approx(4.302653 / math.sqrt(3))
+    alone = episode_interval(np.array([1.0, 2.0, 3.0]))
+    assert (estimate.low, estimate.high) == pytest.approx((alone.low, alone.high))
 
 
 def test_brier_scores_by_hand():
@@ -140,21 +230,26 @@ def test_in_the_mean_no_forecast_beats_the_truth(seed):
 
 def test_decisions_of_one_episode_are_worth_less_than_as_many_alone():
     alike = np.repeat([1.0, 0.0, 1.0, 1.0], 6)
-    together = share_interval(alike, np.repeat(np.arange(4), 6))
-    alone = share_interval(alike, np.arange(24))
+    together = rate_interval(alike, np.repeat(np.arange(4), 6))
+    alone = rate_interval(alike, np.arange(24))
     assert together.value == alone.value == 0.75
     assert (together.n, alone.n) == (24, 24)
-    # By hand: the variance over four clusters is 4/3 * 27/576 = 1/16, eight times that of 24 alone.
-    assert (together.low, together.high) == pytest.approx(wilson(0.75, 3.0))
-    assert (alone.low, alone.high) == pytest.approx(wilson(0.75, 23.0))
+    assert (together.low, together.high) == pytest.approx(wilson(0.75, 4))
+    assert (alone.low, alone.high) == pytest.approx(wilson(0.75, 24))
 
 
 def test_where_all_decisions_are_alike_an_episode_counts_as_one():
-    share = share_interval(np.ones(60), np.repeat(np.arange(10), 6))
+    share = rate_interval(np.ones(60), np.repeat(np.arange(10), 6))
     assert (share.low, share.high) == wilson(1.0, 10.0)
 
 
+def test_a_long_episode_counts_for_more_than_a_short_one():
+    """Nine decisions of one episode and one of another are worth 10² / (9² + 1²) episodes."""
+    share = rate_interval(np.ones(10), np.array([0] * 9 + [1]))
+    assert (share.low, share.high) == wilson(1.0, 100 / 82)
+
+
 def test_unknown_decisions_are_left_out_and_none_gives_no_share():
-    share = share_interval(np.array([1.0, np.nan, 0.0]), np.array([0, 0, 1]))
+    share = rate_interval(np.array([1.0, np.nan, 0.0]), np.array([0, 0, 1]))
     assert (share.value, share.n, share.n_excluded) == (0.5, 2, 1)
-    assert np.isnan(share_interval(np.array([np.nan]), np.array([0])).value)
+    assert np.isnan(rate_interval(np.array([np.nan]), np.array([0])).value)

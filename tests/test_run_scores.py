@@ -25,6 +25,7 @@ from scipy import stats
 
 from harness.backends.base import Completion, Role
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.statistics import wilson
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
@@ -91,10 +92,14 @@ def test_success_unsafe_and_late_by_hand(told: Walked) -> None:
 
 
 def test_the_gain_over_single_local_is_paired_by_episode(told: Walked) -> None:
-    """Differences 0, 1, 0, 0: mean 0.25, standard error 0.25, times t(3) = 3.182."""
+    """From .5 to .75, whose Wilson's ends of 4 are .1500, .8500 and .3006, .9544.
+
+    All covary: .5 - .375 less 1/4 for two pairs that might differ is none, so the ends join as if alone.
+    """
     row = figure(told, "clear", "success_gain_over_single-local")
     assert (row.value, row.n) == (0.25, 4)
-    assert (row.low, row.high) == pytest.approx((0.25 - 0.7956, 0.25 + 0.7956), abs=1e-4)
+    low, high = math.hypot(0.75 - 0.3006, 0.85 - 0.5), math.hypot(0.9544 - 0.75, 0.5 - 0.15)
+    assert (row.low, row.high) == pytest.approx((0.25 - low, 0.25 + high), abs=1e-4)
     assert value(told, "deaf", "success_gain_over_single-local")[0] == 0.0
     gains = {s.condition for s in told.scores if s.metric == "success_gain_over_single-local"}
     assert gains == {"clear", "deaf"}
@@ -185,7 +190,7 @@ def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: 
 # -- seeds ------------------------------------------------------------------------------------------------
 
 
-def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset) -> None:
+def test_intervals_of_what_hangs_on_the_seed(small: Dataset) -> None:
     lossy = OperatingPoint("lossy", "6g", loss=0.4, tau_nats=0.0)
     seeds = (0, 1, 2, 3, 4)
     lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in small.scenes}
@@ -194,17 +199,19 @@ def test_the_interval_over_seeds_is_students_t_of_their_means(small: Dataset) ->
     by_seed = [np.mean([e.success for e in told.episodes if e.seed == seed]) for seed in seeds]
     assert len(set(by_seed)) > 1, "seeds that all agree would not show the interval"
     row = figure(told, "lossy", "success_rate", "seed means")
-    low, high = stats.t.interval(0.95, len(seeds) - 1, loc=np.mean(by_seed), scale=stats.sem(by_seed))
-    assert low < 0 < high < 1  # a share ends at 0, which t does not know
-    assert (row.value, row.low, row.high) == pytest.approx((np.mean(by_seed), 0.0, high))
+    lone = sum(e.success for e in told.episodes)  # one seed's, in one episode
+    assert lone == 1
+    half = stats.t.ppf(0.975, 16) * math.sqrt(20 * (1 - 1 / 5) / 16 + 2) / 20
+    assert (row.value, row.low, row.high) == pytest.approx((np.mean(by_seed), 0.0, 0.05 + half))
     assert (row.n, row.n_excluded) == (5, 0)
 
     numbers = sorted({e.episode for e in told.episodes})
     by_episode = [np.mean([e.success for e in told.episodes if e.episode == n]) for n in numbers]
+    assert sorted(by_episode) == [0, 0, 0, 0.2]
     row = figure(told, "lossy", "success_rate")
-    low, high = stats.t.interval(0.95, 3, loc=np.mean(by_episode), scale=stats.sem(by_episode))
-    assert low < 0, "a share of episodes ends at 0, whatever Student says"
-    assert (row.low, row.high, row.n) == (0.0, pytest.approx(high), 4)
+    worth = 0.05 * 0.95 / (0.03 / 12) * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 3)) ** 2
+    assert (row.low, row.high) == pytest.approx(wilson(0.05, worth))
+    assert row.n == 4
 
 
 def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: Walked) -> None:

@@ -2,11 +2,8 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from harness.core.arrays import Floats
-
-RESAMPLES, RESAMPLING_SEED = 9999, 0
+from harness.core.statistics import rate_difference
 
 
 @dataclass(frozen=True)
@@ -15,9 +12,9 @@ class SuccessTest:
 
     Attributes:
         method: `mcnemar` where no seed changes an episode's success, so that an episode is one yes or no;
-            else `bootstrap`.
-        p_value: two-sided and exact, of McNemar's test; None for the bootstrap.
-        low: lower end of the bootstrap's 95 % interval of B - A; None for McNemar's test.
+            else `interval`.
+        p_value: two-sided and exact, of McNemar's test; None for an interval.
+        low: lower end of the 95 % interval of B - A over episodes; None for McNemar's test.
         high: upper end.
     """
 
@@ -29,7 +26,7 @@ class SuccessTest:
 
 def success_test(a: Floats, b: Floats) -> SuccessTest | None:
     """Test the difference in success, 0 or 1, both (E, S), over episodes."""
-    from scipy.stats import binomtest, bootstrap
+    from scipy.stats import binomtest
 
     if (a == a[:, :1]).all() and (b == b[:, :1]).all():
         gained, lost = (int((x > y).sum()) for x, y in ((b[:, 0], a[:, 0]), (a[:, 0], b[:, 0])))
@@ -37,8 +34,5 @@ def success_test(a: Floats, b: Floats) -> SuccessTest | None:
         return SuccessTest("mcnemar", p_value=p_value)
     if len(a) < 2:
         return None
-    found = bootstrap(
-        ((b - a).mean(axis=1),), np.mean, n_resamples=RESAMPLES, batch=1000, method="percentile",
-        rng=RESAMPLING_SEED,
-    ).confidence_interval  # fmt: skip
-    return SuccessTest("bootstrap", low=float(found.low), high=float(found.high))
+    found = rate_difference(b, a)
+    return SuccessTest("interval", low=found.low, high=found.high)

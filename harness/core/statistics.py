@@ -1,7 +1,8 @@
 """Scores of intents, and means with an interval.
 
 A score has one value per decision; an interval turns values into an `Estimate`. Steps of one episode
-are no independent trials, so intervals are over episodes or over seeds.
+are no independent trials, so intervals are over episodes or over seeds. How often they cover what they
+should is measured by `benchmarks/coverage.py`.
 """
 
 import math
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+
+ROUNDING = 1e-18  # sum of squares that is none, relative to a mean above 1
 
 
 @dataclass(frozen=True)
@@ -67,23 +70,28 @@ def negative_log_likelihood(p: Floats, safe: Bools, floor: float = 1e-4) -> Floa
 def seed_interval(per_seed_means: Floats, level: float = 0.95) -> Estimate:
     """Mean over seeds `(S,)` with Student's t interval, the paper's error bars; t(4) = 2.776 for 5 seeds.
 
-    One seed has a value and no interval.
+    One seed, or seeds that all agree, have a value and no interval.
     """
-    return _student(per_seed_means, level)
+    return _student(per_seed_means, np.arange(len(per_seed_means)), level)
 
 
-def episode_interval(values_by_episode: Floats, level: float = 0.95) -> Estimate:
-    """Mean over episodes with Student's t interval over the episodes' own means.
+def episode_interval(
+    values_by_episode: Floats, episodes: Ints | None = None, level: float = 0.95
+) -> Estimate:
+    """Mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    For yes/no outcomes use `rate_interval`: t gives 0 of 20 an interval of no width.
+    Where all episodes are alike nothing tells how far others would be from them, so the ends are NaN.
 
     Args:
-        values_by_episode: `(E,)`, or `(E, ...)` with steps behind. An episode's mean is over what is not
-            NaN in it; an episode with nothing else is excluded.
+        values_by_episode: `(E,)`, or `(E, ...)` with steps behind, of which an episode has the mean of what
+            is not NaN; an episode with nothing else is excluded.
+        episodes: of which episode each of the values `(n,)` is, where they are not one an episode. The mean
+            is then over values, and the variance that of a ratio of totals (Cochran 1977, section 6.3).
         level: confidence level.
     """
     values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
-    return _student(known_mean(values, axis=-1), level)
+    means = known_mean(values, axis=-1)
+    return _student(means, np.arange(len(means)) if episodes is None else episodes, level)
 
 
 def known_mean(values: Floats, axis: int) -> Floats:
@@ -94,77 +102,160 @@ def known_mean(values: Floats, axis: int) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def rate_interval(outcomes_by_episode: Floats, level: float = 0.95) -> Estimate:
-    """Share of ones among 0/1 outcomes `(E,)` with Wilson's score interval (Wilson 1927)."""
-    outcomes = outcomes_by_episode[~np.isnan(outcomes_by_episode)]
-    n = len(outcomes)
-    n_excluded = len(outcomes_by_episode) - n
+def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0.95) -> Estimate:
+    """Mean of values from 0 to 1 with Wilson's interval for as many yes or no as they are worth.
+
+    What an episode is worth depends on how alike its seeds or decisions are (`_worth`).
+
+    Args:
+        values: `(n,)`: outcomes, or shares of outcomes; NaN is left out.
+        episodes: of which episode each is, `(n,)`; None where each is an episode of its own.
+        level: confidence level.
+    """
+    known = ~np.isnan(values)
+    n, n_excluded = int(known.sum()), int((~known).sum())
     if n == 0:
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
-    rate = float(np.mean(outcomes))
-    return Estimate(rate, *wilson(rate, n, level), n, n_excluded)
+    rate = float(np.mean(values[known]))
+    totals, sizes = _clusters(values[known] - rate, None if episodes is None else episodes[known])
+    return Estimate(rate, *wilson(rate, _worth(rate, totals, sizes, level), level), n, n_excluded)
 
 
 def wilson(rate: float, n: float, level: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a share among n (Wilson 1927)."""
-    from scipy.special import ndtri
-
-    z = float(ndtri(0.5 + level / 2))
+    z = _normal(level)
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     # At 0 and 1 the end is the rate itself; only rounding says otherwise.
     return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
 
 
-def share_interval(hits: Floats, episodes: Ints, level: float = 0.95) -> Estimate:
-    """Share of ones among decisions, with Wilson's interval for as many as they are worth.
+def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
+    """Mean over seeds of shares of these episodes, with an interval over other seeds.
 
-    Decisions of one episode go together, so n of them say as much as n / deff independent ones, deff being
-    the variance of the share over episodes as clusters against that of independent decisions, 1 at least
-    (Korn and Graubard 1998). Where all are alike nobody can tell deff, and an episode counts as one.
+    Draws are independent between seeds and between episodes, so the variance is that of seeds inside each
+    episode: of E (S - 1) degrees of freedom, where the means of S seeds have S - 1. Two more values are
+    counted that go another way than the rest of their episode, one each way (as Bonett and Price 2012 do
+    with pairs): where no seed changed anything, one might.
 
     Args:
-        hits: 0 or 1, `(n,)`; NaN is left out.
-        episodes: of which episode each is, `(n,)`.
+        values: from 0 to 1, or differences of such, `(S, E)`; NaN is left out.
         level: confidence level.
 
     Returns:
-        The share, with the number of decisions as n.
+        The mean, with the number of seeds as n. One seed has a value and no interval.
     """
-    known = ~np.isnan(hits)
-    y, _, cluster = hits[known], *np.unique(episodes[known], return_inverse=True)
-    n, clusters = len(y), int(cluster.max()) + 1 if len(y) else 0
-    if n == 0:
-        return Estimate(math.nan, math.nan, math.nan, 0, len(hits))
-    rate = float(np.mean(y))
-    worth = float(clusters)
-    if clusters > 1 and 0.0 < rate < 1.0:
-        totals = np.bincount(cluster, weights=y - rate)
-        variance = clusters / (clusters - 1) * float(np.sum(totals**2)) / n**2
-        worth = n / max(variance / (rate * (1 - rate) / n), 1.0)
-    low, high = wilson(rate, worth, level)
-    return Estimate(rate, low, high, n, len(hits) - n)
+    from scipy.special import stdtrit
+
+    means = known_mean(values, axis=1)
+    value, counted = float(known_mean(means, axis=0)), int((~np.isnan(means)).sum())
+    known = ~np.isnan(values)
+    freedom = int(np.sum(np.maximum(known.sum(axis=0) - 1, 0)))
+    if freedom == 0:
+        return Estimate(value, math.nan, math.nan, counted, len(means) - counted)
+    within = float(np.nansum((values - known_mean(values, axis=0)) ** 2)) / freedom
+    n = int(known.sum())
+    half = float(stdtrit(freedom, 0.5 + level / 2)) * math.sqrt(n * within + 2) / n
+    return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted)
 
 
-def paired_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
-    """Mean of a - b over episodes with Student's t interval.
+def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
+    """Mean of a - b over episodes, of shares, with an interval from the two of `rate_interval`.
+
+    The ends of both are put together by their correlation over episodes (Newcombe 1998, method 10; Zou and
+    Donner 2008). The correlation is that with two more pairs that differ, one each way (as Bonett and Price
+    2012 do): where all pairs agree, a few of other episodes might not.
 
     Args:
-        a: one condition's values, `(E,)` or `(E, ...)`, episodes in the same order as in `b`.
+        a: one condition's values from 0 to 1, `(E,)` or `(E, ...)`, episodes in the same order as in `b`.
         b: the other's. Where either is NaN the pair is excluded.
         level: confidence level.
     """
-    return episode_interval(a - b, level)
+    unknown = np.isnan(a) | np.isnan(b)
+    x, y = (
+        known_mean(np.where(unknown, np.nan, of).reshape(len(of), math.prod(of.shape[1:])), axis=-1)
+        for of in (a, b)
+    )
+    x, y = x[~np.isnan(x)], y[~np.isnan(y)]
+    n, n_excluded = len(x), len(a) - len(x)
+    value = float(np.mean(x - y)) if n else math.nan
+    if n < 2:
+        return Estimate(value, math.nan, math.nan, n, n_excluded)
+    (p, of_p, p_low, p_high, worth), (q, of_q, q_low, q_high, other) = (_around(of, level) for of in (x, y))
+    shared = float(np.mean(of_p * of_q))
+    shared = max(shared - 1 / math.sqrt(worth * other), 0.0) if shared > 0 else shared
+    spread = math.sqrt(float(np.mean(of_p**2) * np.mean(of_q**2)))
+    correlation = shared / spread if spread > 0 else 0.0
+
+    def reach(one: float, two: float) -> float:
+        return math.sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
+
+    low, high = value - reach(p - p_low, q_high - q), value + reach(p_high - p, q - q_low)
+    return Estimate(value, low, high, n, n_excluded)
 
 
-def _student(values: Floats, level: float) -> Estimate:
+def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:
+    """Mean of shares `(E,)`, their distances from it, both ends of its interval, and their worth."""
+    rate = float(np.mean(values))
+    distances = values - rate
+    worth = _worth(rate, distances, np.ones(len(values)), level)
+    return rate, distances, *wilson(rate, worth, level), worth
+
+
+def _worth(rate: float, totals: Floats, sizes: Floats, level: float) -> float:
+    """How many independent yes or no, of which this share is yes, say as much as these episodes.
+
+    The effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the mean with
+    episodes as clusters, less what Student's t asks for beyond the normal distribution. Its degrees of
+    freedom are Satterthwaite's, from the fourth moment: where few episodes differ from the rest there are
+    few. An episode is worth one at least, since no values from 0 to 1 vary more than yes or no.
+
+    Args:
+        rate: mean of the values.
+        totals: of each episode, of the values' differences from it, (C,).
+        sizes: how many values each episode has, (C,).
+        level: confidence level.
+    """
     from scipy.special import stdtrit
 
-    known = values[~np.isnan(values)]
-    n = len(known)
-    n_excluded = len(values) - n
-    if n < 2:
-        return Estimate(float(known[0]) if n else math.nan, math.nan, math.nan, n, n_excluded)
-    mean = float(np.mean(known))
-    half = float(stdtrit(n - 1, 0.5 + level / 2) * np.std(known, ddof=1) / math.sqrt(n))
+    clusters, n = len(totals), float(sizes.sum())
+    least = n**2 / float(np.sum(sizes**2))
+    squares, fourths = float(np.sum(totals**2)), float(np.sum(totals**4))
+    if clusters < 2 or squares < ROUNDING:
+        return least
+    variance = clusters / (clusters - 1) * squares / n**2
+    uneven = fourths - squares**2 / clusters
+    freedom = 2 * squares**2 / uneven if uneven > 0 else math.inf
+    t = float(stdtrit(min(max(freedom, 1.0), clusters - 1.0), 0.5 + level / 2))
+    return max(rate * (1 - rate) / variance * (_normal(level) / t) ** 2, least)
+
+
+def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
+    """Total and number of the values `(n,)` of each episode, (C,)."""
+    if episodes is None:
+        return values, np.ones(len(values))
+    place: Ints = np.unique(episodes, return_inverse=True)[1]
+    return np.bincount(place, weights=values).astype(float), np.bincount(place).astype(float)
+
+
+def _student(values: Floats, episodes: Ints, level: float) -> Estimate:
+    from scipy.special import stdtrit
+
+    known = ~np.isnan(values)
+    n, n_excluded = int(known.sum()), int((~known).sum())
+    if n == 0:
+        return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
+    mean = float(np.mean(values[known]))
+    totals, _ = _clusters(values[known] - mean, episodes[known])
+    clusters, squares = len(totals), float(np.sum(totals**2))
+    if clusters < 2 or squares < ROUNDING * max(mean**2, 1.0):
+        return Estimate(mean, math.nan, math.nan, n, n_excluded)
+    error = math.sqrt(clusters / (clusters - 1) * squares) / n
+    half = float(stdtrit(clusters - 1, 0.5 + level / 2)) * error
     return Estimate(mean, mean - half, mean + half, n, n_excluded)
+
+
+def _normal(level: float) -> float:
+    from scipy.special import ndtri
+
+    return float(ndtri(0.5 + level / 2))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import share_interval
+from harness.core.statistics import rate_interval
 from harness.parsing.status import Status
 from harness.runs.folder import Run
 from harness.runs.metrics import LATENCY, SUCCESS
@@ -77,7 +77,7 @@ def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Ite
         for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
             here = (conditions == n) & (bins == place) & ~np.isnan(hits)
             if here.any():
-                share = share_interval(hits[here], episodes[here])
+                share = rate_interval(hits[here], episodes[here])
                 yield {
                     "condition": condition, name: round(float(value[here].mean()), 4), "share": share.value,
                     "low": share.low, "high": share.high, "n": share.n,

@@ -13,9 +13,11 @@ from harness.core.statistics import (
     episode_interval,
     known_mean,
     negative_log_likelihood,
+    rate_difference,
     rate_interval,
     safe_target,
     seed_interval,
+    seed_rate_interval,
 )
 from harness.runs.decisions import Decisions
 from harness.runs.records import Episode
@@ -44,7 +46,6 @@ class Metric:
         episodes: an episode's value; None for a metric of decisions.
         total: an episode has the sum over its decisions, not the mean.
         world: where it is known; None for everywhere.
-        yes_or_no: an episode has it or has not.
         closed_loop: what it means in the closed loop, where that differs.
     """
 
@@ -54,13 +55,12 @@ class Metric:
     episodes: Callable[[Episode], Any] | None = None
     total: bool = False
     world: World | None = None
-    yes_or_no: bool = False
     closed_loop: str | None = None
 
 
 def _ends(name: str, meaning: str, of: Callable[[Episode], bool], world: World | None = None,
           closed_loop: str | None = None) -> Metric:  # fmt: skip
-    return Metric(name, meaning, episodes=of, world=world, yes_or_no=True, closed_loop=closed_loop)
+    return Metric(name, meaning, episodes=of, world=world, closed_loop=closed_loop)
 
 
 def _fails(*how: str) -> Callable[[Episode], bool]:
@@ -238,19 +238,26 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:
-    """Interval over seeds of a metric's values (S, E)."""
+    """Interval over seeds of a metric's values (S, E), for these episodes."""
+    if is_rate(name):
+        return in_range(name, seed_rate_interval(values))
     return in_range(name, seed_interval(known_mean(values, axis=1)))
 
 
 def over_episodes(name: str, values: Floats) -> Estimate:
     """Interval over episodes of a metric's values (S, E)."""
     each = known_mean(values, axis=0)
-    settled = each[~np.isnan(each)]
-    # Student's t would give 0 of 20 episodes an interval of no width.
-    yes_or_no = name in METRICS and METRICS[name].yes_or_no
-    if yes_or_no and np.isin(settled, (0.0, 1.0)).all():
-        return rate_interval(each)
-    return in_range(name, episode_interval(each))
+    return rate_interval(each) if is_rate(name) else in_range(name, episode_interval(each))
+
+
+def difference(name: str, a: Floats, b: Floats) -> Estimate:
+    """Interval over episodes of a metric's a - b, both (E, S)."""
+    return rate_difference(a, b) if is_rate(name) else episode_interval(a - b)
+
+
+def is_rate(name: str) -> bool:
+    """Whether a metric is a share of what happened: `effective_loss` is a probability that was computed."""
+    return name.endswith(("_rate", "_reply_loss"))
 
 
 def in_range(name: str, e: Estimate) -> Estimate:

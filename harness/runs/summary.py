@@ -7,7 +7,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from harness.core.arrays import Floats
-from harness.core.statistics import Estimate, episode_interval, rate_interval, seed_interval
+from harness.core.statistics import (
+    Estimate,
+    episode_interval,
+    rate_difference,
+    rate_interval,
+    seed_interval,
+    seed_rate_interval,
+)
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import (
     ALL,
@@ -35,18 +42,14 @@ ROLES: tuple[Role, ...] = ("ego", "helper", "merge")
 def scores(
     world: World, grid: Grid, decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
 ) -> list[Score]:
-    """Every metric of a run; `episodes` by place.
-
-    In the closed loop a seed may change what happens, so an episode's yes or no is a mean over seeds and its
-    interval Student's t, unless no seed changed any.
-    """
+    """Every metric of a run; `episodes` by place."""
     values = by_episode(metrics_of(world), grid, decisions, episodes)
     latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
     return [
         *of_conditions(grid.conditions, values),
         *of_latencies(grid, [latency_ms[places == n] for n in range(len(grid.conditions) * len(grid.seeds))]),
         *_gains(grid.conditions, values[SUCCESS]),
-        *_of_answers(answers),
+        *_of_answers(answers, decisions),
     ]
 
 
@@ -75,25 +78,35 @@ def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
     if BASELINE in conditions:
         for place, condition in enumerate(conditions):
             if condition != BASELINE:
-                gain = success[place] - success[conditions.index(BASELINE)]
-                name = GAIN + BASELINE
-                yield _score(condition, name, seed_interval(gain.mean(axis=1)), "seed means")
-                yield _score(condition, name, episode_interval(gain.mean(axis=0)), "episodes")
+                mine, other, name = success[place], success[conditions.index(BASELINE)], GAIN + BASELINE
+                yield _score(condition, name, seed_rate_interval(mine - other), "seed means")
+                yield _score(condition, name, rate_difference(mine.T, other.T), "episodes")
 
 
-def _of_answers(answers: Sequence[Answer]) -> Iterator[Score]:
-    """How answers were parsed, and how long they and their prompts are, by role."""
+def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Score]:
+    """How answers were parsed, and how long they and their prompts are, by role.
+
+    Intervals are over episodes, whose answers go together.
+    """
+    numbers = decisions.whole("episode")
+    episodes = {scene: numbers[rows.start] for scene, rows in decisions.scenes.items()}
     by_role = {role: [answer for answer in answers if answer.role == role] for role in ROLES}
     for role, given in by_role.items():
         for verdict in ("strict", "recovered", "failed"):
             if given:
                 hits = np.array([float(answer.verdict == verdict) for answer in given])
-                yield _score(ALL, f"{verdict}_rate_{role}", rate_interval(hits), "answers")
+                of = np.array([episodes[answer.scene] for answer in given])
+                yield _score(ALL, f"{verdict}_rate_{role}", rate_interval(hits, of), "answers")
     for role, given in by_role.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
-            counts = [value for answer in given if (value := getattr(answer, what)) is not None]
+            counts = [
+                (value, episodes[answer.scene])
+                for answer in given
+                if (value := getattr(answer, what)) is not None
+            ]
             if counts:
-                estimate = in_range(what, episode_interval(np.array(counts, dtype=float)))
+                values, of = np.array(counts, dtype=float).T
+                estimate = in_range(what, episode_interval(values, of.astype(int)))
                 yield _score(ALL, f"{what}_{role}", estimate, "answers")
 
 

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 
 from harness.core.errors import UserError
 from harness.core.files import write_whole
-from harness.core.statistics import episode_interval
+from harness.core.statistics import rate_difference
 from harness.report.library import picture
 from harness.report.page import environment
 from harness.runs.folder import read
@@ -111,7 +111,7 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
         estimates = {
             "frozen": over_episodes("success_rate", frozen),
             "closed": over_episodes("success_rate", closed),
-            "difference": episode_interval((frozen - closed).mean(axis=0)),
+            "difference": rate_difference(frozen.T, closed.T),
             "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
         }
         row = dict(zip((*WHO, "condition"), place, strict=True))

@@ -1,7 +1,7 @@
 """Whether frozen episodes rank the reference drivers as live driving on the same seeds does."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
@@ -10,7 +10,7 @@ import numpy as np
 from harness.core.arrays import Bools
 from harness.core.errors import UserError, printable
 from harness.core.parallel import spread
-from harness.core.statistics import Estimate, paired_difference, rate_interval
+from harness.core.statistics import Estimate, rate_difference, rate_interval
 from harness.dataset.build import settings
 from harness.dataset.load import Dataset
 from harness.evaluate.success import driver_choices, judge_choices, table
@@ -70,9 +70,11 @@ def ranks_agree(standings: dict[str, Standing]) -> bool:
 
 
 def _standing(frozen: Bools, live: Bools) -> Standing:
+    difference = rate_difference(frozen.astype(float), live.astype(float))
+    points = {end: 100 * getattr(difference, end) for end in ("value", "low", "high")}
     return Standing(
         rate_interval(frozen.astype(float)),
         rate_interval(live.astype(float)),
-        paired_difference(np.where(frozen, 100.0, 0.0), np.where(live, 100.0, 0.0)),
+        replace(difference, **points),
         rate_interval((frozen == live).astype(float)),
     )

@@ -27,7 +27,7 @@ def worse(runs: tuple[Path, Path]) -> tuple[Path, Path]:
 @pytest.mark.parametrize(
     ("gates", "failed"),
     [
-        (["success_rate < -0.25"], []),  # it is -0.25, and its interval ends at -1.05 and at +0.55
+        (["success_rate < -0.25"], []),  # it is -0.25, and its interval ends at -0.70 and at +0.28
         (["success_rate <= -0.25"], ["6g"]),
         (["success_rate < -0.01"], ["6g"]),
         (["success_rate<-0.01"], ["6g"]),
@@ -37,9 +37,13 @@ def worse(runs: tuple[Path, Path]) -> tuple[Path, Path]:
         (["late_rate > 0.2"], ["6g"]),
         (["late_rate >= 0.3"], []),
         (["success_rate.high < 0"], []),
-        (["success_rate.high < 0.6"], ["single-local", "6g"]),
-        (["6g:success_rate.low < -1"], ["6g"]),
-        (["success_rate.low < -1.1"], []),
+        (["success_rate.high < 0.3"], ["6g"]),
+        (["6g:success_rate.low < -0.6"], ["6g"]),
+        (["success_rate.low < -0.7"], []),
+        (
+            ["latency_proxy_ms.high >= 0"],
+            ["single-local", "6g"],
+        ),  # alike in all episodes: 0 stands for its ends
         (["latency_proxy_ms > 5", "late_rate > 0", "unsafe_rate > 0"], ["6g"]),
     ],
 )
@@ -144,7 +148,7 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     said = " ".join(out.split())
     for part in (
         "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
-        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-104.6, +54.6]",
+        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1]",
         "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1",
         "lost: 1 late", "answers: ego strict → failed: 24 of 24", "00000-0/v1, 00000-1/v1, 22 more",
         "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",

@@ -21,13 +21,13 @@ def test_the_best_is_marked_and_who_cannot_be_told_from_it():
     assert marks(best) == [""]  # nobody to be better than
 
 
-def test_where_seeds_differ_the_test_is_a_bootstrap_over_episodes():
+def test_where_seeds_differ_the_interval_over_episodes_decides():
     luck = np.random.default_rng(0)
     one = {(e, s): float(luck.random() < 0.9) for e in range(60) for s in range(3)}
     other = {(e, s): float(luck.random() < 0.5) for e in range(60) for s in range(3)}
     (first, _), (second, behind) = matrix._marks([one, other])
     assert (first, second) == (matrix.BEST, matrix.WORSE)
-    assert behind.test.method == "bootstrap"
+    assert behind.test.method == "interval"
     assert behind.difference < behind.test.high < 0
     assert behind.episodes == 60
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats
 from harness.core.paired import SuccessTest, success_test
-from harness.core.statistics import Estimate, known_mean, paired_difference
+from harness.core.statistics import Estimate, known_mean
 from harness.report.compare import percentiles
 from harness.report.compare.pair import Pair
-from harness.runs.metrics import SUCCESS, metrics_of
+from harness.runs.metrics import SUCCESS, difference, metrics_of
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Difference:
         metric: its name.
         a: mean of A over the episodes and seeds in which both know it; of a latency percentile, itself.
         b: mean of B over the same.
-        change: B - A, paired by episode and seed, with a 95 % interval over episodes: Student's t; of a
-            latency percentile, a bootstrap's.
+        change: B - A, paired by episode and seed, with a 95 % interval over episodes
+            (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
     """
 
     metric: str
@@ -160,7 +160,7 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
 def _difference(metric: str, a: Floats, b: Floats) -> Difference:
     unknown = np.isnan(a) | np.isnan(b)
     before, after = (float(known_mean(known_mean(np.where(unknown, np.nan, x), 1), 0)) for x in (a, b))
-    return Difference(metric, before, after, paired_difference(b, a))
+    return Difference(metric, before, after, difference(metric, b, a))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:

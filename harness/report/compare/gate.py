@@ -90,6 +90,8 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
         if gate.condition in (None, condition.condition):
             changes = [d.change for d in condition.differences if d.metric == gate.metric]
             value = float(getattr(changes[0], gate.end)) if changes else math.nan
+            if math.isnan(value) and changes and changes[0].n > 1:
+                value = changes[0].value  # all episodes changed alike, so that there is no interval
             if math.isnan(value):
                 # A gate that passes because nothing is known would guard nothing.
                 raise UserError(

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
-from harness.core.paired import RESAMPLES, RESAMPLING_SEED
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
@@ -77,8 +76,7 @@ def success(c: InCondition, pair: Pair) -> str:
     if c.test.p_value is not None:
         return f"{said}; McNemar's exact test over episodes p = {c.test.p_value:.3g}"
     ends = " to ".join(f"{100 * (end or 0.0):+.1f}" for end in (c.test.low, c.test.high))
-    how = f"bootstrap over episodes ({RESAMPLES} resamples, seed {RESAMPLING_SEED})"
-    return f"{said}; {how} {ends} points, 95 %"
+    return f"{said}; 95 % interval over episodes {ends} points"
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
