@@ -1,5 +1,6 @@
 """`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,16 +28,24 @@ def build(
     episodes: int = typer.Option(200, help="Episodes."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = 2,
+    lag: float | None = typer.Option(
+        None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
+    ),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
-    """Freeze episodes into a dataset. The same command again continues a build that was stopped."""
+    """Freeze every course of some layouts. The same command again continues a build that was stopped."""
     scenario = ready_to_drive(name, episodes, seed, workers)
+    if lag is not None:
+        period_s = scenario.parameters.decision_period_s
+        if not 0 <= lag < period_s:
+            raise UserError(f"--lag {lag}: give seconds from 0 to below {period_s:g}, the decision period")
+        scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
 
     with bar(f"freezing {name}", episodes) as progress:
         manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
     typer.echo(
-        f"wrote {printable(out)}: {manifest['episodes']} episodes, {manifest['decisions']} decision points"
+        f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points"
     )
 
 
@@ -49,14 +58,14 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
     if as_json:
-        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "decisions")}
+        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
         echo_json({**counts, "sha256": digest, "problems": problems})
     elif problems:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest.name} is sound: {manifest.episodes} episodes, {manifest.decisions} decision "
-            f"points, {len(manifest.files)} files\nmanifest sha256 {digest}"
+            f"{manifest.name} is sound: {manifest.episodes} layouts, {manifest.nodes} decision points\n"
+            f"manifest sha256 {digest}"
         )
     if problems:
         raise typer.Exit(1)

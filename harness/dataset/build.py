@@ -1,8 +1,7 @@
-"""`harness dataset build`: episodes into a folder, in any number of processes, and on after a kill.
+"""`harness dataset build`: layouts into a folder, in any number of processes, and on after a kill.
 
-Each finished episode is a file of its own under `.building/`; when all are there they become one
-`scenes.jsonl`. The bytes depend on the scenario, the seed, the number of episodes and the folder's name
-alone.
+Each finished layout is a file of its own under `.building/`; when all are there they become one `layouts.zip`.
+What is in it depends on the scenario, the seed, the number of episodes and the folder's name alone.
 """
 
 import json
@@ -14,15 +13,27 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import msgspec
 
 from harness import __version__
 from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.parallel import spread
-from harness.dataset.freeze import Behaviour, freeze
-from harness.dataset.schema import FILE_NAME, manifest_schema, record_schema, record_type
+from harness.dataset.forest import Forest
+from harness.dataset.freeze import freeze
+from harness.dataset.schema import (
+    FILE_NAME,
+    LAYOUTS,
+    Danger,
+    Tree,
+    manifest_schema,
+    record_schema,
+    record_type,
+    tree_schema,
+)
+from harness.dataset.verify import level_name, tree_name
 from harness.world.scenario import Scenario
 
 WORK = ".building"
@@ -49,7 +60,6 @@ def build(
     """
     config = {
         **settings(scenario),
-        "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
         "versions": {
@@ -68,19 +78,22 @@ def build(
     todo = sorted(set(range(episodes)) - set(done))
     spread(partial(_freeze_to_file, scenario, work, seed), todo, workers, progress)
 
-    shards = [(work / _shard(e)).read_bytes() for e in range(episodes)]
+    texts = _join(work, episodes, out / LAYOUTS)
+    trees = [msgspec.json.decode(text, type=Tree) for text in texts]
+    forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
     files = {
-        "README.md": _readme(out.absolute().name, config).encode(),
-        "scenes.jsonl": b"".join(shards),
+        "README.md": _readme(out.absolute().name, config, forest).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
+        "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
     }
     manifest = {
-        "format": "swarmdrive-dataset/1",
+        "format": "swarmdrive-dataset/2",
         "name": out.absolute().name,
         **config,
-        "decisions": sum(shard.count(b"\n") for shard in shards),
+        "nodes": sum(len(level) for tree in trees for level in tree.levels),
         "files": {name: sha256_bytes(data) for name, data in files.items()},
+        "trees_sha256": list(map(sha256_bytes, texts)),
     }
     for name, data in files.items():
         write_whole(out / name, data)
@@ -119,32 +132,72 @@ def _begin(out: Path, config: dict[str, Any]) -> Path:
     return work
 
 
-def _shard(episode: int) -> str:
-    return f"{episode:05d}.jsonl"
-
-
 def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> None:
-    records = freeze(scenario, seed + episode, episode, Behaviour())
-    lines = [canonical_json(record) + "\n" for record in records]
-    for line in lines:
+    levels, scenes = freeze(scenario, seed + episode, episode)
+    texts = ["".join(canonical_json(record) + "\n" for record in level).encode() for level in scenes]
+    for line in b"".join(texts).splitlines():
         msgspec.json.decode(line, type=record_type(scenario))  # a record that breaks its own form is a bug
-    write_whole(work / _shard(episode), "".join(lines))
+    danger = scenes[0][0]["danger"]
+    tree = Tree(
+        episode, seed + episode, Danger(danger["sector"], danger["vehicle"]), levels,
+        list(map(sha256_bytes, texts)),
+    )  # fmt: skip
+    with replacing(work / _shard(episode)) as part, ZipFile(part, "w") as file:
+        file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
+        for step, text in enumerate(texts):
+            file.writestr(_entry(level_name(episode, step)), text)
+
+
+def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
+    """One file of all layouts; returns their trees as they are in it."""
+    trees = []
+    with replacing(layouts) as part, ZipFile(part, "w") as file:
+        for episode in range(episodes):
+            with ZipFile(work / _shard(episode)) as shard:
+                for name in shard.namelist():
+                    file.writestr(_entry(name), shard.read(name))
+                trees.append(shard.read(tree_name(episode)))
+    return trees
+
+
+def _entry(name: str) -> ZipInfo:
+    entry = ZipInfo(name)  # of the year 1980: no clock in a dataset
+    entry.compress_type = ZIP_DEFLATED
+    return entry
+
+
+def _shard(episode: int) -> str:
+    return f"{episode:05d}.zip"
 
 
 def _pretty(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _readme(name: str, config: dict[str, Any]) -> str:
+def _readme(name: str, config: dict[str, Any], forest: Forest) -> str:
+    seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
+    drivers = "\n".join(
+        f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
+    )
+    parameters = config["parameters"]
     return f"""# {name}
 
-{config["episodes"]} episodes of `{config["scenario"]}`, seeds {config["seed"]} to \
-{config["seed"] + config["episodes"] - 1}, one record a decision point.
-Built by `harness dataset build {config["scenario"]} --episodes {config["episodes"]} --seed {config["seed"]}`.
+Every course of {seeds} layouts of `{config["scenario"]}`, seeds {config["seed"]} to \
+{config["seed"] + seeds - 1}: {nodes} decision points, {nodes / seeds:.0f} a layout.
+Built by `harness dataset build {config["scenario"]} --episodes {seeds} --seed {config["seed"]}`.
 
-- `scenes.jsonl`: one JSON object a line; fields and units in `scene.schema.json`.
-- `manifest.json`: scenario parameters, behaviour, versions, and the sha256 of every file.
+A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's.
 
-Each record holds the whole state, every viewer's scene graph, and an outcome table: each meta-action taken,
-followed by the full-view driver until the episode ends. `harness dataset check` verifies all of it.
+| who decides | success, % of {seeds} layouts |
+|---|---|
+| the best policy | {rate:.1f} |
+{drivers}
+
+- `layouts.zip`: of each layout `tree.json`, where each action leads and what the reference drivers do, and for
+  each level of the tree `<step>.jsonl`, a line a decision point, in the order of the tree. Each line holds
+  the whole state and every viewer's scene graph.
+- `tree.schema.json`, `scene.schema.json`: fields and units of both.
+- `manifest.json`: scenario parameters, versions, the sha256 of every file and tree; a tree pins its scenes.
+
+`harness dataset check` verifies all of it, `harness dataset rank` drives the reference drivers again.
 """

@@ -26,7 +26,8 @@ COLUMNS = {
     "action": LABEL, "messages": WHOLE, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
     "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
-    "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
+    "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
+    "acted": FLAG,
 }  # fmt: skip
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and the outcome of each action.

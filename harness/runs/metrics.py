@@ -46,7 +46,6 @@ class Metric:
         episodes: an episode's value; None for a metric of decisions.
         total: an episode has the sum over its decisions, not the mean.
         world: where it is known; None for everywhere.
-        closed_loop: what it means in the closed loop, where that differs.
     """
 
     name: str
@@ -55,12 +54,10 @@ class Metric:
     episodes: Callable[[Episode], Any] | None = None
     total: bool = False
     world: World | None = None
-    closed_loop: str | None = None
 
 
-def _ends(name: str, meaning: str, of: Callable[[Episode], bool], world: World | None = None,
-          closed_loop: str | None = None) -> Metric:  # fmt: skip
-    return Metric(name, meaning, episodes=of, world=world, closed_loop=closed_loop)
+def _ends(name: str, meaning: str, of: Callable[[Episode], bool]) -> Metric:
+    return Metric(name, meaning, episodes=of)
 
 
 def _fails(*how: str) -> Callable[[Episode], bool]:
@@ -78,33 +75,32 @@ def _column(name: str) -> Callable[[Columns], Floats]:
 METRICS = {
     metric.name: metric
     for metric in (
-        _ends(SUCCESS, "episodes with every decision safe, and their delays within the allowance",
-              _field("success"),
-              closed_loop="episodes in which the ego clears the intersection, no later than the allowance"),
-        _ends("unsafe_rate", "episodes with a decision that leads to a collision or a forced failure",
-              lambda e: not e.success and e.failure != "late",
-              closed_loop="episodes that end in a collision, by time-out or off the road"),
-        _ends("collision_rate", "episodes that end in a collision", _fails("collision"), "closed-loop"),
+        _ends(SUCCESS, "episodes in which the ego clears the intersection, no later than the allowance",
+              _field("success")),
+        _ends("unsafe_rate", "episodes that end in a collision, by time-out or off the road",
+              lambda e: not e.success and e.failure != "late"),
+        _ends("collision_rate", "episodes that end in a collision", _fails("collision")),
         _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
-              lambda e: e.fault == "ego", "closed-loop"),
-        _ends("late_rate", "episodes with all decisions safe, but delays beyond the allowance",
-              _fails("late"),
-              closed_loop="episodes cleared, but too long after the full-view driver, whose decisions act at "
-              "once"),
+              lambda e: e.fault == "ego"),
+        _ends("late_rate", "episodes cleared, but too long after the full-view driver", _fails("late")),
         _ends("time_out_rate", "episodes in which the ego does not clear the intersection in time",
-              _fails("time_out"), "closed-loop"),
-        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road"),
-              "closed-loop"),
+              _fails("time_out")),
+        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road")),
+        Metric("regret_rate", "decisions that gave success away, of those in which it was still possible",
+               _column("regret"), world="frozen"),
+        Metric("delay_s", "by which a decision that is safe puts off the earliest success",
+               _column("delay_s"), world="frozen"),
+        Metric("off_lag_rate", "decisions that would act in another frame than the dataset's lag",
+               _column("off_lag"), world="frozen"),
         Metric("time_to_clear_s", "until the ego has cleared the intersection, where it does, late or not",
-               episodes=lambda e: e.time_s if e.failure in ("", "late") else None, world="closed-loop"),
+               episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
         Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
-               episodes=_field("least_gap_m"), world="closed-loop"),
+               episodes=_field("least_gap_m")),
         Metric("hard_brakings_per_episode", "times the ego begins to brake harder than 4 m/s²",
-               episodes=_field("hard_brakings"), world="closed-loop"),
+               episodes=_field("hard_brakings")),
         Metric("other_crashes_per_episode", "vehicles that crash without the ego",
-               episodes=_field("other_crashes"), world="closed-loop"),
-        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions"),
-               world="closed-loop"),
+               episodes=_field("other_crashes")),
+        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions")),
         Metric("skipped_per_episode", "decisions not begun, since the one before was still open",
                episodes=_field("skipped"), world="closed-loop"),
         Metric("never_acted_per_episode", "decisions that were not ready before the episode ended",
@@ -148,14 +144,10 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
     return tuple(metric for metric in METRICS.values() if metric.world in (None, world))
 
 
-def meaning(name: str, world: World) -> str:
-    """A metric's meaning in a world; empty for a name that says it all."""
-    if name in DERIVED:
-        return DERIVED[name]
+def meaning(name: str) -> str:
+    """A metric's meaning; empty for a name that says it all."""
     metric = METRICS.get(name)
-    if metric is None:
-        return ""
-    return (world == "closed-loop" and metric.closed_loop) or metric.meaning
+    return metric.meaning if metric else DERIVED.get(name, "")
 
 
 @dataclass(frozen=True)

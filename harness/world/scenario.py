@@ -1,11 +1,19 @@
 """What a scenario provides. All other code takes one as an argument, and names none."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
+
+ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
+
+
+def frames(latency_s: float, simulation_hz: int) -> int:
+    """Whole frames that a decision takes."""
+    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
 @dataclass(frozen=True)
@@ -18,6 +26,8 @@ class Parameters:
         acceleration_mps2: hardest acceleration.
         decisions: decisions an episode.
         decision_period_s: seconds between two decisions.
+        decision_lag_s: seconds from seeing to acting, below the period, in decision trees and of reference
+            drivers: the paper's inference. Until then the ego keeps to its last action.
         simulation_hz: frames a second.
         time_limit_s: an ego that has not reached its goal by then never will.
         delay_allowance_s: how much later than the full-view driver an ego may reach its goal.
@@ -28,9 +38,20 @@ class Parameters:
     acceleration_mps2: float = 3.0
     decisions: int = 6
     decision_period_s: float = 1.0
+    decision_lag_s: float = 0.145
     simulation_hz: int = 50
     time_limit_s: float = 10.0
     delay_allowance_s: float = 1.0
+
+    @property
+    def lag_frames(self) -> int:
+        """`decision_lag_s` in whole frames."""
+        return frames(self.decision_lag_s, self.simulation_hz)
+
+    def due_frame(self, step: int) -> int:
+        """The frame in which a decision is due; after the last one, that of the time limit."""
+        due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
+        return round(due_s * self.simulation_hz)
 
 
 @dataclass(frozen=True)

@@ -105,16 +105,16 @@ class World:
         )  # fmt: skip
 
     def act(self, action: str) -> None:
-        """Take an action by name and simulate until the next decision is due.
+        """Decide for an action by name, which acts a lag later, and simulate until the next decision is due.
 
         After the scenario's last decision the action is held until the episode is decided.
         """
         p = self.scenario.parameters
-        self.take(action)
+        self.advance(p.due_frame(self.step) + p.lag_frames)
+        if not self.outcome.ended:
+            self.take(action)
         self.step += 1
-        last = self.step >= p.decisions
-        until_s = p.time_limit_s if last else self.step * p.decision_period_s
-        self.advance(round(until_s * p.simulation_hz))
+        self.advance(p.due_frame(self.step))
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
