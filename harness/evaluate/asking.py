@@ -27,11 +27,6 @@ from harness.world.perception.graph import truth_graph
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
-def request_count(spec: Spec, scenes: Sequence[Scene]) -> int:
-    """Number of requests for these scenes."""
-    return sum(len(spec.viewers(scene)) for scene in scenes)
-
-
 def most_tokens(spec: Spec, role: Role) -> int:
     """Most tokens that an answer may have, its thought included if the model thinks first."""
     answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
@@ -137,11 +132,12 @@ class Asker:
             kept: JSON Lines file of answers so far; may be torn at its end by a kill.
             answers: further answers that are there already, by request id.
             progress: called with the number of new answers, those kept from before included.
-            more: called with the number of fusion calls, once it is known.
+            more: called with the number of requests before they are made.
         """
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency = latency
+        self._given = frozenset(answers or {})
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
@@ -161,18 +157,23 @@ class Asker:
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN for one without a request, or whose answer failed."""
-        viewers = [(scene.id, self.spec.viewers(scene)) for scene in moments]
-        if any(f"{scene}/{viewer}" not in self.answers for scene, some in viewers for viewer in some):
-            self.ask(list(requests(self.spec, moments)))
-        answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
-        return self._laid_out(moments, answers)
+        if any(self.lacks(moments)):
+            self._owed(list(requests(self.spec, moments)))
+        return self.laid_out(moments)
+
+    def lacks(self, moments: Sequence[Scene]) -> list[bool]:
+        """Whether some viewer's answer is missing, of each."""
+        return [any(f"{s.id}/{v}" not in self.answers for v in self.spec.viewers(s)) for s in moments]
+
+    def laid_out(self, moments: Sequence[Scene]) -> Intents:
+        """The answers that are there as arrays; NaN for one that is not, or that failed."""
+        return self._laid_out(moments, [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments])
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages."""
         ids = [_fusion_id(*each) for each in _heard(moments, codes)]
         if not self.answers.keys() >= set(ids):
-            asked = self.fusion_requests(moments, codes)
-            self.ask_fusion([request for request in asked if request.id not in self.answers])
+            self._owed(self.fusion_requests(moments, codes))
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
@@ -186,11 +187,11 @@ class Asker:
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
         return asked
 
-    def ask_fusion(self, owed: Sequence[Request]) -> None:
-        """Make the fusion calls that are owed."""
-        if owed:
-            self._more(len(owed))
-            self.ask(owed)
+    def _owed(self, requests: Sequence[Request]) -> None:
+        # Those kept from before a kill are among them, so that chunks begin where they did.
+        asked = [request for request in requests if request.id not in self._given]
+        self._more(len(asked))
+        self.ask(asked)
 
     def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
         width, actions = max(map(len, answers)), len(self.spec.actions)

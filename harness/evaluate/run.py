@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend, Request
+from harness.backends.base import Backend
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
@@ -24,10 +24,10 @@ from harness.core.parallel import spread
 from harness.dataset.load import Scene
 from harness.evaluate import latency as latencies
 from harness.evaluate import timing
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.spec import Spec, versions
-from harness.evaluate.walk import heard_codes, table, walk
+from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.formats import CONFIG, FORMAT, WORK
@@ -69,7 +69,7 @@ def evaluate(
         progress: called with the number of new answers, or of episodes just driven, those kept from before
             included.
         cache: file of completions kept between runs, for language models; None for no cache.
-        more: called with the number of fusion calls on frozen scenes, once it is known.
+        more: called with the number of answers that are owed next, where scenes are frozen.
         workers: processes that drive, each with a backend of its own.
 
     Raises:
@@ -104,32 +104,15 @@ def _frozen(
     spec: Spec, source: FrozenSource, out: Path, progress: Callable[[int], None], cache: Path | None,
     more: Callable[[int], None],
 ) -> Evaluated:  # fmt: skip
-    scenes = source.dataset.scenes
+    dataset = source.dataset
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
-    latency = _latency(spec, out, backend, lambda: timing.spread_over(scenes))
+    latency = _latency(spec, out, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     with working(spec, out, backend.identity(), latency) as work:
         asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
-        asker.ask(list(requests(spec, scenes)))
-        if any(point.asks_again for point in spec.points):
-            asker.ask_fusion(_fusion_calls(spec, source, asker))
+        walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
-            walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
-        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), latency)
-
-
-def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Request]:
-    """All fusion calls of a run, scene by scene: what frozen scenes show depends on no decision.
-
-    They are made before the walk, so that they fill batches, whatever their steps.
-    """
-    world = FrozenWorld(source.dataset, spec.seeds)
-    asked: list[Request] = []
-    while scenes := world.observe():
-        codes = heard_codes({point: world.due(point) for point in spec.points}, asker(scenes))
-        asked += asker.fusion_requests(scenes, codes)
-    place = {scene.id: n for n, scene in enumerate(source.dataset.scenes)}
-    return sorted(asked, key=lambda request: place[request.id.partition("/")[0]])
+            return _written(spec, out, work, dataset.episodes, walked, backend.identity(), latency)
 
 
 def _closed_loop(
