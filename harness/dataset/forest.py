@@ -132,12 +132,12 @@ class Forest:
     @cached_property
     def safe(self) -> Bools:
         """Whether success is still possible after each action, (N, A)."""
-        return np.isfinite(self.earliest_s) & (self.earliest_s <= self.limit_s[self.tree][:, None])
+        return self._in_time(self.earliest_s, self.limit_s[self.tree][:, None])
 
     @cached_property
     def value(self) -> Bools:
         """Whether success is possible at each decision point, (N,): what the best policy reaches."""
-        return self.safe.any(axis=-1)
+        return np.asarray(self.safe.any(axis=-1))
 
     @cached_property
     def delay_s(self) -> Floats:
@@ -167,7 +167,11 @@ class Forest:
 
     def succeeds(self, edge: Ints, tree: Ints) -> Bools:
         """Whether ending at an edge (...) is a success in its tree (...)."""
-        return np.isfinite(self.cleared_s[edge]) & (self.cleared_s[edge] <= self.limit_s[tree])
+        return self._in_time(self.cleared_s[edge], self.limit_s[tree])
+
+    @staticmethod
+    def _in_time(goal_s: Floats, limit_s: Floats) -> Bools:
+        return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
         """How an episode that ends at this edge ends."""

@@ -71,7 +71,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 def scenario_of(manifest: Manifest) -> Scenario:
     """The scenario of a manifest, with the manifest's parameters."""
     scenario = scenarios.get(manifest.scenario)
-    values = {
+    values: Any = {
         name: tuple(value) if isinstance(value, list) else type(getattr(scenario.parameters, name))(value)
         for name, value in manifest.parameters.items()
     }

@@ -172,7 +172,8 @@ class FrozenWorld:
         seed, tree = place
         forest, last = self._forest, int(walks.last[place])
         end, reference_s = forest.end(last), float(forest.reference_s[tree])
-        cleared, success = end.result == "cleared", bool(forest.succeeds(last, tree))
+        cleared = end.result == "cleared"
+        success = bool(forest.succeeds(np.array(last), np.array(tree)))
         return Episode(
             condition=condition, seed=int(self._seeds[seed]), episode=int(forest.episodes[tree]),
             layout_seed=int(forest.seeds[tree]), danger=forest.dangers[tree] or "none", success=success,

@@ -88,7 +88,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class Walked:
-    """All that a walk decided, how its episodes ended, and the answers by request id."""
+    """All that a walk decided, rounded, how its episodes ended, and the answers by request id."""
 
     decisions: Decisions
     episodes: Sequence[Episode]
@@ -97,7 +97,8 @@ class Walked:
 
 def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
-    return Walked(table(decided, world.columns(), spec.actions), world.episodes(), asker.answers)
+    decisions = table(decided, world.columns(), spec.actions).rounded()
+    return Walked(decisions, world.episodes(), asker.answers)
 
 
 def _frozen(
@@ -152,7 +153,7 @@ def _driven(
         )
         world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
-        folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
+        folder.write_part(part, walked.decisions, walked.episodes, list(walked.answers.values()))
     return part
 
 
@@ -205,7 +206,7 @@ def _written(
         "engine_errors": sum(answer.error is not None for answer in answers),
         "versions": versions(),
     }, Manifest)  # fmt: skip
-    folder.write(out, manifest, walked.decisions.rounded(), episodes, answers, summary)
+    folder.write(out, manifest, walked.decisions, episodes, answers, summary)
     return Evaluated(out, manifest, summary)
 
 
