@@ -12,6 +12,7 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import torch
+from evaluating import scenes_of
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -67,7 +68,7 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late(few: Dataset) -> 
         {a: outcome("collision") for a in ACTIONS},
     ]
     scenes = tuple(
-        replace(s, record={**s.record, "outcomes": t}) for s, t in zip(few.scenes, tables, strict=False)
+        replace(s, record={**s.record, "outcomes": t}) for s, t in zip(scenes_of(few), tables, strict=False)
     )
     free, danger, lost = labels(replace(few, scenes=scenes))
     total = np.exp(-2.0) + 1.3
@@ -91,7 +92,7 @@ def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
 def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[float], bare: bool) -> None:
     intent = np.array(weights) / sum(weights)
     for prompt in VERSIONS:
-        for graph in few.scenes[2].record["graphs"].values():
+        for graph in scenes_of(few)[2].record["graphs"].values():
             text = answer(prompt, graph, intent, ACTIONS, bare=bare)
             said = parse(text, role=graph["role"], actions=ACTIONS)
             reasons_first = prompt.helper_answer == "recommendation" and not bare
@@ -104,7 +105,7 @@ def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[fl
 
 
 def test_a_helpers_evidence_keeps_to_twelve_words(few: Dataset) -> None:
-    for scene in few.scenes:
+    for scene in scenes_of(few):
         for graph in scene.record["graphs"].values():
             assert len(message(graph, np.array([0.2, 0.5, 0.3]), ACTIONS)["evidence"].split()) <= 12
 
@@ -265,7 +266,7 @@ def test_bad_input_writes_nothing(options: list[str], said: str, small_path: Pat
 
 def test_held_out_episodes_are_in_neither_half_twice(few: Dataset) -> None:
     kept, apart = split(few, 1)
-    assert len(kept.scenes) + len(apart.scenes) == len(few.scenes)
-    assert {s.record["episode"] for s in apart.scenes} == {2}
+    assert len(scenes_of(kept)) + len(scenes_of(apart)) == len(scenes_of(few))
+    assert {s.record["episode"] for s in scenes_of(apart)} == {2}
     assert shared(kept, apart) == 0
-    assert shared(kept, few) == len(kept.scenes)
+    assert shared(kept, few) == len(scenes_of(kept))

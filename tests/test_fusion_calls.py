@@ -21,6 +21,7 @@ from evaluating import (
     same_files,
     same_scores,
     says,
+    scenes_of,
     spec_of,
     sure,
 )
@@ -59,13 +60,13 @@ def clear(n: int, helpers: int = 3) -> Due:
 
 
 def first_scene(small: Dataset) -> Dataset:
-    return replace(small, scenes=small.scenes[:1])
+    return replace(small, scenes=scenes_of(small)[:1])
 
 
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:
     """v2 and v4 are heard, v3's reply is lost: two lines of messages, with intent, risk and evidence."""
     data = first_scene(small)
-    [scene] = data.scenes
+    [scene] = scenes_of(data)
     lines = {
         f"{scene.id}/v1": says((0.3, 0.4, 0.3)),
         f"{scene.id}/v2": says((0.8, 0.1, 0.1), "helper").replace("clear", "one comes fast"),
@@ -86,9 +87,9 @@ def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None
 
 
 def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset) -> None:
-    unsure = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
-    intents = asker_of(spec_of(small, LANGUAGE_MODEL, points=(FUSION,)), Scripted(unsure))(small.scenes)
-    n = len(small.scenes)
+    unsure = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)}
+    intents = asker_of(spec_of(small, LANGUAGE_MODEL, points=(FUSION,)), Scripted(unsure))(scenes_of(small))
+    n = len(scenes_of(small))
     all_cross = clear(n)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
     once = heard_codes({FUSION: all_cross}, intents)
@@ -102,7 +103,7 @@ def test_a_whole_run_makes_each_fusion_call_once(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Conditions and seeds that hear the same share a call, and the calls are announced together."""
-    backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes})
+    backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)})
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: backend)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
     spec = spec_of(small, LANGUAGE_MODEL, points=(FUSION, slow), latency="paper", seeds=(0, 1, 2))
@@ -130,7 +131,7 @@ def test_a_set_that_was_never_asked_about_is_no_guess() -> None:
 
 
 def test_its_answers_keep_their_place_and_a_failed_one_says_so(small: Dataset) -> None:
-    scenes = small.scenes[:6]
+    scenes = scenes_of(small)[:6]
     one, other = f"{scenes[1].id}/v1+v3", f"{scenes[4].id}/v1+v2+v3+v4"
     slow = Completion(other, "no idea", None, None, "stop", 9.0, 1, slow_s=0.4)
     asker = asker_of(spec_of(small, LANGUAGE_MODEL), Scripted({one: sure("SLOWER"), other: slow}), DECLARED)
@@ -265,7 +266,7 @@ def opens(backend: Scripted) -> Callable[..., Scripted]:
 
 
 def unsure(small: Dataset) -> dict[str, str | Completion]:
-    return {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
+    return {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)}
 
 
 def test_a_resumed_run_has_the_times_that_it_began_with(
@@ -277,7 +278,7 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
         def complete(self, requests: Sequence[Request]) -> list[Completion]:
             return [replace(c, seconds=len(self.asked) / 1000) for c in super().complete(requests)]
 
-    backend = Slower({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes})
+    backend = Slower({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)})
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: backend)
     monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
     spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="measured")

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 import vl_convert
+from harness.evaluate.success import reference_success
 
 from harness.core import kept
 from harness.dataset.load import Dataset
 from harness.evaluate import success
-from harness.evaluate.success import reference_success
 from harness.report import library
 from harness.world.drivers import DRIVERS
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from evaluating import scenes_of
 from packaged import install
 
 import harness
@@ -108,7 +109,7 @@ def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarr
 
 def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):
     assert frozen.config["identity"] == {"engine": "cautious", "version": 1}
-    graphs = {scene.record["scene"]: scene.record["graphs"] for scene in small.scenes}
+    graphs = {scene.record["scene"]: scene.record["graphs"] for scene in scenes_of(small)}
     answers = frozen.answers
     assert len(answers) == sum(map(len, graphs.values()))
     wary = np.array([bool(graphs[a.scene][a.viewer]["conflicts"]) for a in answers.itertuples()])
@@ -132,7 +133,7 @@ def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request
 def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, small: Dataset):
     """An answer takes 10 ms, its way 10 ms more; one crossing is lost with 1 % a metre."""
     range_m = {}
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         at = {
             vehicle["id"]: (vehicle["x_m"], vehicle["y_m"]) for vehicle in scene.record["state"]["vehicles"]
         }

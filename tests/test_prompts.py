@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evaluating import scenes_of
 from graphs import ACTIONS, CAR, CASES, MESSAGES, STANDING, TRUCK, graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -68,7 +69,7 @@ def test_action_names_are_the_ones_passed_in(version: str) -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 def test_nobody_is_named_who_is_not_in_the_viewers_graph(version: str, small: Dataset) -> None:
     prompt = prompts.load(version)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         present = {v.id for v in scene.state.vehicles}
         for viewer, seen in scene.record["graphs"].items():
             known = {viewer, seen["ego"]["id"], *(n["id"] for n in seen["nodes"])}
@@ -314,7 +315,7 @@ def test_every_prompt_keeps_its_token_budget(
     assert count is not None
     least, most = prompt.token_budget
     assert (least, most) == (200, 400)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         for viewer, seen in scene.record["graphs"].items():
             if messages and seen["role"] == "helper":
                 continue

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import decisions, figure, run, same_decisions, spec_of
+from evaluating import decisions, figure, run, same_decisions, scenes_of, spec_of
 from run_on_disk import answers_of
 from scipy.stats import binom
 
@@ -48,7 +48,7 @@ def questions(dataset: Dataset, form: str) -> list[Request]:
             view=graph,
             scenario=dataset.scenario,
         )
-        for scene in dataset.scenes
+        for scene in scenes_of(dataset)
         for viewer, graph in scene.record["graphs"].items()
     ]
 
@@ -130,7 +130,9 @@ def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Pa
     """Alone, an ego decides after 145 ms, or 545 ms where its answer was drawn slow."""
     run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     alone = decisions(tmp_path / "run", "single-local")
-    expected = [145.0 + 1000 * drawn(FAULTY, f"{scene.id}/v1")[1] for scene in small.scenes for _ in (0, 1)]
+    expected = [
+        145.0 + 1000 * drawn(FAULTY, f"{scene.id}/v1")[1] for scene in scenes_of(small) for _ in (0, 1)
+    ]
     found = [d.latency_ms for d in alone]
     assert found == pytest.approx(expected)
     assert set(found) == {145.0, 545.0}

@@ -11,7 +11,18 @@ from typing import Any
 import msgspec
 import pandas as pd
 import pytest
-from evaluating import FILES, decisions, figure, run, same_decisions, same_files, same_scores, spec_of
+from evaluating import (
+    FILES,
+    decisions,
+    figure,
+    run,
+    same_decisions,
+    same_files,
+    same_scores,
+    scenes_of,
+    spec_of,
+)
+from harness.evaluate.success import driver_choices
 from run_on_disk import answers_of, rows_of
 
 from harness.backends import cards
@@ -21,7 +32,6 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
-from harness.evaluate.success import driver_choices
 from harness.prompts import versions as prompts
 from harness.runs.records import Answer, FrozenScenes
 from harness.world.drivers import DRIVERS
@@ -156,9 +166,10 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
     said = refused(spec_of(small, f"replay:{tmp_path / 'three'}"), tmp_path / "out")
     assert said.endswith("holds no answer for 00003-0/v1; replay a run of the same dataset and limit")
     moved = replace(
-        small.scenes[0], record={**small.scenes[0].record, "graphs": small.scenes[1].record["graphs"]}
+        scenes_of(small)[0],
+        record={**scenes_of(small)[0].record, "graphs": scenes_of(small)[1].record["graphs"]},
     )
-    other = replace(small, scenes=(moved, *small.scenes[1:]))
+    other = replace(small, scenes=(moved, *scenes_of(small)[1:]))
     assert "another prompt or dataset" in refused(spec_of(other, f"replay:{proxy_run}"), tmp_path / "out")
 
 
@@ -345,7 +356,7 @@ def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
             assert [d.action for d in made] == chosen
             assert all((d.messages, d.latency_ms) == ((), 0.0) for d in made)
         assert figure(done, condition, "messages_per_episode").value == 0
-    assert [a.id for a in answers_of(tmp_path / "run")] == [f"{scene.id}/v1" for scene in small.scenes]
+    assert [a.id for a in answers_of(tmp_path / "run")] == [f"{scene.id}/v1" for scene in scenes_of(small)]
     for metric in ("success_rate", "brier", "entropy_nats"):
         assert len({figure(done, condition, metric).value for condition in ALL}) == 1
     assert figure(done, "6g", "success_gain_over_single-local").value == 0

@@ -14,6 +14,7 @@ from evaluating import (
     failed,
     figure,
     says,
+    scenes_of,
     spec_of,
     sure,
     walked,
@@ -121,8 +122,8 @@ def test_messages_triggers_and_loss_by_hand(told: Walked) -> None:
 
 def test_latency_by_hand(told: Walked, played: Dataset) -> None:
     """100 ms everywhere; three V2X replies add 25 ms each, and their bits at 10 Mbit/s."""
-    intents = asker_of(spec_of(played), Scripted(SAID))(played.scenes)
-    asked = [s.id for s in played.scenes].index("00001-0")
+    intents = asker_of(spec_of(played), Scripted(SAID))(scenes_of(played))
+    asked = [s.id for s in scenes_of(played)].index("00001-0")
     consulted = 100 + 3 * 25 + intents.payload_bits[asked].sum() / 10e6 * 1000
     assert value(told, "single-local", "latency_proxy_ms")[0] == pytest.approx(100)
     for condition in ("clear", "deaf"):  # a lost reply is waited for all the same
@@ -177,8 +178,8 @@ def test_the_episodes_table_says_how_each_ended(played: Dataset) -> None:
 
 def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: Dataset) -> None:
     """Paper Eq. 1 and 2: closeness 1/d, the sum of all is one; alone the ego has it all."""
-    at = [s.id for s in played.scenes].index("00001-0")
-    distance = played.scenes[at].record["distance_m"]
+    at = [s.id for s in scenes_of(played)].index("00001-0")
+    distance = scenes_of(played)[at].record["distance_m"]
     closeness = np.array([1 / max(distance[v], 1.0) for v in ("v1", "v2", "v3", "v4")])
     w = closeness / closeness.sum()
     expected = [w[0] * 0.3 + 1 - w[0], w[0] * 0.4, w[0] * 0.3]
@@ -193,8 +194,8 @@ def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: 
 def test_intervals_of_what_hangs_on_the_seed(small: Dataset) -> None:
     lossy = OperatingPoint("lossy", "6g", loss=0.4, tau_nats=0.0)
     seeds = (0, 1, 2, 3, 4)
-    lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in small.scenes}
-    lines |= {f"{s.id}/v{n}": sure("SLOWER", "helper") for s in small.scenes for n in (2, 3, 4)}
+    lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in scenes_of(small)}
+    lines |= {f"{s.id}/v{n}": sure("SLOWER", "helper") for s in scenes_of(small) for n in (2, 3, 4)}
     told = walked(spec_of(small, points=(lossy,), seeds=seeds), Scripted(lines))
     by_seed = [np.mean([e.success for e in told.episodes if e.seed == seed]) for seed in seeds]
     assert len(set(by_seed)) > 1, "seeds that all agree would not show the interval"
@@ -229,7 +230,7 @@ def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:
     """Uniform over three actions: ln 3 = 1.099 nats, above the threshold of 0.7."""
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
     lines = {**SAID, "00000-0/v1": "no idea", "00001-0/v1": ""}
-    told, intents = walked(spec, Scripted(lines)), asker_of(spec, Scripted(lines))(played.scenes)
+    told, intents = walked(spec, Scripted(lines)), asker_of(spec, Scripted(lines))(scenes_of(played))
     failing = [0, 2]
     assert np.isnan(intents.own[failing]).all()
     assert told.result(CLEAR, "own_failed") == [i in failing for i in range(7)]
@@ -263,7 +264,7 @@ def test_a_helper_whose_answer_failed_sends_nothing(
 ) -> None:
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
     backend = Scripted({**SAID, "00001-0/v3": line})
-    told, intents = walked(spec, backend), asker_of(spec, backend)(played.scenes)
+    told, intents = walked(spec, backend), asker_of(spec, backend)(scenes_of(played))
     assert intents.valid[2].tolist() == [True, False, True]
     assert told.result(CLEAR, "asked")[2].tolist() == [True, False, True]
     [v3] = [a for a in told.answers if a.id == "00001-0/v3"]
@@ -275,7 +276,7 @@ def test_a_helper_whose_answer_failed_sends_nothing(
 
 def test_every_answer_takes_what_is_declared_for_its_role(small: Dataset) -> None:
     """Whatever it took; one that its proxy makes slower takes that on top, and who was not asked no time."""
-    asked = {r.role: r for r in requests(spec_of(small), small.scenes[:1])}
+    asked = {r.role: r for r in requests(spec_of(small), scenes_of(small)[:1])}
 
     def took(role: Role, seconds: float | None, slow_s: float = 0.0, error: str | None = None) -> Answer:
         said = Completion(

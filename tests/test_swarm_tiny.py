@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import decisions, figure, run, spec_of
+from evaluating import decisions, figure, run, scenes_of, spec_of
 from run_on_disk import answers_of
 
 from harness.core.resources import DATASET
@@ -40,7 +40,7 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
     no action crashes."""
     hidden, clear = [], []
     said = decisions(done.out, "single-local")[::5]  # one seed: nothing of it depends on luck
-    for scene, decision in zip(shipped.scenes, said, strict=True):
+    for scene, decision in zip(scenes_of(shipped), said, strict=True):
         graph = scene.record["graphs"][scene.state.ego.id]
         crashes = [o["result"] == "collision" for o in scene.record["outcomes"].values()]
         seen = scene.record["danger"]["vehicle"] in {node["id"] for node in graph["nodes"]}

@@ -70,7 +70,8 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     """Make a run: its manifest says nothing but payload n, its answers and decisions say all in turn."""
     mine, said, dangers = PAYLOADS[n], Attacker(n), {}
     world = FrozenScenes(
-        name=mine, sha256=dataset.sha256, scenes=3, episodes=3, limit=None, delay_allowance_s=1.0,
+        name=mine, sha256=dataset.sha256, nodes=3, episodes=3, limit=None, delay_allowance_s=1.0,
+        decision_lag_s=0.145,
         path=str(dataset.path),
     )  # fmt: skip
     made_up(

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import typer
-from evaluating import spec_of
+from evaluating import scenes_of, spec_of
 from msgspec import structs
 from reading import Page, details, packed
 from run_on_disk import answers_of, change, configure, rows_of
@@ -89,7 +89,7 @@ def messages_in(row):
 
 def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, dataset):
     every = by_scene(run)
-    assert list(opened) == list(every) == [scene.id for scene in dataset.scenes]
+    assert list(opened) == list(every) == [scene.id for scene in scenes_of(dataset)]
     for scene, (rows, answers) in every.items():
         detail = opened[scene]
         [found] = detail["runs"]
@@ -155,7 +155,7 @@ def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, 
     said = {"label_mass": 0.25, "retries": 2, "cached": True}
 
     def as_read_out(answer):
-        scene = next(scene for scene in dataset.scenes if scene.id == answer.scene)
+        scene = next(scene for scene in scenes_of(dataset) if scene.id == answer.scene)
         shown = V2.render(scene.record["graphs"][answer.viewer], dataset.actions)
         return structs.replace(answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said)
 
@@ -253,7 +253,7 @@ def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
 
 
 def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset):
-    [request] = list(requests(spec_of(dataset), dataset.scenes[:1]))[:1]
+    [request] = list(requests(spec_of(dataset), scenes_of(dataset)[:1]))[:1]
     answer = answer_of(request, Completion(request.id, "I\ud800", None, None, "stop", None, 1))
     assert answer.raw == "I?"
 
