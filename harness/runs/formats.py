@@ -1,8 +1,6 @@
 """Names that a run's folder is known by."""
 
-FORMAT = "swarmdrive-run/3"
-READ_BY = {  # older formats, and the version for them
-    "swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1", "swarmdrive-run/2": "0.2",
-}  # fmt: skip
+FORMAT = "swarmdrive-run/2"
+READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}  # older formats, and the version for them
 WORK = ".work"  # what a kill leaves
 CONFIG = "config.json"  # the settings that a run began with; its work counts only once this is there
