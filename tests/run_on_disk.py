@@ -21,8 +21,14 @@ Row = dict[str, Any]
 Change = Callable[[Row], object]
 
 _FROZEN = FrozenScenes(
-    name="made-up", sha256="0" * 64, nodes=0, episodes=0, limit=None, delay_allowance_s=1.0,
-        decision_lag_s=0.145, path="nowhere"
+    name="made-up",
+    sha256="0" * 64,
+    nodes=0,
+    episodes=0,
+    limit=None,
+    delay_allowance_s=1.0,
+    decision_lag_s=0.145,
+    path="nowhere",
 )
 _DRIVEN = ClosedLoop(scenario={"name": "made-up"}, first_seed=0, episodes=0, late_against="nobody")
 

@@ -44,9 +44,7 @@ def build(
 
     with bar(f"freezing {name}", episodes) as progress:
         manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
-    typer.echo(
-        f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points"
-    )
+    typer.echo(f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points")
 
 
 @app.command()

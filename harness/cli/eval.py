@@ -118,8 +118,10 @@ def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: b
         echo_json({**spec.settings(), "requests": asked, "prompt_tokens": stats or None})
     if as_json or quiet:
         return
-    typer.echo(f"{asked} requests for the {len(scenes)} scenes on the reference drivers' courses; would "
-               f"score {len(spec.points)} conditions × {len(spec.seeds)} seeds; no model was called")  # fmt: skip
+    typer.echo(
+        f"{asked} requests for the {len(scenes)} scenes on the reference drivers' courses; would score "
+        f"{len(spec.points)} conditions × {len(spec.seeds)} seeds; no model was called"
+    )
     for role, s in stats.items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
     if not stats:

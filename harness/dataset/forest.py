@@ -143,9 +143,7 @@ class Forest:
     def delay_s(self) -> Floats:
         """Seconds by which a safe action puts off the earliest success, (N, A); NaN where it is not safe."""
         with np.errstate(invalid="ignore"):
-            return np.where(
-                self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan
-            )
+            return np.where(self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan)
 
     def last_edge(self, chosen: Ints) -> Ints:
         """The edge at which each episode ends, (E,), if action `chosen` (N,) is taken at each point."""

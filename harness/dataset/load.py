@@ -12,7 +12,7 @@ from zipfile import ZipFile
 import msgspec
 import numpy as np
 
-from harness.core.errors import unknown
+from harness.core.errors import UserError, unknown
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
@@ -23,8 +23,8 @@ from harness.dataset.verify import (
     decoded,
     file_problems,
     opened,
-    read_manifest,
     read_level,
+    read_manifest,
     read_tree,
     scenario_of,
     unusable,

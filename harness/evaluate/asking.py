@@ -167,7 +167,8 @@ class Asker:
 
     def laid_out(self, moments: Sequence[Scene]) -> Intents:
         """The answers that are there as arrays; NaN for one that is not, or that failed."""
-        return self._laid_out(moments, [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments])
+        answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
+        return self._laid_out(moments, answers)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages."""

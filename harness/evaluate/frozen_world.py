@@ -81,9 +81,7 @@ class FrozenWorld:
     A decision acts the dataset's lag after its moment, however long it took.
     """
 
-    def __init__(
-        self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]
-    ) -> None:
+    def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
         self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
         self._columns: list[dict[str, Any]] = []

@@ -53,7 +53,7 @@ class LiveSource:
         parameters = asdict(self.scenario.parameters)
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
-            episodes=self.episodes, late_against="full-view driver, whose decisions act after the scenario's lag",
+            episodes=self.episodes, late_against="full-view driver, whose decisions act after decision_lag_s",
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:

@@ -33,7 +33,7 @@ class Standing:
 
 
 def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
-    """Each driver's standing over the dataset's episodes; every one of them is driven again in closed loop."""
+    """Each driver's standing over the dataset's episodes, every one of which is driven again."""
     seeds = [tree.episode_seed for tree in dataset.trees]
     live = spread(partial(drive_all, dataset.scenario), seeds, workers, progress)
     return {

@@ -157,8 +157,7 @@ class Stored:
         if now != stored:
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
-                f"{shown}: the model is not what it was "
-                f"({printable(', '.join(other))}); run again"
+                f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"
             )
         return cached(backend, spec.card, default_file())
 
