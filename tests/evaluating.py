@@ -177,8 +177,8 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
            driver: str = "cruise") -> Dataset:  # fmt: skip
     """Trees with one branch: whatever is decided leads to the next scene of a driver's course.
 
-    Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and action, has
-    how it fails; at the last step it ends as they say, by default cleared after 5 s.
+    Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and action,
+    has how it fails; at the last step it ends as they say, by default cleared after 5 s.
 
     Args:
         dataset: whose scenes are taken.

@@ -1,7 +1,8 @@
 """`harness dataset build`: layouts into a folder, in any number of processes, and on after a kill.
 
 Each finished layout is a file of its own under `.building/`; when all are there they become one
-`layouts.zip`. What is in it depends on the scenario, the seed, the number of episodes and the folder's name alone.
+`layouts.zip`. What is in it depends on the scenario, the seed, the number of episodes and the folder's name
+alone.
 """
 
 import json
@@ -194,8 +195,8 @@ A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, e
 {drivers}
 
 - `layouts.zip`: of each layout `tree.json`, where each action leads and what the reference drivers do, and
-  for each level of the tree `<step>.jsonl`, a line a decision point, in the order of the tree. Each line holds
-  the whole state and every viewer's scene graph.
+  for each level of the tree `<step>.jsonl`, a line a decision point, in the order of the tree. Each line
+  holds the whole state and every viewer's scene graph.
 - `tree.schema.json`, `scene.schema.json`: fields and units of both.
 - `manifest.json`: scenario parameters, versions, the sha256 of every file and tree; a tree pins its scenes.
 

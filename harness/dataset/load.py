@@ -180,12 +180,6 @@ def argument(path: Path) -> str:
     return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
 
 
-def shared(one: Dataset, other: Dataset) -> int:
-    """How many episodes of one are in the other too: of the same layout seed."""
-    seeds = {tree.episode_seed for tree in other.trees}
-    return sum(tree.episode_seed in seeds for tree in one.trees)
-
-
 def released_digests() -> set[str]:
     """Digests of the manifests of released datasets, `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"

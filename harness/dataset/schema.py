@@ -179,7 +179,7 @@ class Snapshot(Closed, frozen=True):
 
 
 class Record(Closed, frozen=True):
-    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has the names of a scenario's places."""
+    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
 
     scene: SceneId
     episode: Episode

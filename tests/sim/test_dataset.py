@@ -265,11 +265,10 @@ def test_an_archive_cut_off_is_refused(copy):
         load(copy)
 
 
-def test_a_member_that_is_missing_encrypted_or_a_bomb_is_refused(copy):
+def test_a_member_that_is_missing_is_found_and_refused(copy):
     rewrite(copy, "00001/2.jsonl", lambda data: None)
-    assert check(copy) == [
-        "layouts.zip 00001/2.jsonl: cannot be read (\"There is no item named '00001/2.jsonl' in the archive\")"
-    ]
+    [problem] = check(copy)
+    assert problem.startswith("layouts.zip 00001/2.jsonl: cannot be read (")
     with pytest.raises(UserError, match="There is no item"):
         use(copy)
 

@@ -30,7 +30,7 @@ def forest(*levels: list[Branching], allowance_s: float = 1.0) -> Forest:
 
 @pytest.fixture
 def two_steps() -> Forest:
-    """Going clears at 4 s; stopping first, then going, at 4.6 s; stopping twice at 5.2 s, going late crashes."""
+    """Going clears at 4 s; stopping first, then going, at 4.6 s; stopping twice at 5.2 s."""
     return forest(
         [point("start", GO, leads(STOP, 0), leads(GO, 1))],
         [
