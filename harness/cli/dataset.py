@@ -1,5 +1,6 @@
 """`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +32,7 @@ def build(
     lag: float | None = typer.Option(
         None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
     ),
+    audit: bool = typer.Option(True, help="Audit 100 layouts or more for tells, on the dataset's card."),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
     """Freeze every course of some layouts. The same command again continues a build that was stopped."""
@@ -42,9 +44,13 @@ def build(
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
 
+    begun_s = time.monotonic()
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
-    typer.echo(f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points")
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit)
+    typer.echo(
+        f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "
+        f"{time.monotonic() - begun_s:.0f} s"
+    )
 
 
 @app.command()

@@ -22,6 +22,7 @@ from harness import __version__
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.parallel import spread
+from harness.core.seeds import purpose, stated
 from harness.dataset.forest import Forest
 from harness.dataset.freeze import freeze
 from harness.dataset.schema import (
@@ -35,14 +36,18 @@ from harness.dataset.schema import (
     tree_schema,
 )
 from harness.dataset.verify import level_name, tree_name
+from harness.world.audit import Audit, audit, ready
+from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
 WORK = ".building"
+LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
 
 def build(
-    scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None]
-) -> dict[str, Any]:
+    scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None],
+    audits: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """Build a dataset in `out`.
 
     Args:
@@ -52,17 +57,23 @@ def build(
         seed: first layout seed.
         workers: processes.
         progress: called with the number of episodes just finished.
+        audits: whether the layouts are audited for tells, from `LEAST_AUDITED` on.
 
     Returns:
         The manifest.
 
     Raises:
-        UserError: the folder holds a finished dataset, or one begun with other settings, or something else.
+        UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
+            the seeds are for several purposes; or the audit needs a package that is missing.
     """
+    audits = audits and episodes >= LEAST_AUDITED
+    if audits:
+        ready()
     config = {
         **settings(scenario),
         "episodes": episodes,
         "seed": seed,
+        "purpose": purpose(seed, episodes),
         "versions": {
             "harness": __version__,
             **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
@@ -82,8 +93,9 @@ def build(
     texts = _join(work, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
+    found = audit(scenario, episodes, seed, lambda done: None, workers) if audits else None
     files = {
-        "README.md": _readme(out.absolute().name, config, forest).encode(),
+        "README.md": _readme(out.absolute().name, config, forest, found).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
         "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
@@ -143,10 +155,21 @@ def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> 
         episode, seed + episode, Danger(danger["sector"], danger["vehicle"]), levels,
         list(map(sha256_bytes, texts)),
     )  # fmt: skip
+    _check(scenario, tree)
     with replacing(work / _shard(episode)) as part, ZipFile(part, "w") as file:
         file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
         for step, text in enumerate(texts):
             file.writestr(_entry(level_name(episode, step)), text)
+
+
+def _check(scenario: Scenario, tree: Tree) -> None:
+    """Drive the layout: a tree in which a reference driver ends otherwise is a bug."""
+    forest = Forest.of([tree], scenario.actions, scenario.parameters.delay_allowance_s)
+    for driver, outcome in drive_all(scenario, tree.episode_seed).items():
+        end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))
+        walked = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
+        if walked != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
+            raise RuntimeError(f"layout {tree.episode_seed}: {driver} drives to {outcome}, walks to {end}")
 
 
 def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
@@ -175,19 +198,30 @@ def _pretty(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _readme(name: str, config: dict[str, Any], forest: Forest) -> str:
+def _readme(name: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
         f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
     )
     parameters = config["parameters"]
+    told = "Not audited for tells."
+    if found:
+        auc = found.auc["danger"]
+        told = (
+            "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
+            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness scenario audit`, n = {auc.n} "
+            "layouts; .50 is a guess)."
+        )
     return f"""# {name}
 
-Every course of {seeds} layouts of `{config["scenario"]}`, seeds {config["seed"]} to \
-{config["seed"] + seeds - 1}: {nodes} decision points, {nodes / seeds:.0f} a layout.
+Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:
+{nodes} decision points, {nodes / seeds:.0f} a layout.
 Built by `harness dataset build {config["scenario"]} --episodes {seeds} --seed {config["seed"]}`.
 
-A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's.
+A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
+built every reference driver drove every layout in closed loop too, and ended as in the trees.
+
+{told}
 
 | who decides | success, % of {seeds} layouts |
 |---|---|

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, field
 
+from harness.core.seeds import Purpose
 from harness.world.scenario import Scenario
 from harness.world.state import Kind, Part, indicator
 
@@ -260,6 +261,7 @@ class Manifest(Closed, frozen=True):
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
     nodes: Annotated[int, Meta(ge=1, le=10_000_000)]
     seed: Annotated[int, Meta(ge=0, le=LAST_SEED)]
+    purpose: Purpose
     versions: dict[str, Text]
     files: dict[FileName, Sha256]
     trees_sha256: list[Sha256]
