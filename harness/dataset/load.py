@@ -2,7 +2,7 @@
 
 import os
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -74,8 +74,12 @@ class Dataset:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What was frozen."""
-        return scenarios.get(self.manifest.scenario)
+        """What was frozen, with the manifest's parameters."""
+        scenario = scenarios.get(self.manifest.scenario)
+        usual = scenario.parameters
+        given = {name: type(getattr(usual, name))(value) for name, value in self.manifest.parameters.items()}
+        # In a dataset from before beacons everybody knew the truth.
+        return replace(scenario, parameters=replace(usual, **{"perfect_knowledge": True, **given}))
 
     @property
     def actions(self) -> tuple[str, ...]:

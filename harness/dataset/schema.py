@@ -58,6 +58,20 @@ class Building(Closed, frozen=True):
     south_m: Number
 
 
+class Beacon(Closed, frozen=True):
+    """`harness.world.state.Beacon` in a file."""
+
+    sender: VehicleId
+    time_s: Number
+    arrives_s: Number
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
+    target_speed_mps: Number | None
+    heard_by: list[VehicleId]
+
+
 class State(Closed, frozen=True):
     """`harness.world.state.WorldState` in a file."""
 
@@ -68,6 +82,7 @@ class State(Closed, frozen=True):
     target_speed_mps: Number
     vehicles: Annotated[list[Vehicle], Meta(min_length=1)]
     buildings: list[Building]
+    beacons: list[Beacon] = []
 
 
 class Viewer(Closed, frozen=True):
@@ -87,6 +102,7 @@ class Ego(Closed, frozen=True):
     zone_m: Number
     forward_m: Number
     left_m: Number
+    age_s: Number = 0.0
 
 
 class Node(Closed, frozen=True):
@@ -210,6 +226,7 @@ class Record(Closed, frozen=True):
     distance_m: dict[VehicleId, Number]
     outcomes: dict[str, Outcome]
     snapshot: Snapshot
+    range_m: dict[VehicleId, Number] = {}
 
 
 class Manifest(Closed, frozen=True):
@@ -219,7 +236,7 @@ class Manifest(Closed, frozen=True):
     name: FileName
     scenario: Text
     actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
-    parameters: dict[str, Number | list[Number]]
+    parameters: dict[str, bool | Number | list[Number]]
     behaviour: dict[str, Number]
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
     decisions: Annotated[int, Meta(ge=1, le=1_000_000)]

@@ -12,7 +12,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_bytes, sha256_file
 from harness.dataset.schema import Manifest, Record, record_type
 from harness.world import scenarios
-from harness.world.scenario import Scenario
+from harness.world.scenario import BEACON_DIALS, Scenario
 
 _MANIFEST = msgspec.json.Decoder(Manifest)
 _JSON = msgspec.json.Decoder()
@@ -57,7 +57,9 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             yield f"[parameters]: {unknown('parameter', name, expected)}"
         elif isinstance(value, list) != isinstance(expected[name], tuple):
             yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
-    if missing := expected.keys() - manifest.parameters.keys():
+    # A dataset from before beacons does not declare them: everybody knew the truth.
+    known = set() if "perfect_knowledge" in manifest.parameters else {*BEACON_DIALS}
+    if missing := expected.keys() - manifest.parameters.keys() - known:
         yield f"[parameters] has no {', '.join(sorted(missing))}"
 
 
@@ -160,6 +162,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest) -> li
         "a conflict is on a path that does not cross the ego's": {(c.sector, c.route) for c in conflicts}
         <= scenario.road().crossings.keys(),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
+        "ranges are not those of the helpers": record.range_m.keys() in (set(), viewers - {ids[0]}),
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
         "sections are not one a vehicle": len(record.snapshot.sections) == len(ids),
     }

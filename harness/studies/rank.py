@@ -11,7 +11,6 @@ from harness.core.arrays import Bools
 from harness.core.errors import UserError, printable
 from harness.core.parallel import spread
 from harness.core.statistics import Estimate, paired_difference, rate_interval
-from harness.dataset.build import settings
 from harness.dataset.load import Dataset
 from harness.evaluate.success import driver_choices, judge_choices, table
 from harness.world.drivers import DRIVERS
@@ -39,15 +38,14 @@ def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dic
     """Each driver's standing over the dataset's episodes; every one of them is driven again in closed loop.
 
     Raises:
-        UserError: the dataset was built from another scenario than the one that would be driven.
+        UserError: the dataset was built with other actions than the scenario has.
     """
     scenario = dataset.scenario
-    for what, here in settings(scenario).items():
-        if getattr(dataset.manifest, what) != here:
-            raise UserError(
-                f"dataset {printable(dataset.path)} was built with other {what} than are driven here; "
-                "build it again to compare"
-            )
+    if dataset.actions != scenario.actions:
+        raise UserError(
+            f"dataset {printable(dataset.path)} was built with other actions than are driven here; "
+            "build it again to compare"
+        )
     seeds = {s.record["episode"]: s.record["episode_seed"] for s in dataset.scenes}
     live = spread(partial(drive_all, scenario), seeds.values(), workers, progress)
     return {
