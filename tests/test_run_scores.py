@@ -31,7 +31,8 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
 from harness.runs.folder import csv_text
-from harness.runs.records import Answer, Latency, Score, Variant
+from harness.runs.metrics import METRICS, of_decisions
+from harness.runs.records import Answer, Episode, Latency, Score, Variant
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
@@ -124,12 +125,29 @@ def test_latency_by_hand(told: Walked, played: Dataset) -> None:
     """100 ms everywhere; three V2X replies add 25 ms each, and their bits at 10 Mbit/s."""
     intents = asker_of(spec_of(played), Scripted(SAID))(scenes_of(played))
     asked = [s.id for s in scenes_of(played)].index("00001-0")
-    consulted = 100 + 3 * 25 + intents.payload_bits[asked].sum() / 10e6 * 1000
+    consulted = 100 + (400 / 10e6) * 1000 + 3 * 25 + intents.payload_bits[asked].sum() / 10e6 * 1000
     assert value(told, "single-local", "latency_proxy_ms")[0] == pytest.approx(100)
     for condition in ("clear", "deaf"):  # a lost reply is waited for all the same
         found = value(told, condition, "latency_proxy_ms")[0]
         assert found == pytest.approx((100 + (consulted + 100) / 2 + 100 + 100) / 4)
     assert value(told, "clear", "deadline_miss_rate")[0] == 0
+
+
+def test_the_channels_cost_by_hand(told: Walked, played: Dataset) -> None:
+    """One request of 400 bits and three replies in one of four episodes, lost or not, at 10 Mbit/s."""
+    intents = asker_of(spec_of(played), Scripted(SAID))(played.scenes)
+    bits = 400 + intents.payload_bits[[s.id for s in played.scenes].index("00001-0")].sum()
+    for condition in ("clear", "deaf"):
+        assert value(told, condition, "requests_per_episode")[0] == 1 / 4
+        assert value(told, condition, "bits_per_episode")[0] == pytest.approx(bits / 4)
+        assert value(told, condition, "airtime_ms")[0] == pytest.approx(bits / 10e6 * 1000 / 4, abs=1e-6)
+    assert value(told, "single-local", "bits_per_episode") == (0.0, 4, 0)
+
+
+def test_a_total_with_an_unknown_part_is_unknown() -> None:
+    airtime_ms = {"airtime_ms": np.array([0.5, 0.25, 1.0, np.nan])}
+    totals = of_decisions(METRICS["airtime_ms"], airtime_ms, np.array([0, 0, 1, 1]), 3)
+    assert totals == pytest.approx([0.75, np.nan, 0.0], nan_ok=True)
 
 
 def test_percentiles_are_over_all_decisions(told: Walked) -> None:

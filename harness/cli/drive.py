@@ -71,10 +71,11 @@ def command(
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     options.in_range("--save-video", save_video, 0, episodes)
     names = POINTS if condition in (None, [], [ALL]) else condition
+    scenarios.get(scenario)
     spec = Spec(
         card=cards.resolve(model, engine),
         prompt=versions.load(prompt),
-        source=LiveSource(first_seed, episodes, scenarios.get(scenario).name),
+        source=LiveSource(first_seed, episodes, scenario),
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),
         thinking=thinking,

@@ -13,6 +13,7 @@ import numpy as np
 
 from harness.core.files import digest
 from harness.dataset.schema import Branching, Edge, End
+from harness.world.beacons import known
 from harness.world.drivers import DRIVERS, choose
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph, truth_graph
@@ -88,8 +89,12 @@ def scene_id(episode: int, state: WorldState) -> str:
 
 
 def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
-    """What is there at a decision point, and what the viewers see of it; the ego is the first of them."""
-    zone = world.scenario.road().zone_m
+    """What is there at a decision point, and what the viewers see of it; the ego is the first of them.
+
+    Distances to the conflict zone and to the ego are those that the ego knows.
+    """
+    zone, ego = world.scenario.road().zone_m, viewers[0]
+    taken = {v.id: known(state, v.id, ego.id) for v in viewers}
     return {
         "scene": scene_id(episode, state),
         "episode": episode,
@@ -98,5 +103,10 @@ def moment(world: World, state: WorldState, episode: int, viewers: Sequence[Vehi
         "danger": {"sector": world.layout.danger, "vehicle": world.layout.danger_id},
         "state": state.to_dict(),
         "graphs": {v.id: scene_graph(world.scenario, state, v.id) for v in viewers},
-        "distance_m": {v.id: round(float(np.hypot(v.x_m - zone[0], v.y_m - zone[1])), 3) for v in viewers},
+        "distance_m": {id_: _apart_m(v, *zone) for id_, v in taken.items()},
+        "range_m": {id_: _apart_m(v, ego.x_m, ego.y_m) for id_, v in taken.items() if id_ != ego.id},
     }
+
+
+def _apart_m(v: VehicleState, x_m: float, y_m: float) -> float:
+    return round(float(np.hypot(v.x_m - x_m, v.y_m - y_m)), 3)

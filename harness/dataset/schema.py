@@ -61,6 +61,20 @@ class Building(Closed, frozen=True):
     south_m: Number
 
 
+class Beacon(Closed, frozen=True):
+    """`harness.world.state.Beacon` in a file."""
+
+    sender: VehicleId
+    time_s: Number
+    arrives_s: Number
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
+    target_speed_mps: Number | None
+    heard_by: list[VehicleId]
+
+
 class State(Closed, frozen=True):
     """`harness.world.state.WorldState` in a file."""
 
@@ -71,6 +85,7 @@ class State(Closed, frozen=True):
     target_speed_mps: Number
     vehicles: Annotated[list[Vehicle], Meta(min_length=1)]
     buildings: list[Building]
+    beacons: list[Beacon]
 
 
 class Viewer(Closed, frozen=True):
@@ -90,6 +105,7 @@ class Ego(Closed, frozen=True):
     zone_m: Number
     forward_m: Number
     left_m: Number
+    age_s: Number
 
 
 class Node(Closed, frozen=True):
@@ -191,6 +207,7 @@ class Record(Closed, frozen=True):
     state: State
     graphs: dict[VehicleId, Graph]
     distance_m: dict[VehicleId, Number]
+    range_m: dict[VehicleId, Number]
     snapshot: Snapshot
 
 
@@ -257,7 +274,7 @@ class Manifest(Closed, frozen=True):
     name: FileName
     scenario: Text
     actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
-    parameters: dict[str, Number | list[Number]]
+    parameters: dict[str, bool | Number | list[Number]]
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
     nodes: Annotated[int, Meta(ge=1, le=10_000_000)]
     seed: Annotated[int, Meta(ge=0, le=LAST_SEED)]

@@ -273,6 +273,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "a conflict is on a path that does not cross the ego's": {(c.sector, c.route) for c in conflicts}
         <= scenario.road().crossings.keys(),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
+        "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
         "sections are not one a vehicle": len(record.snapshot.sections) == len(ids),
     }

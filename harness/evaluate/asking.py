@@ -201,14 +201,12 @@ class Asker:
         bits = np.zeros((len(moments), width - 1))
         for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
             at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
-            ego_x_m, ego_y_m = at[scene.viewers[0]]
             for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
                 distance[i, j] = scene.record["distance_m"][viewer]
                 if answer and answer.intent is not None:
                     p[i, j] = answer.intent
                 if j:
-                    x_m, y_m = at[viewer]
-                    reach[i, j - 1] = np.hypot(x_m - ego_x_m, y_m - ego_y_m)
+                    reach[i, j - 1] = scene.record["range_m"][viewer]
                     bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
             row += [None] * (width - len(row))
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)

@@ -169,7 +169,9 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
     c, point = decided.result, decided.point
     anybody = c.on_time.any(axis=-1)
     return {
-        "messages": c.messages, "triggered": c.triggered, "own_failed": c.own_failed,
+        "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
+        "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
+        "own_failed": c.own_failed,
         "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
         "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
         "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),

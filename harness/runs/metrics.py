@@ -107,6 +107,12 @@ METRICS = {
                episodes=_field("never_acted"), world="closed-loop"),
         Metric("messages_per_episode", "replies scheduled; the request is none", _column("messages"),
                total=True),
+        Metric("requests_per_episode", "requests broadcast, one for all helpers that are asked together",
+               _column("requests"), total=True),
+        Metric("bits_per_episode", "requests and scheduled replies together",
+               lambda d: d["request_bits"] + d["reply_bits"], total=True),
+        Metric("airtime_ms", "how long an episode's requests and scheduled replies occupy the medium in all",
+               _column("airtime_ms"), total=True),
         Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
                "included", _column("latency_ms")),
         Metric("deadline_miss_rate", "decisions that took longer than the decision window",
@@ -213,7 +219,10 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
     """A metric of n episodes, (n,), from their decisions, each at its episode's place."""
     assert metric.decisions
     values = np.asarray(metric.decisions(decisions), dtype=float)
-    return sum_by_place(values, places, n) if metric.total else mean_by_place(values, places, n)
+    if not metric.total:
+        return mean_by_place(values, places, n)
+    unknown = sum_by_place(np.isnan(values), places, n)
+    return np.where(unknown > 0, np.nan, sum_by_place(values, places, n))
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
@@ -272,7 +281,8 @@ def unit(name: str) -> tuple[float, str, int]:
     if "_rate" in name or name.endswith("_loss"):
         return 100.0, " %", 1
     endings: Mapping[str, tuple[str, int]] = {
-        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1), "_per_episode": ("", 2),
+        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1),
+        "bits_per_episode": (" bit", 0), "_per_episode": ("", 2),
     }  # fmt: skip
     for ending, (suffix, digits) in endings.items():
         if name.endswith(ending):

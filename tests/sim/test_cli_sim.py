@@ -90,14 +90,14 @@ def test_a_damaged_dataset_is_told_line_by_line_with_exit_code_1(harness, small_
     assert (code, json.loads(out)["problems"]) == (1, lines)
 
 
-def test_ranking_refuses_a_dataset_of_other_parameters(harness, small_folder, tmp_path):
+def test_ranking_refuses_a_dataset_of_other_actions(harness, small_folder, tmp_path):
     other = shutil.copytree(small_folder, tmp_path / "other")
     manifest = json.loads((other / "manifest.json").read_text())
-    manifest["parameters"]["time_limit_s"] = 11.0
+    manifest["actions"].reverse()
     (other / "manifest.json").write_text(json.dumps(manifest))
     code, out, err = harness("dataset", "rank", other)
     assert (code, out) == (2, "")
-    assert "was built with other parameters than are driven here" in err
+    assert "was built with other actions than are driven here" in err
 
 
 @pytest.mark.parametrize(
