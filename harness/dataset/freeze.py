@@ -51,8 +51,8 @@ def _edges(world: World, episode: int, following: dict[str, World]) -> Iterator[
     for action in world.actions:
         index = waiting.speed_index if waiting.outcome.ended else waiting.speed_index_after(action)
         by_target.setdefault(index, []).append(action)
-    for actions in by_target.values():
-        branch = waiting.branch()
+    for left, actions in zip(reversed(range(len(by_target))), by_target.values(), strict=True):
+        branch = waiting.branch() if left else waiting
         branch.act(actions[0])
         outcome, end, to = branch.outcome, None, None
         if outcome.ended:
