@@ -56,7 +56,7 @@ NOT_RUN = {
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
-    "harness dataset rank occluded-intersection-v1 --json": "long; docs/datasets.md ranks a small one",
+    "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {
     "make": "CI runs it",

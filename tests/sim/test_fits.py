@@ -30,7 +30,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [p for key, inner in pairs for p in ((*path, key), *places(inner, (*path, key)))]
 
 
-RELEASED = find("occluded-intersection-v1")
+RELEASED = find("occluded-intersection-v2")
 TYPES = Draft202012Validator.TYPE_CHECKER.redefine("integer", lambda _, value: type(value) is int)
 WholeNumbers: Any = extend(Draft202012Validator, type_checker=TYPES)  # to which 1.0 is no integer
 
