@@ -218,6 +218,5 @@ def _ends(run: Run) -> Any:
     if run.world == "closed-loop":
         letters = {"": GOOD, "late": SLOW}
         return np.array([letters.get(e.failure, BAD) for e in run.episodes])[run.grid.places(d)]
-    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
     safe = np.where(np.nan_to_num(d["delay_s"]) > 0, SLOW, GOOD)
-    return np.where(avoidable, np.where(d.flags("safe"), safe, BAD), BLAMELESS)
+    return np.where(d.flags("value"), np.where(d.flags("safe"), safe, BAD), BLAMELESS)
