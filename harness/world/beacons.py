@@ -20,14 +20,15 @@ the beacon, so no condition, no seed of the channel and no order of asking chang
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 
 from harness.core import noise
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Floats
 from harness.world.scenario import Parameters
 from harness.world.state import Beacon, VehicleState, WorldState
 
@@ -85,33 +86,49 @@ def broadcast(
     """
     if p.perfect_knowledge:
         return ()
-    end = first_frame + len(poses)
-    beacons = []
+    time_s = (first_frame + len(poses) - 1) / p.simulation_hz
+    kept: list[Beacon] = []
     for place, sender in enumerate(radios):
-        beacons += [b for b in before if b.sender == sender]
         receivers = tuple(radios[:1] if place else radios[1:])
-        phase, errors, lost = _draws(p, seed, sender, receivers)
-        every = p.simulation_hz / p.beacon_hz  # frames
-        number = max(0, int((first_frame + _lead_frames(p)) / every - phase) - 1)
-        while (frame := math.floor((number + phase) * every) - _lead_frames(p)) < end:
-            if frame >= first_frame:
-                x, y, heading, speed = (poses[frame - first_frame, place] + errors[number]).tolist()
-                hearing = tuple(r for r, gone in zip(receivers, lost[number], strict=True) if not gone)
-                time_s = frame / p.simulation_hz
-                beacons.append(Beacon(
-                    sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
-                    max(round(speed, 2), 0.0), None if place else target_mps, hearing,
-                ))  # fmt: skip
-            number += 1
-    return _that_matter(beacons, (end - 1) / p.simulation_hz)
+        target = None if place else target_mps
+        newest_first = chain(
+            _sent(p, seed, sender, receivers, target, poses[:, place], first_frame),
+            reversed([b for b in before if b.sender == sender]),
+        )
+        kept += reversed(_that_matter(newest_first, {*receivers}, time_s))
+    return tuple(kept)
 
 
-def _that_matter(beacons: Sequence[Beacon], time_s: float) -> tuple[Beacon, ...]:
-    """The last that each receiver has, and those under way; each sender's in order of time."""
-    last = {(b.sender, r): b for b in beacons if _is_there(b, time_s) for r in b.heard_by}
-    return tuple(
-        b for b in beacons if any(not _is_there(b, time_s) or last[b.sender, r] is b for r in b.heard_by)
-    )
+def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: float) -> list[Beacon]:
+    """Of one sender's beacons those under way, and the last that each receiver has."""
+    kept = []
+    for beacon in newest_first:
+        if not receivers:
+            break
+        if not receivers.isdisjoint(beacon.heard_by):
+            kept.append(beacon)
+        if _is_there(beacon, time_s):
+            receivers = receivers.difference(beacon.heard_by)
+    return kept
+
+
+def _sent(
+    p: Parameters, seed: int, sender: str, receivers: tuple[str, ...], target_mps: float | None,
+    poses: Floats, first_frame: int,
+) -> Iterator[Beacon]:  # fmt: skip
+    """What one vehicle, whose poses these are, (F, 4), broadcasts in these frames, the last first."""
+    phase, errors, heard_by = _draws(p, seed, sender, receivers)
+    every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
+    number = math.ceil((first_frame + len(poses) + lead) / every - phase)
+    while number >= 0 and (frame := math.floor((number + phase) * every) - lead) >= first_frame:
+        if frame < first_frame + len(poses):
+            x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
+            time_s = frame / p.simulation_hz
+            yield Beacon(
+                sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
+                max(round(speed, 2), 0.0), target_mps, heard_by[number],
+            )  # fmt: skip
+        number -= 1
 
 
 def _is_there(beacon: Beacon, time_s: float) -> bool:
@@ -123,18 +140,17 @@ def _lead_frames(p: Parameters) -> int:
 
 
 @lru_cache(maxsize=1024)
-def _draws(p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]) -> tuple[float, Floats, Bools]:
-    """When a sender begins, as a share of its period; its errors (n, 4); who loses which beacon (n, R)."""
-    n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 1
+def _draws(
+    p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]
+) -> tuple[float, Floats, list[tuple[str, ...]]]:
+    """When a sender begins, as a share of its period; its errors, (n, 4); whom each beacon gets through to."""
+    n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
     own = noise.generator("beacons", seed, sender)
     phase = float(own.random())
-    errors = own.standard_normal((n, 4)) * [
-        p.beacon_noise_m,
-        p.beacon_noise_m,
-        p.beacon_noise_rad,
-        p.beacon_noise_mps,
+    sizes = [p.beacon_noise_m, p.beacon_noise_m, p.beacon_noise_rad, p.beacon_noise_mps]
+    errors = own.standard_normal((n, 4)) * sizes
+    draws = {receiver: noise.uniforms((n,), "beacons", seed, sender, receiver) for receiver in receivers}
+    heard_by = [
+        tuple(r for r in receivers if number == 0 or draws[r][number] >= p.beacon_loss) for number in range(n)
     ]
-    lost = np.zeros((n, len(receivers)), dtype=bool)
-    for place, receiver in enumerate(receivers):
-        lost[1:, place] = noise.uniforms((n,), "beacons", seed, sender, receiver)[1:] < p.beacon_loss
-    return phase, errors, lost
+    return phase, errors, heard_by

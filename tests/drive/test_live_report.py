@@ -102,7 +102,8 @@ def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
     assert telling
     for scene, seed in telling.items():
         rows = moments[scene]
-        assert not all(map(fails, rows))
+        of_layout = [e.success for e in found.episodes if e.episode == rows[0]["episode"]]
+        assert not all(map(fails, rows)) or not any(of_layout)
         assert any(fails(row) and row["seed"] == seed for row in rows)
         later = list(moments.values())[list(moments).index(scene) + 1 :]
         for others in (rows for rows in later if rows[0]["episode"] == moments[scene][0]["episode"]):
