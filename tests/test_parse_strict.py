@@ -81,9 +81,7 @@ PROSE = st.text(st.characters(exclude_characters="{｛<＜[&\\`~", exclude_categ
 
 @unhurried
 @given(PROSE.map(lambda prose: f"So: {prose}\n"), ANSWERS, ROLES)
-def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(
-    reasons: str, value: Any, role: str
-) -> None:
+def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, value: Any, role: str) -> None:
     """Nothing, whatever they say and whatever stands behind them; unasked they are one more repair at most."""
     text = json.dumps(value)
     bare = parse(text, role=role, actions=ACTIONS)

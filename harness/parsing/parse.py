@@ -152,9 +152,7 @@ def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     return None if answer.repairs else answer
 
 
-def _recovered(
-    text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool
-) -> Answer:
+def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
     # A narrow space between a number and its unit is good typography in prose, and none of JSON's.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)

@@ -84,6 +84,7 @@ def render(
         headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
         lines=lines,
         grids=matrix.grids(lines),
+        uneven=matrix.uneven(runs),
         summaries=[contents.summary(run) for run in runs.runs],
         answers=contents.answers(runs),
         charts=charts,
@@ -140,7 +141,7 @@ def environment(*more: Path) -> Environment:
         finalize=visible,
     )
     templates.filters |= {
-        "number": words.number, "facts": words.facts, "shown": words.shown,
+        "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
         "latency_source": words.latency_source, "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
     return templates

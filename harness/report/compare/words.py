@@ -4,22 +4,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
+from harness.core.multiplicity import LEVEL
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
+from harness.report.words import p_value
 from harness.runs.metrics import unit
 
 
 @dataclass(frozen=True)
 class Line:
-    """A difference as text: the metric with its unit, both means, B - A and its interval."""
+    """A difference as text: the metric with its unit, both means, B - A, its interval and Holm's p."""
 
     metric: str
     a: str
     b: str
     change: str
     interval: str
+    p: str
 
 
 def line(d: Difference) -> Line:
@@ -34,6 +37,7 @@ def line(d: Difference) -> Line:
     return Line(
         f"{d.metric}{' %' if suffix == ' %' else ''}", f"{d.a * factor:.{digits}f}",
         f"{d.b * factor:.{digits}f}", signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
+        "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
     )  # fmt: skip
 
 
@@ -75,10 +79,21 @@ def success(c: InCondition, pair: Pair) -> str:
     if c.test is None:
         return said
     if c.test.p_value is not None:
-        return f"{said}; McNemar's exact test over episodes p = {c.test.p_value:.3g}"
+        return f"{said}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
     ends = " to ".join(f"{100 * (end or 0.0):+.1f}" for end in (c.test.low, c.test.high))
     how = f"bootstrap over episodes ({RESAMPLES} resamples, seed {RESAMPLING_SEED})"
     return f"{said}; {how} {ends} points, 95 %"
+
+
+def many(comparison: Comparison) -> str:
+    """How many differences were tested, how p counts that, and how many hold."""
+    p_values = [p for c in comparison.conditions for d in c.differences if (p := d.p_corrected) is not None]
+    held = sum(p <= LEVEL for p in p_values)
+    return (
+        f"p is corrected by Holm's method for the {len(p_values)} differences shown: one or more of them is "
+        f"below {LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the "
+        "tests of success and gates are of one difference each, not corrected"
+    )
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
