@@ -18,6 +18,7 @@ from harness.core.files import write_whole
 from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
 from harness.report import contents, library, matrix, words
+from harness.report.caveats import caveats
 from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, ground_of
@@ -81,6 +82,11 @@ def render(
         runs=runs,
         title=runs.names[0] if len(runs.names) == 1 else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
+        caveats=[
+            f"{name}: {caveat}" if len(runs.names) > 1 else caveat
+            for name, run in zip(runs.names, runs.runs, strict=True)
+            for caveat in caveats(run.manifest, run.scores)
+        ],
         headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
         lines=lines,
         grids=matrix.grids(lines),

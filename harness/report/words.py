@@ -59,8 +59,8 @@ def headline(run: Run) -> str:
 
 
 def _p_value(gain: Score) -> float:
-    ends = (math.nan if x is None else x for x in (gain.value, gain.low, gain.high))
-    p_value = p_of_interval(*ends, gain.n)
+    value, low, high = (math.nan if x is None else x for x in (gain.value, gain.low, gain.high))
+    p_value = p_of_interval(value, low, high, gain.n)
     return 1.0 if p_value is None else p_value
 
 

@@ -173,9 +173,7 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
 
 
-def test_no_p_is_printed_as_zero_and_json_keeps_the_number(
-    runs: tuple[Path, Path], harness: Harness
-) -> None:
+def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Path], harness: Harness) -> None:
     """B takes 50 ms more in even episodes and 50.01 in odd ones: certain, also among some thirty."""
 
     def slower(row: Row) -> None:

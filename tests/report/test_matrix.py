@@ -55,7 +55,7 @@ def test_a_run_of_easier_episodes_alone_is_not_the_best():
 
 
 def test_where_each_run_is_behind_another_none_is_the_best():
-    """First beats second on 40 episodes; the third, of 4, beats the first there and is beaten by the second."""
+    """The first beats the second on 40 episodes; the third, of 4, beats the first and loses to the second."""
     first = [0.0, 0.0, 1.0, 0.0] + [1.0] * 36
     second = [1.0, 1.0, 1.0, 1.0] + [0.0] * 36
     third = [1.0, 1.0, 1.0, 0.0]
@@ -118,7 +118,8 @@ def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
     runs = gather(paths)
     assert matrix.uneven(gather([run])) is None
     assert matrix.uneven(runs).startswith("The runs have not the same episodes × seeds (")
-    assert "4 × 3" in matrix.uneven(runs) and "2 × 3" in matrix.uneven(runs)
+    assert "4 × 3" in matrix.uneven(runs)
+    assert "2 × 3" in matrix.uneven(runs)
     page = render(runs)
     assert "on 2 shared" in page
     assert escape(matrix.uneven(runs)) in page

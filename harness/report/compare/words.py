@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
+from harness.report.caveats import caveats
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
@@ -50,6 +51,15 @@ def who(side: Side) -> str:
 def sides(pair: Pair) -> list[tuple[str, str]]:
     """`A` and `B`, each with its folder and who answered."""
     return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+
+
+def told_before(pair: Pair) -> list[str]:
+    """What must be said of a run before its numbers, with the run's letter."""
+    return [
+        f"{name}: {caveat}"
+        for name, side in (("A", pair.a), ("B", pair.b))
+        for caveat in caveats(side.run.manifest, side.run.scores)
+    ]
 
 
 def paired(pair: Pair) -> str:
