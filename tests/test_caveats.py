@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.run import Evaluated
-from harness.report.caveats import caveats
+from harness.report.caveats import caveats, no_prompt
 from harness.runs.records import Manifest, Score
 
 Said = tuple[int, str, str]
@@ -67,6 +67,19 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
 @pytest.mark.parametrize("engine", ["proxy", "driver"])
 def test_a_rule_reads_no_prompt_and_says_so(done: Evaluated, engine: str) -> None:
     assert caveats(with_engine(done, engine), done.scores) == [NO_PROMPT]
+
+
+def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
+    def under(prompt: str, model: str = "proxy") -> Manifest:
+        manifest = done.manifest
+        names = {"model": {**manifest.model, "name": model}, "prompt": {**manifest.prompt, "version": prompt}}
+        return replace(manifest, **names)
+
+    assert no_prompt([under("v1"), under("v2")]) == [NO_PROMPT.replace("v2", "v1 or v2")]
+    assert no_prompt([under("v2", "cruise"), under("v2", "brake"), done.manifest]) == [
+        "cruise, brake and proxy read no prompt: they decide by the scene graph, whatever v2 says."
+    ]
+    assert no_prompt([with_engine(done, "llama-cpp"), done.manifest]) == [NO_PROMPT]
 
 
 def test_an_engine_that_is_not_here_is_not_judged(done: Evaluated) -> None:

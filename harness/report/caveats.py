@@ -1,6 +1,6 @@
 """What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from harness.backends.registry import find
 from harness.core.errors import printable
@@ -17,11 +17,12 @@ _FAILED = {
 
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
-    """Sentences for a run's headline; none for a language model that is understood."""
-    return [*_unread(scores), *_no_prompt(manifest)]
+    """Sentences for a run's headline; none for a language model whose answers could be read."""
+    return [*unread(scores), *no_prompt([manifest])]
 
 
-def _unread(scores: Sequence[Score]) -> Iterator[str]:
+def unread(scores: Sequence[Score]) -> Iterator[str]:
+    """Whose answers could not be read, half of them or more, and what takes their place."""
     failed = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, instead) in _FAILED.items():
         score = failed.get(f"failed_rate_{role}")
@@ -30,11 +31,17 @@ def _unread(scores: Sequence[Score]) -> Iterator[str]:
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
 
 
-def _no_prompt(manifest: Manifest) -> Iterator[str]:
-    engine = find(str(manifest.model.get("engine")))
-    if engine is not None and not engine.capabilities.language_model:
-        name, version = manifest.variant.model, manifest.variant.prompt
-        yield (
-            f"{printable(name, 30)} reads no prompt: it decides by the scene graph, "
-            f"whatever {printable(version, 20)} says."
-        )
+def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
+    """One sentence about the runs whose model reads no prompt; empty where there are none."""
+    rules = [
+        manifest.variant for manifest in manifests
+        if (engine := find(str(manifest.model.get("engine")))) and not engine.capabilities.language_model
+    ]  # fmt: skip
+    models = list(dict.fromkeys(printable(rule.model, 30) for rule in rules))
+    versions = " or ".join(dict.fromkeys(printable(rule.prompt, 20) for rule in rules))
+    if not models:
+        return []
+    if len(models) == 1:
+        return [f"{models[0]} reads no prompt: it decides by the scene graph, whatever {versions} says."]
+    names = f"{', '.join(models[:-1])} and {models[-1]}"
+    return [f"{names} read no prompt: they decide by the scene graph, whatever {versions} says."]

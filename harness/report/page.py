@@ -17,8 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
-from harness.report import contents, library, matrix, words
-from harness.report.caveats import caveats
+from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, ground_of
@@ -82,11 +81,12 @@ def render(
         runs=runs,
         title=runs.names[0] if len(runs.names) == 1 else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
-        caveats=[
-            f"{name}: {caveat}" if len(runs.names) > 1 else caveat
+        unread=[
+            f"{name}: {said}" if len(runs.names) > 1 else said
             for name, run in zip(runs.names, runs.runs, strict=True)
-            for caveat in caveats(run.manifest, run.scores)
+            for said in caveats.unread(run.scores)
         ],
+        no_prompt=caveats.no_prompt(run.manifest for run in runs.runs),
         headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
         lines=lines,
         grids=matrix.grids(lines),

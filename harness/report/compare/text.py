@@ -28,7 +28,7 @@ def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
     pair = comparison.pair
     yield from (f"{name}: {side}" for name, side in words.sides(pair))
-    yield from words.told_before(pair)
+    yield from words.caveats(pair)
     yield f"paired: {words.paired(pair)}"
     yield words.differing(comparison)
     yield from (f"  {setting}" for setting in words.settings(comparison))
@@ -58,7 +58,7 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]
     said += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
     said += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
-    said += [f"- {code(caveat)}" for caveat in words.told_before(pair)]
+    said += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
     said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
@@ -94,7 +94,7 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
     return {
         "a": {"run": str(pair.a.run.path), "settings": dict(pair.a.settings)},
         "b": {"run": str(pair.b.run.path), "settings": dict(pair.b.settings)},
-        "caveats": words.told_before(pair),
+        "caveats": words.caveats(pair),
         "scenes": pair.a.on,
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
 from harness.core.paired import RESAMPLES, RESAMPLING_SEED
-from harness.report.caveats import caveats
+from harness.report.caveats import no_prompt, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
@@ -53,12 +53,12 @@ def sides(pair: Pair) -> list[tuple[str, str]]:
     return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
 
 
-def told_before(pair: Pair) -> list[str]:
-    """What must be said of a run before its numbers, with the run's letter."""
+def caveats(pair: Pair) -> list[str]:
+    """What must be said of the runs before their numbers, with the run's letter where it is of one."""
+    sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        f"{name}: {caveat}"
-        for name, side in (("A", pair.a), ("B", pair.b))
-        for caveat in caveats(side.run.manifest, side.run.scores)
+        *(f"{name}: {said}" for name, run in sides for said in unread(run.scores)),
+        *no_prompt(run.manifest for _, run in sides),
     ]
 
 
