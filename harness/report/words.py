@@ -1,8 +1,10 @@
 """Numbers and findings in the words of the report."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from harness.core.multiplicity import LEVEL, holm, p_of_interval
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
 from harness.runs.records import Latency, Score, Times
@@ -47,11 +49,24 @@ def headline(run: Run) -> str:
     if base == best:
         return text + (", and no other condition does better." if len(scores) > 1 else ".")
     text += f"; {base} {_clears(scores[base])}"
-    gain = run.score(best, GAIN + base)
-    if gain is not None and gain.low is not None and gain.high is not None:
-        clear = "a clear difference" if gain.low > 0 or gain.high < 0 else "which may be chance"
+    gains = {c: gain for c in scores if (gain := run.score(c, GAIN + base)) is not None}
+    gain = gains.get(best)
+    if gain is not None and interval(gain):
+        p_values = dict(zip(gains, holm([_p_value(each) for each in gains.values()]), strict=True))
+        clear = "a clear difference" if p_values[best] <= LEVEL else "which may be chance"
         text += f", a gap of {shown(gain)['value']} ({interval(gain)}), {clear}"
     return text + "."
+
+
+def _p_value(gain: Score) -> float:
+    value, low, high = (math.nan if x is None else x for x in (gain.value, gain.low, gain.high))
+    p_value = p_of_interval(value, low, high, gain.n)
+    return 1.0 if p_value is None else p_value
+
+
+def p_value(p: float) -> str:
+    """What stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
+    return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
 def _clears(score: Score) -> str:

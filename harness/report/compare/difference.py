@@ -1,12 +1,13 @@
 """What changed from one run to another: metrics, episodes, answers and settings."""
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
+from harness.core.multiplicity import holm, p_of_interval
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.report.compare import percentiles
@@ -24,12 +25,17 @@ class Difference:
         b: mean of B over the same.
         change: B - A, paired by episode and seed, with a 95 % interval over episodes
             (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
+        p_value: of no difference, of this one alone: of the test of success where that gives one, else of
+            the interval; None where there is neither.
+        p_corrected: by Holm's method (Holm 1979) for all differences of the comparison.
     """
 
     metric: str
     a: float
     b: float
     change: Estimate
+    p_value: float | None = None
+    p_corrected: float | None = None
 
 
 @dataclass(frozen=True)
@@ -116,10 +122,22 @@ def compare(pair: Pair) -> Comparison:
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
-        conditions=tuple(_in_condition(pair, name) for name in pair.conditions),
+        conditions=_corrected([_in_condition(pair, name) for name in pair.conditions]),
         answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
         answers_in_both=dict(Counter(a[request].role for request in both)),
     )
+
+
+def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
+    """The same, each difference with its p-value as it counts among all of them."""
+    p_values = [d.p_value for c in conditions for d in c.differences if d.p_value is not None]
+    among = iter(holm(p_values))
+    return tuple(
+        replace(c, differences=tuple(
+            d if d.p_value is None else replace(d, p_corrected=next(among)) for d in c.differences
+        ))
+        for c in conditions
+    )  # fmt: skip
 
 
 def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
@@ -148,10 +166,11 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         )
     ]
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
+    test = success_test(a, b)
     return InCondition(
         condition=condition,
-        differences=tuple(d for d in differences if d.change.n),
-        test=success_test(a, b),
+        differences=tuple(_tested(d, test) for d in differences if d.change.n),
+        test=test,
         gained=tuple(_flips(pair, condition, (a == 0) & (b == 1))),
         lost=tuple(_flips(pair, condition, (a == 1) & (b == 0))),
     )
@@ -161,6 +180,12 @@ def _difference(metric: str, a: Floats, b: Floats) -> Difference:
     unknown = np.isnan(a) | np.isnan(b)
     before, after = (float(known_mean(known_mean(np.where(unknown, np.nan, x), 1), 0)) for x in (a, b))
     return Difference(metric, before, after, difference(metric, b, a))
+
+
+def _tested(d: Difference, test: SuccessTest | None) -> Difference:
+    if d.metric == SUCCESS and test is not None and test.p_value is not None:
+        return replace(d, p_value=test.p_value)
+    return replace(d, p_value=p_of_interval(d.change.value, d.change.low, d.change.high, d.change.n))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
