@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.core.multiplicity import holm, p_of_interval
-from harness.core.statistics import episode_interval
+from harness.core.multiplicity import LEAST, holm, p_of_bootstrap, p_value
+from harness.core.statistics import episode_interval, rate_difference
 
 SHARES = st.lists(st.floats(0, 1), min_size=1, max_size=12)
 
@@ -45,20 +45,45 @@ def test_false_alarms_among_many_true_nothings_stay_at_five_percent() -> None:
 
 @given(st.lists(st.integers(-20, 20), min_size=2, max_size=40).filter(lambda values: len(set(values)) > 1))
 def test_the_p_of_students_interval_is_the_t_tests(values: list[int]) -> None:
-    found = episode_interval(np.array(values, dtype=float))
-    p_value = p_of_interval(found.value, found.low, found.high, found.n)
-    assert p_value == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue, rel=1e-6, abs=1e-300)
+    found = p_value(lambda level: episode_interval(np.array(values, dtype=float), level=level))
+    assert found == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue, rel=1e-3, abs=LEAST)
 
 
-def test_an_interval_that_touches_0_has_p_005_on_whichever_side() -> None:
-    assert p_of_interval(3.0, 0.0, 9.0, 20) == pytest.approx(0.05)
-    assert p_of_interval(-3.0, -9.0, 0.0, 20) == pytest.approx(0.05)
-    assert p_of_interval(3.0, 0.1, 9.0, 20) < 0.05 < p_of_interval(3.0, -0.1, 9.0, 20)
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=60), st.floats(0.5, 0.999))
+def test_the_interval_of_a_rate_leaves_0_out_just_where_p_is_less(
+    pairs: list[tuple[bool, bool]], level: float
+) -> None:
+    """No formula of the 95 % ends does this, since these intervals are not symmetric."""
+    a, b = np.array(pairs, dtype=float).T
+    p = p_value(lambda at: rate_difference(a, b, at))
+    assert p is not None
+    assert LEAST <= p <= 1
+    found = rate_difference(a, b, level)
+    assert (found.low > 0 or found.high < 0) == (p < 1 - level) or p == pytest.approx(1 - level, rel=1e-6)
+    assert p_value(lambda at: rate_difference(b, a, at)) == pytest.approx(p), "the other way round"
 
 
-def test_where_every_episode_changes_alike_the_sign_says_how_sure_that_is() -> None:
-    """Two heads in a row are one in two, both sides; ten are 2 in 1024."""
-    assert p_of_interval(5.0, 5.0, 5.0, 2) == 0.5
-    assert p_of_interval(5.0, 5.0, 5.0, 10) == 2 / 1024
-    assert p_of_interval(0.0, 0.0, 0.0, 10) == 1.0
-    assert p_of_interval(5.0, math.nan, math.nan, 1) is None
+def test_rates_that_agree_in_every_episode_have_p_1() -> None:
+    alike = np.array([1.0, 1.0, 0.0])
+    assert p_value(lambda level: rate_difference(alike, alike, level)) == 1.0
+
+
+def test_what_is_surer_than_numbers_can_say_is_not_0() -> None:
+    """Fifty milliseconds more in even episodes and 50.01 in odd ones."""
+    slower = 50 + np.arange(240) % 2 * 0.01
+    assert p_value(lambda level: episode_interval(slower, level=level)) == LEAST
+
+
+def test_where_there_is_no_interval_there_is_no_p() -> None:
+    """Every time changed alike, and there is no telling how others would; or there is one episode."""
+    assert p_value(lambda level: episode_interval(np.full(10, 5.0), level=level)) is None
+    assert p_value(lambda level: rate_difference(np.ones(1), np.zeros(1), level)) is None
+    assert p_of_bootstrap(5.0, math.nan, math.nan) is None
+
+
+def test_a_bootstraps_interval_that_touches_0_has_p_005_on_whichever_side() -> None:
+    assert p_of_bootstrap(3.0, 0.0, 9.0) == pytest.approx(0.05)
+    assert p_of_bootstrap(-3.0, -9.0, 0.0) == pytest.approx(0.05)
+    assert p_of_bootstrap(3.0, 0.1, 9.0) < 0.05 < p_of_bootstrap(3.0, -0.1, 9.0)
+    assert p_of_bootstrap(0.0, 0.0, 400.0) == 1.0
+    assert p_of_bootstrap(5.0, 5.0, 9.0) == 0.05, "no spread on the side of 0"

@@ -1,6 +1,5 @@
 """Prompts and models side by side: what each run scored, and which cannot be told from the best."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -9,12 +8,12 @@ from statistics import median
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.core.multiplicity import LEVEL, holm, p_of_interval
-from harness.core.paired import SuccessTest, success_test
+from harness.core.multiplicity import LEVEL, holm
+from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import success_of
 from harness.runs.folder import Run
-from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.metrics import LATENCY, SUCCESS, difference, p_value
 from harness.runs.records import Score
 
 Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
@@ -27,16 +26,13 @@ class Behind:
     """A run against the best one, over the episodes that both have.
 
     Attributes:
-        difference: its success minus the best one's.
-        episodes: how many both have.
-        test: what says whether that is chance; None where nothing can.
-        p_value: of the difference, corrected by Holm's method for the pairs of runs under all conditions.
+        change: its success minus the best one's, with a 95 % interval over the episodes that both have.
+        p_value: of no difference, by that interval, corrected by Holm's method for the pairs of runs under
+            all conditions.
     """
 
-    difference: float
-    episodes: int
-    test: SuccessTest | None
-    p_value: float = 1.0
+    change: Estimate
+    p_value: float
 
     @property
     def undecided(self) -> bool:
@@ -154,7 +150,7 @@ def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Be
     """
     found = [_behind_best(ended) for ended in conditions]
     every = [(n, run) for n, (_, behind) in enumerate(found) for run in behind]
-    p_values = [_p_value(found[n][1][run]) for n, run in every]
+    p_values = [found[n][1][run].p_value for n, run in every]
     pairs = sum(len(list(combinations(filter(None, ended), 2))) for ended in conditions)
     corrected = dict(zip(every, holm(p_values, pairs), strict=True))
     marks: list[list[tuple[str, Behind | None]]] = []
@@ -170,7 +166,7 @@ def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Be
 
 
 def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behind]]:
-    """The best run and the others against it; None where there is no such run.
+    """The best run and the others against it, p not yet corrected; None where there is no such run.
 
     The best is not behind any other on the episodes and seeds that the two share: a run of other episodes is
     no better for their being easy.
@@ -179,9 +175,7 @@ def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behi
     for best in scored:
         pairs = {n: _shared(ended[n], ended[best]) for n in scored if n != best}
         if pairs and all(len(a) and a.mean() <= b.mean() for a, b in pairs.values()):
-            return best, {
-                n: Behind(float((a - b).mean()), len(a), success_test(b, a)) for n, (a, b) in pairs.items()
-            }
+            return best, {n: _behind(a, b) for n, (a, b) in pairs.items()}
     return None, {}
 
 
@@ -194,16 +188,10 @@ def _shared(one: Successes, other: Successes) -> tuple[Floats, Floats]:
     return a, b
 
 
-def _p_value(behind: Behind) -> float:
-    """Of one difference alone; 1 where nothing says that it is more than chance."""
-    test = behind.test
-    if test is None:
-        return 1.0
-    if test.p_value is not None:
-        return test.p_value
-    low, high = (math.nan if end is None else end for end in (test.low, test.high))
-    p_value = p_of_interval(behind.difference, low, high, behind.episodes)
-    return 1.0 if p_value is None else p_value
+def _behind(a: Floats, b: Floats) -> Behind:
+    p = p_value(SUCCESS, a, b)
+    # One episode has no interval: nothing says that it is more than chance.
+    return Behind(difference(SUCCESS, a, b), 1.0 if p is None else p)
 
 
 def uneven(runs: Runs) -> str | None:

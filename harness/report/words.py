@@ -1,10 +1,12 @@
 """Numbers and findings in the words of the report."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-from harness.core.multiplicity import LEVEL, holm, p_of_interval
+import numpy as np
+
+from harness.core.multiplicity import LEVEL, holm
+from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
 from harness.runs.records import Latency, Score, Times
@@ -49,19 +51,20 @@ def headline(run: Run) -> str:
     if base == best:
         return text + (", and no other condition does better." if len(scores) > 1 else ".")
     text += f"; {base} {_clears(scores[base])}"
-    gains = {c: gain for c in scores if (gain := run.score(c, GAIN + base)) is not None}
-    gain = gains.get(best)
+    gain = run.score(best, GAIN + base)
     if gain is not None and interval(gain):
-        p_values = dict(zip(gains, holm([_p_value(each) for each in gains.values()]), strict=True))
-        clear = "a clear difference" if p_values[best] <= LEVEL else "which may be chance"
+        clear = "a clear difference" if _p_values(run, base)[best] <= LEVEL else "which may be chance"
         text += f", a gap of {shown(gain)['value']} ({interval(gain)}), {clear}"
     return text + "."
 
 
-def _p_value(gain: Score) -> float:
-    value, low, high = (math.nan if x is None else x for x in (gain.value, gain.low, gain.high))
-    p_value = p_of_interval(value, low, high, gain.n)
-    return 1.0 if p_value is None else p_value
+def _p_values(run: Run, base: str) -> dict[str, float]:
+    """Of the gain in success of each condition over one of them, corrected by Holm's method."""
+    ended = np.array([e.success for e in run.episodes], dtype=float).reshape(run.grid.shape)
+    success = {c: of.T for c, of in zip(run.conditions, ended, strict=True)}
+    alone = success.pop(base)
+    p_values = [metrics.p_value(SUCCESS, of, alone) for of in success.values()]
+    return dict(zip(success, holm([1.0 if p is None else p for p in p_values]), strict=True))
 
 
 def p_value(p: float) -> str:

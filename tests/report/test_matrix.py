@@ -40,9 +40,8 @@ def test_where_seeds_differ_the_interval_over_episodes_decides():
     other = {(e, s): float(luck.random() < 0.5) for e in range(60) for s in range(3)}
     [[(first, _), (second, behind)]] = matrix.marked([[one, other]])
     assert (first, second) == (matrix.BEST, matrix.WORSE)
-    assert behind.test.method == "interval"
-    assert behind.difference < behind.test.high < 0
-    assert (behind.episodes, behind.p_value < 0.001) == (60, True)
+    assert behind.change.value < behind.change.high < 0
+    assert (behind.change.n, behind.p_value < 0.001) == (60, True)
 
 
 def test_a_run_of_easier_episodes_alone_is_not_the_best():
@@ -50,7 +49,7 @@ def test_a_run_of_easier_episodes_alone_is_not_the_best():
     long, short = [1.0] * 120 + [0.0] * 80, [1.0] * 19 + [0.0]
     (first, _), (second, behind) = marked(long, short)
     assert (first, second) == (matrix.BEST, matrix.CLOSE)
-    assert (behind.difference, behind.episodes) == (-0.05, 20)
+    assert (behind.change.value, behind.change.n) == (pytest.approx(-0.05), 20)
     assert marks(short, long) == [matrix.CLOSE, matrix.BEST], "whatever the order"
 
 
@@ -69,18 +68,21 @@ def test_runs_without_episodes_in_common_are_not_marked():
 
 
 def test_holm_counts_every_pair_under_every_condition():
-    """Eight episodes lost and none gained: McNemar's p = 2 / 2^8 = 0.0078, real alone and among six pairs.
+    """Eight of 18 successes lost in 20 episodes, none gained: real alone and among 6 pairs, not among 12.
 
     Of 4 runs under 2 conditions there are 12 pairs: the first counts 12 times, and so do the next, equal ones
     at least.
     """
-    best, worse = {(e, 0): 1.0 for e in range(20)}, {(e, 0): float(e >= 8) for e in range(20)}
+    best, worse = ({(e, 0): float(first <= e < 18) for e in range(20)} for first in (0, 8))
     [[_, (mark, alone)]] = matrix.marked([[best, worse]])
-    assert (mark, alone.p_value) == (matrix.WORSE, 2 / 2**8)
+    assert mark == matrix.WORSE
+    assert alone.change.high < 0
     [[_, *others]] = matrix.marked([[best, worse, worse, worse]])
-    assert [(mark, behind.p_value) for mark, behind in others] == [(matrix.WORSE, 6 * 2 / 2**8)] * 3
+    assert [mark for mark, _ in others] == [matrix.WORSE] * 3
+    assert [behind.p_value for _, behind in others] == pytest.approx([6 * alone.p_value] * 3)
     for _, *others in matrix.marked([[best, worse, worse, worse]] * 2):
-        assert [(mark, behind.p_value) for mark, behind in others] == [(matrix.CLOSE, 12 * 2 / 2**8)] * 3
+        assert [mark for mark, _ in others] == [matrix.CLOSE] * 3
+        assert [behind.p_value for _, behind in others] == pytest.approx([12 * alone.p_value] * 3)
 
 
 @pytest.fixture(scope="session")

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
-from harness.core.multiplicity import holm, p_of_interval
+from harness.core.multiplicity import holm, p_of_bootstrap
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.report.compare import percentiles
 from harness.report.compare.pair import Pair
-from harness.runs.metrics import SUCCESS, difference, metrics_of
+from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,7 @@ class Difference:
         b: mean of B over the same.
         change: B - A, paired by episode and seed, with a 95 % interval over episodes
             (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
-        p_value: of no difference, of this one alone: of the test of success where that gives one, else of
-            the interval; None where there is neither.
+        p_value: of no difference, of this one alone, by its interval; None where there is none.
         p_corrected: by Holm's method (Holm 1979) for all differences of the comparison.
     """
 
@@ -160,17 +159,19 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         for metric in metrics_of(pair.a.run.world)
     ]
     differences += [
-        Difference(f"latency_p{percent}_ms", before, after, change)
+        Difference(
+            f"latency_p{percent}_ms", before, after, change,
+            p_of_bootstrap(change.value, change.low, change.high),
+        )
         for percent, before, after, change in percentiles.differences(
             pair.latencies(pair.a, condition), pair.latencies(pair.b, condition), len(pair.episodes)
         )
-    ]
+    ]  # fmt: skip
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
-    test = success_test(a, b)
     return InCondition(
         condition=condition,
-        differences=tuple(_tested(d, test) for d in differences if d.change.n),
-        test=test,
+        differences=tuple(d for d in differences if d.change.n),
+        test=success_test(a, b),
         gained=tuple(_flips(pair, condition, (a == 0) & (b == 1))),
         lost=tuple(_flips(pair, condition, (a == 1) & (b == 0))),
     )
@@ -179,13 +180,7 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
 def _difference(metric: str, a: Floats, b: Floats) -> Difference:
     unknown = np.isnan(a) | np.isnan(b)
     before, after = (float(known_mean(known_mean(np.where(unknown, np.nan, x), 1), 0)) for x in (a, b))
-    return Difference(metric, before, after, difference(metric, b, a))
-
-
-def _tested(d: Difference, test: SuccessTest | None) -> Difference:
-    if d.metric == SUCCESS and test is not None and test.p_value is not None:
-        return replace(d, p_value=test.p_value)
-    return replace(d, p_value=p_of_interval(d.change.value, d.change.low, d.change.high, d.change.n))
+    return Difference(metric, before, after, difference(metric, b, a), p_value(metric, b, a))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:

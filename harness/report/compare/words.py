@@ -98,9 +98,10 @@ def many(comparison: Comparison) -> str:
     p_values = [p for c in comparison.conditions for d in c.differences if (p := d.p_corrected) is not None]
     held = sum(p <= LEVEL for p in p_values)
     return (
-        f"p is corrected by Holm's method for the {len(p_values)} differences shown: one or more of them is "
-        f"below {LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the "
-        "tests of success and gates are of one difference each, not corrected"
+        "p goes with the interval (1 less the level at which that would just touch 0) and is corrected by "
+        f"Holm's method for the {len(p_values)} differences that have one: one or more of them is below "
+        f"{LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the tests "
+        "of success and gates are of one difference each, not corrected"
     )
 
 
