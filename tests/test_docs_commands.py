@@ -43,7 +43,7 @@ CUT = {
 # Ends otherwise than its page shows, since what it reads was cut.
 CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
-    "harness compare reports/v1 reports/v2"
+    "harness compare reports/a reports/b"
     " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0,
     "harness scenario audit occluded-intersection": 1,  # so few layouts tell something by accident
 }

@@ -32,7 +32,7 @@ from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
 from harness.runs.folder import csv_text
 from harness.runs.metrics import METRICS, of_decisions
-from harness.runs.records import Answer, Episode, Latency, Score, Variant
+from harness.runs.records import Answer, Latency, Score, Variant
 
 ALONE = OperatingPoint("single-local", None)
 CLEAR = OperatingPoint("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter

@@ -139,4 +139,9 @@ def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None
         agreement = f"{100 * s.agreement.value:.0f}"
         rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
-    console().print(f"n = {episodes} episodes; ranks agree: {'yes' if agree else 'no'}")
+    order = "the same order" if agree else "another order"
+    text = console()
+    text.print(
+        f"n = {episodes} episodes; frozen and in closed loop the {len(standings)} drivers have {order}"
+    )
+    text.print("so few are no rank correlation: that these scenes rank models takes runs, `harness fidelity`")

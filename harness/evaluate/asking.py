@@ -49,6 +49,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 form=spec.prompt.helper_answer,
                 answer=spec.answer,
                 thinking=spec.thinking,
+                reasons_first=spec.prompt.reasons_first,
                 view=graph,
                 truth=truth,
                 scenario=spec.scenario,
@@ -74,6 +75,7 @@ def fusion_request(
         form=spec.prompt.helper_answer,
         answer=spec.answer,
         thinking=spec.thinking,
+        reasons_first=spec.prompt.reasons_first,
     )
 
 
@@ -90,7 +92,8 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     said = parse(
         # A read-out is a bare distribution, a helper's too.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
-        thinking=request.thinking, finish_reason=completion.finish_reason, error=completion.error,
+        thinking=request.thinking, reasons_first=request.reasons_first,
+        finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
     return Answer(
         scene=scene, viewer=viewer, heard=tuple(heard), role="merge" if heard else request.role, raw=raw,

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from harness.core import multiplicity
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import (
     Estimate,
@@ -251,9 +252,14 @@ def over_episodes(name: str, values: Floats) -> Estimate:
     return rate_interval(each) if is_rate(name) else in_range(name, episode_interval(each))
 
 
-def difference(name: str, a: Floats, b: Floats) -> Estimate:
+def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate:
     """Interval over episodes of a metric's a - b, both (E, S)."""
-    return rate_difference(a, b) if is_rate(name) else episode_interval(a - b)
+    return rate_difference(a, b, level) if is_rate(name) else episode_interval(a - b, level=level)
+
+
+def p_value(name: str, a: Floats, b: Floats) -> float | None:
+    """Of no difference of a metric's a - b, both (E, S), by the interval of `difference`."""
+    return multiplicity.p_value(lambda level: difference(name, a, b, level))
 
 
 def is_rate(name: str) -> bool:

@@ -184,7 +184,5 @@ class WorldState:
         fields = dict(data)
         fields["vehicles"] = tuple(VehicleState(**v) for v in data["vehicles"])
         fields["buildings"] = tuple(Building(**b) for b in data["buildings"])
-        fields["beacons"] = tuple(
-            Beacon(**{**b, "heard_by": tuple(b["heard_by"])}) for b in data["beacons"]
-        )
+        fields["beacons"] = tuple(Beacon(**{**b, "heard_by": tuple(b["heard_by"])}) for b in data["beacons"])
         return cls(**fields)

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -148,8 +149,8 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     said = " ".join(out.split())
     for part in (
         "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
-        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1]",
-        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1",
+        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1] 1.000",
+        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1.000",
         "lost: 1 late", "answers: ego strict → failed: 24 of 24", "00000-0/v1, 00000-1/v1, 22 more",
         "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",
     ):  # fmt: skip
@@ -162,6 +163,7 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
         "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
+        "p": pytest.approx(0.317, abs=1e-3), "p_holm": 1.0,
     }  # fmt: skip
     assert condition["lost"] == {
         "count": 2, "episodes": 1,
@@ -173,6 +175,26 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
         "role": "helper", "a": "strict", "b": "recovered", "count": 24, "requests": ["00000-0/v2"],
     }  # fmt: skip
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
+
+
+def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Path], harness: Harness) -> None:
+    """B takes 50 ms more in even episodes and 50.01 in odd ones: certain, also among some thirty."""
+
+    def slower(row: Row) -> None:
+        row["latency_ms"] = 150.0 + row["episode"] % 2 * 0.01
+
+    change(runs[0], decision=lambda row: row.update(latency_ms=100.0))
+    change(runs[1], decision=slower)
+    told = json.loads(harness("compare", *runs, "--json")[1], parse_constant=pytest.fail)
+    of = [metric for c in told["conditions"] for metric in c["metrics"].values() if metric["p"] is not None]
+    latency = told["conditions"][1]["metrics"]["latency_proxy_ms"]
+    assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * len(of) < 1e-9
+    printed = [harness("compare", *runs, *form)[1] for form in ((), ("--markdown",), ("--html", "page.html"))]
+    for text in (*printed[:2], unescape(Path("page.html").read_text())):
+        said = " ".join(text.split())
+        assert "< 0.001" in said
+        assert f"Holm's method for the {len(of)} differences that have one" in said
+    assert not [line for line in printed[0].splitlines() if line.endswith((" 0.000", "= 0.000"))]
 
 
 HOSTILE = "`<script>alert(1)</script> @everyone ![x](http://x) {{ 7 * 7 }} | ``\n\u202e"

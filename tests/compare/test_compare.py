@@ -14,6 +14,7 @@ from run_on_disk import Row, change, configure, made_up
 
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
+from harness.core.multiplicity import holm
 from harness.core.paired import SuccessTest
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
@@ -99,6 +100,24 @@ def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(runs: tupl
     assert (change.value, change.low, change.high) == pytest.approx((0.25, -0.3196, 0.6553), abs=1e-4)
     assert c.conditions[1].test == SuccessTest("interval", low=change.low, high=change.high)
     assert c.conditions[1].gained == (Flip(0, (0,), "late", "success"), Flip(3, (0,), "late", "success"))
+
+
+def test_holm_counts_every_difference_in_every_condition(runs: tuple[Path, Path]) -> None:
+    """Four successes of four gained under 6g: the least p, times all that is compared."""
+    ends(runs[0], "6g", [["late"] * 4] * 2)
+    ends(runs[1], "6g", [[""] * 4] * 2)
+    c = found(runs)
+    every = [d for of in c.conditions for d in of.differences]
+    p_values = [d.p_value for d in every if d.p_value is not None]
+    assert [d.p_corrected for d in every if d.p_value is not None] == holm(p_values)
+    gained = differences(c, "6g")["success_rate"]
+    assert gained.change.low > 0
+    assert gained.p_value is not None
+    assert gained.p_value == pytest.approx(min(p_values))
+    assert gained.p_corrected == pytest.approx(len(p_values) * gained.p_value)
+    assert differences(c, "6g")["late_rate"].p_value == pytest.approx(gained.p_value), "its mirror image"
+    unchanged = differences(c, "single-local")["success_rate"]
+    assert (unchanged.p_value, unchanged.p_corrected) == (1.0, 1.0)
 
 
 def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> None:

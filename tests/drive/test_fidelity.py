@@ -71,6 +71,10 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
     assert (code, err) == (0, "")
     assert "rank correlation of 5 models and conditions" in out
     assert "Largest difference, frozen minus closed" in out
+    few = harness("fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few")[1]
+    assert "Spearman" not in few
+    assert "No rank correlation: 3 different models and conditions are too few, it takes 5." in few
+    assert "too few" in Path("few/index.html").read_text()
     names = {f"fidelity.{kind}" for kind in ("csv", "jsonl", "svg", "pdf", "png")}
     assert {p.name for p in Path("told").iterdir()} == names | {
         "episodes.csv",

@@ -31,9 +31,10 @@ from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import answer_times, headline, latency_source
 from harness.runs.folder import csv_text, read
-from harness.runs.records import Latency, Score, Times
+from harness.runs.records import Episode, Latency, Score, Times
 
 V2 = prompts.load("v2")
+ENDED = {"single-local": 34, "v2x": 35, "6g": 47}  # successes of 50
 
 
 def told(viewer_says):
@@ -258,14 +259,21 @@ def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset)
     assert answer.raw == "I?"
 
 
-def scored(run, tmp_path, *scores):
-    """The run with another summary."""
+def scored(run, tmp_path, *scores, ended=None):
+    """The run with another summary, and in each condition so many successes of 50 episodes."""
     found = [
         Score(condition, metric, value, low, high, 2, 0, "episodes")
         for condition, metric, value, low, high in scores
     ]
     copy = copied(run, tmp_path)
-    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.variant))
+    variant = read(run).manifest.variant
+    (copy / "summary.csv").write_text(csv_text(Score, found, variant))
+    if ended:
+        [*some] = {(e.condition, e.seed): e for e in read(run).episodes}.values()
+        episodes = [
+            structs.replace(e, episode=n, success=n < ended[e.condition]) for e in some for n in range(50)
+        ]
+        (copy / "episodes.csv").write_text(csv_text(Episode, episodes, variant))
     return read(copy)
 
 
@@ -277,6 +285,7 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ("6g", "success_rate", 0.94, 0.88, 0.97),
         ("6g", "latency_proxy_ms", 151.4, 151.0, 151.8),
         ("6g", "success_gain_over_single-local", 0.26, 0.17, 0.35),
+        ended=ENDED,
     )
     assert headline(found) == (
         "With rule-of-thumb, 6g clears 94.0 % (95 % interval 88.0 to 97.0 %) of the episodes of two "
@@ -292,6 +301,7 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_p
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("v2x", "success_rate", 0.70, 0.60, 0.78),
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
+        ended=ENDED,
     )
     assert headline(found).endswith("a gap of 2.0 points (-3.0 to 7.0 points), which may be chance.")
 
