@@ -143,7 +143,7 @@ def _lead_frames(p: Parameters) -> int:
 def _draws(
     p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]
 ) -> tuple[float, Floats, list[tuple[str, ...]]]:
-    """When a sender begins, as a share of its period; its errors, (n, 4); whom each beacon gets through to."""
+    """When a sender begins, as a share of its period; its errors, (n, 4); who hears each beacon."""
     n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
     own = noise.generator("beacons", seed, sender)
     phase = float(own.random())
