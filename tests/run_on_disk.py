@@ -170,7 +170,7 @@ def _decision(
     if closed_loop:
         row |= {"acts_at_s": step + latency_ms / 1000, "acted": True}
     else:
-        row |= {"safe": True, "delay_s": 0.0}
+        row |= {"value": True, "safe": True, "regret": False, "delay_s": 0.0, "off_lag": False}
         row |= {f"safe_{action}": action == "IDLE" for action in ACTIONS}
         row |= {f"delay_s_{action}": 0.0 if action == "IDLE" else None for action in ACTIONS}
     for place, viewer in enumerate(viewers[1:], 1):

@@ -135,8 +135,8 @@ def _answer(row, said, n):
 def _decision(row, danger):
     """One reply in time, one lost, one late."""
     row.update(
-        danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, safe=False,
-        delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7, safe_SLOWER=True, safe_IDLE=True,
+        danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, value=True,
+        safe=False, regret=True, delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7, safe_SLOWER=True, safe_IDLE=True,
         safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0, delay_s_FASTER=None,
     )  # fmt: skip
     for k in range(3):

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, column, decisions, driven, spec
-from evaluating import scenes_of, spec_of
+from evaluating import spec_of
 
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
@@ -188,9 +188,9 @@ def test_the_luck_is_the_frozen_runs(small):
             for n, (episode, seed) in enumerate(zip(due.episode.tolist(), due.seed.tolist(), strict=True)):
                 yield (episode, seed, step), (due.draws.link[n].tolist(), due.draws.jitter[n].tolist())
 
-    first = scenes_of(small)[0].record["episode_seed"]
+    first = small.manifest.seed
     run = spec("cruise", points=(ALONE,), seeds=(3, 4), first_seed=first, episodes=4)
-    frozen = dict(draws(spec_of(small, "proxy", points=(ALONE,)), FrozenWorld(small, (3, 4))))
+    frozen = dict(draws(spec_of(small, "cruise", points=(ALONE,)), FrozenWorld(small, (ALONE,), (3, 4))))
     # A driver asks no helper, so the ego alone is looked at; `ego_alone` is given here to see all four.
     closed = dict(draws(run, LiveWorld(SCENARIO, first, range(4), run.points, run.seeds, ego_alone=False)))
     assert closed.keys() <= frozen.keys()
