@@ -278,7 +278,7 @@ def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
 ) -> None:
     """What the v1 templates ask for, word by word, from the ego and from a helper, also in a fusion call."""
     spec = spec_of(small, prompt=version)
-    scene = small.scenes[0]
+    scene = scenes_of(small)[0]
     ego = 'The truck hides the left.\n{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
     helper = (
         'A car comes from the left.\n{"evidence": "car", "risk": "high", "recommended_maneuver": "SLOWER", '
