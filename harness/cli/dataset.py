@@ -78,7 +78,7 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
 @app.command()
 def show(
     dataset: Dataset,
-    scene: str = typer.Argument(help="Scene id, such as 00003-2."),
+    scene: str = typer.Argument(help="Scene id, such as 00003-0."),
     out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
     viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
 ) -> None:

@@ -41,7 +41,7 @@ def list_prompts(as_json: options.Json = False) -> None:
 @app.command()
 def show(
     version: Version,
-    scene: str = typer.Option(..., help="Scene id, such as 00003-2."),
+    scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
     viewer: str | None = typer.Option(None, help="Vehicle id. Default: every viewer."),
     dataset: options.Dataset = resources.DATASET,
     as_json: options.Json = False,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from changing import ends
-from run_on_disk import Row, change, configure
+from run_on_disk import Row, answers_of, change, configure
 
 from harness.report.compare.text import code
 
@@ -147,11 +147,14 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     assert (code, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
     said = " ".join(out.split())
+    scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
+    n = len(scenes)
     for part in (
         "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
         "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1] 1.000",
         "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1.000",
-        "lost: 1 late", "answers: ego strict → failed: 24 of 24", "00000-0/v1, 00000-1/v1, 22 more",
+        "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",
+        f"{scenes[0]}/v1, {scenes[1]}/v1, {n - 2} more",
         "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",
     ):  # fmt: skip
         assert part in said, part
@@ -170,9 +173,11 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
         "listed": [{"episode": 1, "seeds": [0, 1], "a": "success", "b": "late"}],
     }  # fmt: skip
     assert condition["test"] == {"method": "mcnemar", "p_value": 1.0, "low": None, "high": None}
+    scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
     [turned] = told["answers"]
     assert turned == {
-        "role": "helper", "a": "strict", "b": "recovered", "count": 24, "requests": ["00000-0/v2"],
+        "role": "helper", "a": "strict", "b": "recovered", "count": len(scenes),
+        "requests": [f"{scenes[0]}/v2"],
     }  # fmt: skip
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
 

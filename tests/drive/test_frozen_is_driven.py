@@ -54,6 +54,7 @@ def off_lag(of: Run) -> set[Place]:
     return {(d.condition, d.seed, d.episode) for d in decisions if d.off_lag}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "points", "seeds", "least"),
     [

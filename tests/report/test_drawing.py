@@ -53,8 +53,11 @@ def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
 
 
 def test_conflict_points_say_when_the_ego_and_the_other_are_there(dataset):
-    scene = next(s for s in scenes_of(dataset) if s.record["graphs"]["v1"]["conflicts"])
-    conflict = scene.record["graphs"]["v1"]["conflicts"][0]
+    scene, conflict = next(
+        (s, conflict)
+        for s in scenes_of(dataset) for conflict in s.record["graphs"]["v1"]["conflicts"]
+        if conflict["ego"]["time_s"] and conflict["other"]["time_s"]
+    )  # fmt: skip
     ego, other = conflict["ego"]["time_s"], conflict["other"]["time_s"]
     assert f"v1 in {ego:.1f} s, {conflict['with']} in {other:.1f} s" in texts(picture(scene))
 

@@ -229,7 +229,10 @@ def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_pat
     assert "brave · v2" in found
     assert found.count("★ best") >= 3
     every = details(text)
-    assert all(len([r for r in d["runs"] if r]) == 2 for d in every.values())
+    came = [by_scene(of) for of in (run, brave)]
+    assert len(every) < sum(map(len, came)), "some scenes are of both"
+    for scene, detail in every.items():
+        assert [told is not None for told in detail["runs"]] == [scene in of for of in came]
 
 
 def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tmp_path):
