@@ -128,7 +128,7 @@ def scenes_of(dataset: Dataset) -> list[Scene]:
 
 def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Walked:
     """A whole evaluation but for its folder: asked, walked and scored."""
-    asker = asker_of(spec, backend, latency, kept)
+    asker = Asker(spec, lambda: backend, latency, kept)
     assert isinstance(spec.source, FrozenSource)
     world = FrozenWorld(spec.source.dataset, spec.points, spec.seeds)
     parts = list(chain.from_iterable(walk(world, spec.points, asker)))
@@ -174,18 +174,19 @@ def sure(action: str, role: str = "ego") -> str:
 
 
 def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str, float | str]] | None = None,
-           driver: str = "cruise") -> Dataset:  # fmt: skip
+           driver: str = "cruise", drives: Mapping[str, str] | None = None) -> Dataset:  # fmt: skip
     """Trees with one branch: whatever is decided leads to the next scene of a driver's course.
 
     Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and action,
-    has how it fails; at the last step it ends as they say, by default cleared after 5 s.
+    has how: seconds until cleared, or the failure. At the last step every action does, by default cleared
+    after 5 s.
 
     Args:
         dataset: whose scenes are taken.
         steps: at most, of each episode.
-        outcomes: how actions end: seconds until cleared, or the failure. If given, scenes that it has not
-            are left out.
+        outcomes: how actions end. If given, scenes that it has not are left out.
         driver: whose course it is.
+        drives: what every reference driver does in a scene, the full-view driver too; else IDLE.
     """
     forest, trees, scenes = dataset.forest, [], {}
     visited = [forest.ids[n] for n in forest.visited(forest.drivers[driver]).tolist()]
@@ -199,8 +200,8 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
         for name, scene in named.items():
             scenes[name] = replace(scene, record={**scene.record, "scene": name})
         levels = [
-            [Branching(name, dict.fromkeys(DRIVERS, "IDLE"), [
-                _edge(action, (outcomes or {}).get(name, {}).get(action, 5.0), last=step == len(named) - 1)
+            [Branching(name, dict.fromkeys(DRIVERS, (drives or {}).get(name, "IDLE")), [
+                _edge(action, (outcomes or {}).get(name, {}).get(action), last=step == len(named) - 1)
                 for action in dataset.actions
             ])]
             for step, name in enumerate(named)
@@ -209,8 +210,8 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
     return replace(dataset, trees=tuple(trees), _scenes=scenes)
 
 
-def _edge(action: str, outcome: float | str, last: bool) -> Edge:
-    if isinstance(outcome, str):
-        return Edge([action], None, End(outcome, 5.0, None, None, None), 1.0, 0, 0)  # type: ignore[arg-type]
-    end = End("cleared", outcome, None, None, None) if last else None
-    return Edge([action], None if last else 0, end, 1.0, 0, 0)
+def _edge(action: str, outcome: float | str | None, last: bool) -> Edge:
+    if outcome is None and not last:
+        return Edge([action], 0, None, 1.0, 0, 0)
+    how, time_s = (outcome, 5.0) if isinstance(outcome, str) else ("cleared", outcome or 5.0)
+    return Edge([action], None, End(how, time_s, None, None, None), 1.0, 0, 0)  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ import pytest
 from evaluating import (
     Scripted,
     asker_of,
+    course,
     decisions,
     figure,
     run,
@@ -59,13 +60,9 @@ def clear(n: int, helpers: int = 3) -> Due:
     return due(np.full((n, helpers, 2), 0.9), np.zeros((n, helpers)))
 
 
-def first_scene(small: Dataset) -> Dataset:
-    return replace(small, scenes=scenes_of(small)[:1])
-
-
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:
     """v2 and v4 are heard, v3's reply is lost: two lines of messages, with intent, risk and evidence."""
-    data = first_scene(small)
+    data = course(small, steps=1).of_episodes([0])
     [scene] = scenes_of(data)
     lines = {
         f"{scene.id}/v1": says((0.3, 0.4, 0.3)),

@@ -13,7 +13,7 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import walk
 
 OUTCOMES = {
-    f"0000{episode}-{step}": {"SLOWER": 5.0, "IDLE": 5.0, "FASTER": "collision"}
+    f"0000{episode}-{step}": {"FASTER": "collision"}
     for episode, steps in ((0, 3), (1, 2), (2, 3)) for step in range(steps)
 }  # fmt: skip
 EGO = says([0.5, 0.3, 0.2])  # 1.03 nats: it asks at every step
