@@ -10,7 +10,7 @@ from harness.cli.estimates import WIDTH
 from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.sweep import tables
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose
 
 app = typer.Typer(help="Run a whole study: the paper's, or its panels closed-loop.", no_args_is_help=True)
@@ -34,6 +34,8 @@ def paper(
     options.in_range("--episodes", episodes, 10, MOST_EPISODES)
     options.in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
     draws = options.parse_seeds(seeds)
+    if len(set(draws)) < len(draws):
+        raise UserError(f"--seeds {printable(seeds)}: give different whole numbers, such as 0:5")
     silent = as_json or quiet
     settings = panels(episodes, sweep_episodes)
     with bar("grid points", sum(len(panel.settings) for panel in settings), silent) as progress:

@@ -92,7 +92,7 @@ def _origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Itera
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
     for role, took in m.answer_times.items():
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        yield f"{role} answers took {half} ms (5 to 95 %: {low} to {high}; n = {took.n}); decides nothing"
+        yield f"{role} answers took {half} ms (5-95 %: {low} to {high}, n = {took.n}); not used"
     if m.cached_answers:
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks anew)"
     if m.engine_errors:

@@ -132,18 +132,23 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
     }
 
 
+def with_interval(mean: float, low: float, high: float) -> str:
+    """`94.7 [94.6, 94.9]`; a dash for an end that is not known."""
+    ends = ("–" if math.isnan(end) else f"{end:.1f}" for end in (low, high))
+    return f"{mean:.1f} [{', '.join(ends)}]"
+
+
 def shown(row: Any) -> dict[str, Any]:
     """One row of the ledger as text."""
     value = f" {row.value:g}" if isinstance(row.value, float) else ""
     theirs = f"{row.paper_low:g}" + (f" to {row.paper_high:g}" if row.paper_high != row.paper_low else "")
     cited = row.kind == "cited"
-    ends = ("–" if math.isnan(end) else f"{end:.1f}" for end in (row.ci_low, row.ci_high))
     unit = UNITS.get(row.unit, f", {row.unit}")
     return {
         "id": row.id,
         "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
-        "ours": "" if cited else f"{row.ours:.1f} [{', '.join(ends)}]",
+        "ours": "" if cited else with_interval(row.ours, row.ci_low, row.ci_high),
         "off": "" if cited else f"{row.difference:+.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,

@@ -14,14 +14,13 @@ from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
 from harness.studies.calibrated import Calibrated
 from harness.studies.folder import write, write_manifest
-from harness.studies.ledger import ledger, marks, shown, tally
+from harness.studies.ledger import ledger, marks, shown, tally, with_interval
 from harness.studies.play import joined, play
 
 if TYPE_CHECKING:
     import pandas as pd
 
 OFF = ("misses", "unclear")
-SEEDS = (0, 1, 2, 3, 4)
 WEIGHTS = "min_distance_m"  # the setting that flattens the weights of Equation 2
 EQUAL_M = 1000.0  # beyond every distance, so that all weights are equal
 TEMPLATES = Path(__file__).parent / "templates"
@@ -119,11 +118,11 @@ def equation_2(weights: "pd.DataFrame") -> str:
     """What the weights by distance do in the calibrated proxy, from the summary of their panel."""
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it, without = (
-        "{:.1f} [{:.1f}, {:.1f}] %".format(*(100 * success.loc[m, ["mean", "ci_low", "ci_high"]]))
-        for m in (1.0, EQUAL_M)
+        with_interval(*(100 * success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)))
+        for metres in (1.0, EQUAL_M)
     )
     return (
-        f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} with weights by distance, and in "
-        f"{without} with equal ones. The distances are declared so that the witness decides: this is no "
+        f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, and in "
+        f"{without} % with equal ones. The distances are declared so that the witness decides: this is no "
         f"evidence for the equation. For a run: harness sweep RUN --over {WEIGHTS} --grid 1,{EQUAL_M:g}"
     )

@@ -179,7 +179,7 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
     from scipy.special import stdtrit
 
     least = float(stdtrit(estimate.n - 1, 0.975)) * 0.5 / values.shape[1] / math.sqrt(estimate.n)
-    half = max(estimate.high - estimate.value, least)
+    half = float(np.fmax(estimate.high - estimate.value, least))  # no interval where all agree
     return in_range(name, replace(estimate, low=estimate.value - half, high=estimate.value + half))
 
 

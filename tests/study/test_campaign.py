@@ -86,6 +86,7 @@ def test_seeds_are_the_studys_own(tmp_path: Path) -> None:
     ]
     assert said[0].equals(said[1])
     assert not said[0].equals(said[2])
+    assert "100.0 [–, –] %" in run_paper(panels(10, 10), (3,), tmp_path / "d", lambda done: None).equation_2
     assert json.loads((tmp_path / "c" / "study.json").read_text())["seeds"] == [8]
 
 
