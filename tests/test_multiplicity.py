@@ -70,7 +70,7 @@ def test_rates_that_agree_in_every_episode_have_p_1() -> None:
 
 def test_what_is_surer_than_numbers_can_say_is_not_0() -> None:
     """Fifty milliseconds more in even episodes and 50.01 in odd ones."""
-    slower = 50 + np.arange(240) % 2 * 0.01
+    slower = np.array([50.0, 50.01] * 120)
     assert p_value(lambda level: episode_interval(slower, level=level)) == LEAST
 
 
