@@ -45,7 +45,7 @@ class Audit:
         steps: decision points that were compared: those at which at least half of the dangers are hidden.
             Later, an empty road is an observation and no tell.
         auc: of each question, the probability that a layout with it ranks above one without: `danger`, and
-            the sectors it can come from. Intervals are a bootstrap over layouts.
+            the sectors it can come from. Intervals are a bootstrap over layouts, for these models.
         told_by: the numbers that gave it away and the AUC that is lost without each; none unless it tells.
     """
 
