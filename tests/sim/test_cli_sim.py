@@ -25,7 +25,7 @@ def test_every_parameter_is_shown_with_value_and_meaning(harness):
     shown = json.loads(harness("scenario", "show", NAME, "--json")[1])
     assert shown["actions"] == ["SLOWER", "IDLE", "FASTER"]
     assert shown["parameters"]["time_limit_s"]["value"] == 10.0
-    assert shown["parameters"]["corner_m"]["value"] == [8.0, 18.0]
+    assert shown["parameters"]["corner_m"]["value"] == [8.0, 15.0]
     assert all(p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values())
 
 
