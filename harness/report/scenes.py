@@ -47,10 +47,12 @@ def world(scene: Scene) -> dict[str, Any]:
 def outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
     """What each action leads to at a decision point if the full-view driver takes the rest."""
     n = forest.place[name]
+    last = forest.then_full_view[n]
+    in_time = forest.succeeds(last, forest.tree[n])
+    rows = zip(forest.actions, last.tolist(), in_time, forest.safe[n], forest.delay_s[n], strict=True)
     return [
-        {**msgspec.to_builtins(forest.end(edge)), "action": action, "safe": bool(safe),
-         "delay_s": None if np.isnan(delay_s) else float(delay_s)}
-        for action, edge, safe, delay_s in zip(
-            forest.actions, forest.then_full_view[n].tolist(), forest.safe[n], forest.delay_s[n], strict=True
-        )
+        {**msgspec.to_builtins(end := forest.end(edge)), "action": action, "safe": bool(safe),
+         "result": "late" if end.result == "cleared" and not success else end.result,
+         "delay_s": None if np.isnan(delay_s) else round(float(delay_s), 3)}
+        for action, edge, success, safe, delay_s in rows
     ]  # fmt: skip

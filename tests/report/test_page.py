@@ -108,8 +108,9 @@ def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, 
             )
             for row in rows
         }
-        assert [o["safe"] for o in detail["outcomes"]] == [
-            rows[0][f"safe_{action}"] for action in dataset.actions
+        assert [(o["safe"], o["delay_s"]) for o in detail["outcomes"]] == [
+            (rows[0][f"safe_{action}"], (delay_s := rows[0][f"delay_s_{action}"]) and round(delay_s, 3))
+            for action in dataset.actions
         ]
         assert set(detail["world"]["viewers"]) == set(answers)
 
