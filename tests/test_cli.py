@@ -136,7 +136,9 @@ def test_one_changed_byte_is_noticed_in_the_layouts(harness: Harness, broken: Pa
         assert "layouts.zip 0000" in one_line(harness(*command, "--dataset", broken))
 
 
-@pytest.mark.parametrize("name", [f"{of}.schema.json" for of in ("scene", "tree", "manifest")] + ["README.md"])
+@pytest.mark.parametrize(
+    "name", [f"{of}.schema.json" for of in ("scene", "tree", "manifest")] + ["README.md"]
+)
 def test_one_changed_byte_is_noticed_in_any_file(harness: Harness, broken: Path, name: str) -> None:
     data = bytearray((broken / name).read_bytes())
     data[len(data) // 2] ^= 1
@@ -195,9 +197,7 @@ def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Pa
     assert said.out.startswith("--- v1 system\nYou drive car v1")
     said = harness("prompt", "check", "v2", "--dataset", small_path)
     scenes = len(load(small_path).courses())
-    assert said.out.startswith(
-        f"v2: renders for every viewer of {scenes} scenes; budget 200 to 400 tokens\n"
-    )
+    assert said.out.startswith(f"v2: renders for every viewer of {scenes} scenes; budget 200 to 400 tokens\n")
     assert "tokens not counted" in said.out
 
 
@@ -211,7 +211,10 @@ def test_a_prompt_outside_its_budget_ends_with_one(
     scenes, first = len(data.courses()), data.forest.ids[0]
     every = 7 * scenes  # four viewers, and the ego with the messages of one, two and three
     assert said.code == 1
-    assert f"outside the budget: {every} of {every} prompts; the first are\nscene {first} viewer v1: 2" in said.out
+    assert (
+        f"outside the budget: {every} of {every} prompts; the first are\nscene {first} viewer v1: 2"
+        in said.out
+    )
     assert f"scene {first} viewer v1 with messages of 3: 2 tokens" in said.out
     told = json.loads(harness(*args, "--json").out)
     two = {"least": 2, "mean": 2.0, "most": 2}

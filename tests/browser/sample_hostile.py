@@ -136,8 +136,9 @@ def _decision(row, danger):
     """One reply in time, one lost, one late."""
     row.update(
         danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, value=True,
-        safe=False, regret=True, delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7, safe_SLOWER=True, safe_IDLE=True,
-        safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0, delay_s_FASTER=None,
+        safe=False, regret=True, delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7,
+        safe_SLOWER=True, safe_IDLE=True, safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0,
+        delay_s_FASTER=None,
     )  # fmt: skip
     for k in range(3):
         sent = {"delivered": k != 1, "on_time": k == 0, "weight": 0.3}

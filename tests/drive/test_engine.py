@@ -124,7 +124,7 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
 
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
-def test_a_driver_that_needs_no_time_drives_as_the_reference_does(driver, seed):
+def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
     outcome = live.drive_all(SCENARIO, seed)[driver]
     assert len(episodes) == 6

@@ -73,7 +73,9 @@ def test_the_ego_from_the_south_is_in_the_lower_half_because_north_is_up(dataset
 
 
 def test_who_is_no_viewer_and_what_is_no_format_is_refused_with_what_is_allowed(dataset):
-    with pytest.raises(UserError, match=r"unknown viewer of scene 00000-0-[0-9a-f]{12} 'v9'.* known: v1, v2, v3, v4"):
+    with pytest.raises(
+        UserError, match=r"unknown viewer of scene 00000-0-[0-9a-f]{12} 'v9'.* known: v1, v2, v3, v4"
+    ):
         picture(scenes_of(dataset)[0], viewer="v9")
     with pytest.raises(UserError, match=r"unknown picture format 'bmp'.* known: pdf, png, svg"):
         picture(scenes_of(dataset)[0], format="bmp")
