@@ -165,7 +165,9 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
 ) -> None:
     run(spec_of(load(small_path, limit=3)), tmp_path / "three")
     said = refused(spec_of(small, f"replay:{tmp_path / 'three'}"), tmp_path / "out")
-    assert said.endswith(f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and limit")
+    assert said.endswith(
+        f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and limit"
+    )
     root, after = scenes_of(small)[:2]
     moved = replace(root, record={**root.record, "graphs": after.record["graphs"]})
     other = replace(small, _scenes={root.id: moved})

