@@ -124,7 +124,7 @@ def test_regret_is_the_decision_that_gave_success_away(told: Walked) -> None:
 
 
 def test_a_safe_decision_costs_the_seconds_that_it_puts_success_off(told: Walked) -> None:
-    """The second SLOWER of episode 0 costs 1.0 s, the first of 2 costs 0.6 s. What is not safe has no delay."""
+    """The second SLOWER of episode 0 costs 1.0 s, the first of 2 costs 0.6 s; an unsafe one has none."""
     delay_s = {d.scene: d.delay_s for d in told.records("clear")}
     assert delay_s == {
         "00000-0": 0.0, "00000-1": 1.0, "00001-0": 0.0, "00001-1": 0.0,
@@ -137,7 +137,7 @@ def test_a_safe_decision_costs_the_seconds_that_it_puts_success_off(told: Walked
 
 
 def test_decisions_that_would_act_in_another_frame_than_the_datasets_lag(played: Dataset) -> None:
-    """The lag is 145 ms, frames are of 20 ms. 145 ms act in the 8th, like 160; who consults over V2X later."""
+    """The lag is 145 ms, frames are of 20 ms: 145 and 160 ms act in the 8th, and V2X's replies come later."""
     spec = spec_of(played, points=(ALONE, CLEAR), seeds=(0,))
     for seconds, alone, one in ((0.14, 1.0, 1.0), (0.145, 0.0, 1.0), (0.16, 0.0, 1.0), (0.161, 1.0, 1.0)):
         latency = Latency("card", "declared", seconds, seconds, seconds)
