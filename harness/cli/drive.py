@@ -30,7 +30,9 @@ def command(
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
     condition: options.Conditions = None,
-    scenario: str = typer.Option("occluded-intersection", help="Scenario to drive. `harness scenario list`."),
+    scenario: str = typer.Option(
+        "occluded-intersection", help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons."
+    ),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     seeds: options.Seeds = "0:5",

@@ -44,7 +44,7 @@ class Links:
         asked: who was asked, `(..., H)`. What is said of the others may be anything, NaN included.
         ready_s: seconds from the start of the request until the helper has heard it and has its own answer,
             `(..., H)`.
-        range_m: ego-helper distance, `(..., H)`.
+        range_m: ego-helper distance, `(..., H)`, as the ego knows it: a beacon's error off the true one.
         payload_bits: size of the reply, `(..., H)`.
         in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
