@@ -21,9 +21,9 @@ LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0:2", "--worker
 
 @pytest.fixture
 def runs(harness: Callable[..., Said], small: Dataset) -> list[Path]:
-    """Three models, each frozen and driven."""
+    """Four models, each frozen and driven."""
     made = []
-    for model in ("proxy", "cruise", "brake"):
+    for model in ("proxy", "cruise", "brake", "local-view"):
         made.append(evaluate(spec_of(small, model), Path(f"eval-{model}")).out)
         assert harness("drive", "--model", model, *LAYOUTS, "--out", f"drive-{model}")[0] == 0
         made.append(Path(f"drive-{model}"))
@@ -37,8 +37,8 @@ def success(run: Path, condition: str) -> pd.Series:
 
 def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> None:
     found = fidelity(runs)
-    assert len(found.table) == 3 * 3
-    assert len(found.episodes) == 3 * 3 * 2 * 4
+    assert len(found.table) == 4 * 3
+    assert len(found.episodes) == 4 * 3 * 2 * 4
     row: Any
     for row in found.table.itertuples():
         frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))
@@ -46,7 +46,7 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
         assert row.closed == pytest.approx(closed.mean())
         assert row.difference == pytest.approx((frozen - closed).mean())
         assert row.n == 4
-    assert found.ranked == 5, "no condition makes a difference to a driver"
+    assert found.ranked == 5, "no condition makes a difference to a driver, nor the link here to the proxy"
     assert -1 <= found.rank <= 1
     other = found.episodes.success_frozen != found.episodes.success_closed
     assert disagreements(found.episodes)["count"].sum() == other.sum()
@@ -76,7 +76,7 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
         "episodes.jsonl",
         "index.html",
     }
-    assert len(json.loads(harness("fidelity", *runs, "--json")[1])) == 9
+    assert len(json.loads(harness("fidelity", *runs, "--json")[1])) == 12
 
 
 def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable[..., Said]) -> None:
