@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from evaluating import (
     Scripted,
+    all_scenes,
     asker_of,
     course,
     decisions,
@@ -99,8 +100,8 @@ def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset)
 def test_a_whole_run_makes_each_fusion_call_once(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Conditions and seeds that hear the same share a call, and the calls are announced together."""
-    backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)})
+    """Conditions and seeds that hear the same share a call; a step's calls are announced together."""
+    backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in all_scenes(small)})
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: backend)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
     spec = spec_of(small, LANGUAGE_MODEL, points=(FUSION, slow), latency="paper", seeds=(0, 1, 2))
@@ -109,8 +110,9 @@ def test_a_whole_run_makes_each_fusion_call_once(
     evaluate(spec, tmp_path / "run", False, answered.append, more=announced.append)
     calls = [name for name in backend.asked if "+" in name]
     assert set(Counter(calls).values()) == {1}
-    assert announced == [len(calls)]
-    assert sum(answered) == len(backend.asked)
+    steps = Counter(name.split("-")[1] for name in calls)
+    assert announced[1::2] == [steps[step] for step in sorted(steps)], "after each step's viewers"
+    assert sum(announced) == sum(answered) == len(backend.asked)
     assert {a.id for a in answers_of(tmp_path / "run") if a.role == "merge"} == set(calls)
 
 
