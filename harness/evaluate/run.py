@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -267,7 +267,7 @@ def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
 @contextmanager
 def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -> Iterator[Path]:
     """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
-    work, existed = out / WORK, out.exists()
+    work, made = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     new = not (work / CONFIG).is_file()
     if not new and _begun(work)["identity"] != digest(identity):
         raise UserError(
@@ -294,6 +294,7 @@ def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -
     except UserError:
         if new:
             shutil.rmtree(work)
-            if not existed:
-                out.rmdir()
+            for path in made:
+                with suppress(OSError):  # somebody else's run is in it by now
+                    path.rmdir()
         raise
