@@ -30,7 +30,9 @@ _FROZEN = FrozenScenes(
     decision_lag_s=0.145,
     path="nowhere",
 )
-_DRIVEN = ClosedLoop(scenario={"name": "made-up"}, first_seed=0, episodes=0, late_against="nobody")
+_DRIVEN = ClosedLoop(
+    scenario={"name": "made-up", "parameters": {}}, first_seed=0, episodes=0, late_against="nobody"
+)
 
 
 def made_up(

@@ -45,7 +45,6 @@ CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
     "harness compare reports/a reports/b"
     " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0,
-    "harness scenario audit occluded-intersection": 1,  # so few layouts tell something by accident
 }
 
 # Held against the program's options, and not run.

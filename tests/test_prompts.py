@@ -366,7 +366,7 @@ def test_no_evidence_takes_a_fusion_call_over_its_budget(
     prompt, count = prompts.load(version), counter(vocabulary)
     assert count is not None
     assert count([{"content": EVIDENCE}]) == len(EVIDENCE)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         ego, *helpers = scene.viewers
         messages = densest_messages(helpers[:senders], small.actions)
         n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages))

@@ -15,11 +15,12 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
-from harness.evaluate.live_world import LiveWorld, frames
+from harness.evaluate.live_world import LiveWorld
 from harness.evaluate.walk import walk
 from harness.runs.decisions import Decisions
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS
+from harness.world.scenario import frames
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 

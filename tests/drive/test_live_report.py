@@ -18,6 +18,7 @@ from harness.report.compare.pair import pair
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
+from harness.runs.records import ClosedLoop
 from harness.studies.stored import Stored
 
 V2 = prompts.load("v2")
@@ -56,6 +57,7 @@ def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     name = "occluded-intersection:perfect_knowledge=true"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
+    assert isinstance(found.manifest.world, ClosedLoop)
     assert found.manifest.world.scenario["parameters"]["perfect_knowledge"] is True
     scenes = [scene_of(found, scene) for scene in found.decisions.scenes]
     assert [scene.id for scene in scenes] == list(found.decisions.scenes)

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -17,7 +18,7 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import WorldState
 from harness.world.world import World
 
-SILENT = {"beacon_noise_m": 0.0, "beacon_noise_mps": 0.0, "beacon_noise_rad": 0.0}
+SILENT: Any = {"beacon_noise_m": 0.0, "beacon_noise_mps": 0.0, "beacon_noise_rad": 0.0}
 EXACT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, beacon_loss=0.0, **SILENT))
 PERFECT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, perfect_knowledge=True))
 HELPERS = ("v2", "v3", "v4")
