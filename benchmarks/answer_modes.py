@@ -74,7 +74,8 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     dataset = load.load(load.find(DATASET))
     source, points = FrozenSource(dataset), tuple(POINTS.values())
     spec = Spec(card, prompts.load("v2"), source, points, (0,), answer=mode)  # type: ignore[arg-type]
-    scenes = dataset.scenes[:: max(1, len(dataset.scenes) // count)][:count]
+    ids = dataset.courses()
+    scenes = dataset.scenes(ids[:: max(1, len(ids) // count)][:count])
     egos = [r for r in requests(spec, scenes) if r.role == "ego"]
     return [replace(r, max_tokens=most) for r in egos] if most and mode == "json" else egos
 

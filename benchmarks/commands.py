@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from zipfile import ZipFile
 
 from harness.core.files import canonical_json, sha256_bytes
 from harness.core.resources import DATASET
@@ -97,32 +98,40 @@ def run(checkout: Path, command: list[str], runs: Path) -> tuple[float, float]:
 
 
 def copied(copies: int, out: Path) -> Path:
-    """The shipped dataset so many times over."""
+    """The layouts of the shipped dataset so many times over, each time as others."""
     shipped = find(DATASET)
     out.mkdir()
-    lines = [json.loads(line) for line in (shipped / "scenes.jsonl").read_text().splitlines()]
-    episodes = 1 + max(line["episode"] for line in lines)
-    scenes = "".join(
-        canonical_json({
-            **line, "episode": (episode := line["episode"] + n * episodes),
-            "scene": f"{episode:05d}-{line['step']}", "episode_seed": line["episode_seed"] + n * 100_000,
-            "state": {**line["state"], "episode_seed": line["state"]["episode_seed"] + n * 100_000},
-        }) + "\n"
-        for n in range(copies) for line in lines
-    )  # fmt: skip
-    (out / "scenes.jsonl").write_text(scenes)
+    manifest = json.loads((shipped / "manifest.json").read_text())
+    episodes, trees = manifest["episodes"], []
+    with ZipFile(shipped / "layouts.zip") as layouts, ZipFile(out / "layouts.zip", "w") as file:
+        for episode in range(episodes * copies):
+            again, number = divmod(episode, episodes)
+            names = [(f"{number:05d}-", f"{episode:05d}-")]
+            seed = manifest["seed"] + number
+            names += [(f'"episode_seed":{seed}', f'"episode_seed":{seed + again * episodes}')]
+            names += [(f'"episode":{number},', f'"episode":{episode},')]
+            tree = json.loads(layouts.read(f"{number:05d}/tree.json"))
+            texts = []
+            for step in range(len(tree["levels"])):
+                text = layouts.read(f"{number:05d}/{step}.jsonl").decode()
+                for before, after in names:
+                    text = text.replace(before, after)
+                file.writestr(f"{episode:05d}/{step}.jsonl", text)
+                texts.append(sha256_bytes(text.encode()))
+            text = json.dumps({**tree, "scenes_sha256": texts}, separators=(",", ":"))
+            for before, after in names:
+                text = text.replace(before, after)
+            file.writestr(f"{episode:05d}/tree.json", text)
+            trees.append(sha256_bytes(text.encode()))
     for schema in shipped.glob("*.schema.json"):
         shutil.copy(schema, out)
-    manifest = json.loads((shipped / "manifest.json").read_text())
     files = {
         name: sha256_bytes((out / name).read_bytes()) for name in manifest["files"] if (out / name).exists()
     }
     manifest |= {
-        "name": out.name,
-        "episodes": episodes * copies,
-        "decisions": len(lines) * copies,
-        "files": files,
-    }
+        "name": out.name, "episodes": episodes * copies, "nodes": manifest["nodes"] * copies, "files": files,
+        "trees_sha256": trees,
+    }  # fmt: skip
     (out / "manifest.json").write_text(canonical_json(manifest))
     return out
 

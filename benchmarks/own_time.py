@@ -1,14 +1,13 @@
 """The harness's own CPU time for a decision: the slope of an evaluation between two sizes.
 
-A decision is a scene: one ego answer and up to three helper answers, scored under three conditions and five
-seeds. Own time is the process's CPU time less what `backend.complete` takes. Loading the dataset is apart,
-since it is done once.
+A decision is a decision point that some walk came to: one ego answer and up to three helper answers, scored
+under three conditions and five seeds. Sizes are copies of the dataset. Own time is the process's CPU time
+less what `backend.complete` takes. Loading the dataset is apart, since it is done once.
 
-    python benchmarks/own_time.py [DATASET] [--sizes 1000 5000] [--repeats 3] [--prompt v2]
+    python benchmarks/own_time.py [DATASET] [--sizes 1 5] [--repeats 3] [--prompt v2]
 """
 
 import argparse
-import copy
 import hashlib
 import json
 import statistics
@@ -16,11 +15,12 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from time import process_time
 from typing import Any
 from unittest.mock import patch
+
+from copies import copies
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
@@ -52,7 +52,7 @@ def main() -> None:
     """Print the slopes as a table and as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("dataset", nargs="?", default=DATASET)
-    arguments.add_argument("--sizes", nargs=2, type=int, default=[1000, 5000])
+    arguments.add_argument("--sizes", nargs=2, type=int, default=[1, 5])
     arguments.add_argument("--repeats", type=int, default=3)
     arguments.add_argument("--prompt", default="v2")
     given = arguments.parse_args()
@@ -60,15 +60,14 @@ def main() -> None:
     load.load(load.find(given.dataset), limit=1)  # pays for imports
     start = process_time()
     dataset = load.load(load.find(given.dataset))
-    loading_ms = (process_time() - start) * 1000 / len(dataset.scenes)
+    loading_ms = (process_time() - start) * 1000 / len(dataset.forest.ids)
     specs = [
-        Spec(cards.resolve("proxy"), prompts.load(given.prompt), FrozenSource(replicated(dataset, size)),
+        Spec(cards.resolve("proxy"), prompts.load(given.prompt), FrozenSource(copies(dataset, size)),
              tuple(POINTS.values()), tuple(range(5)))
         for size in given.sizes
     ]  # fmt: skip
-    evaluated(specs[0], ["proxy"])  # pays for imports and compiled templates
-    scenes = scenes_of(specs[1])
-    requests = asking.request_count(specs[1], scenes) / len(scenes)
+    first = evaluated(specs[0], ["proxy"])  # pays for imports and compiled templates
+    requests = first["answers"] / first["decisions"]
     # Clocks around every call take time too, so the total comes from runs with the proxy's alone.
     total = slopes(specs, ["proxy"], given.repeats)
     parts = slopes(specs, list(PARTS), given.repeats)
@@ -91,48 +90,21 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def replicated(dataset: load.Dataset, size: int) -> load.Dataset:
-    """The first `size` decisions of the dataset repeated, each repeat with other episodes and prompts.
-
-    The ego's distance to the zone, which every prompt states, differs by a decimetre a repeat, so that no
-    cache can profit from one.
-    """
-    episodes = 1 + max(scene.record["episode"] for scene in dataset.scenes)
-    scenes = []
-    for number in range(size):
-        again, position = divmod(number, len(dataset.scenes))
-        record_ = copy.deepcopy(dataset.scenes[position].record)
-        record_["episode"] += again * episodes
-        record_["episode_seed"] += again * episodes
-        record_["scene"] = f"{record_['episode']:05}-{record_['step']}"
-        for graph in record_["graphs"].values():
-            graph["ego"]["zone_m"] = round(graph["ego"]["zone_m"] + again / 10, 1)
-        scenes.append(load.Scene(record_))
-    return replace(dataset, scenes=tuple(scenes))
-
-
 def slopes(specs: list[Spec], parts: list[str], repeats: int) -> dict[str, float]:
     """Milliseconds a decision more costs, by part: median over repeats of the slope between two sizes."""
     found: dict[str, list[float]] = {}
     for _ in range(repeats):
         small, large = (evaluated(spec, parts) for spec in specs)
-        more = len(scenes_of(specs[1])) - len(scenes_of(specs[0]))
+        more = large.pop("decisions") - small.pop("decisions")
+        del large["answers"]
         for part in large:
             found.setdefault(part, []).append((large[part] - small[part]) * 1000 / more)
     return {part: statistics.median(values) for part, values in found.items()}
 
 
-def scenes_of(spec: Spec) -> tuple[load.Scene, ...]:
-    """The scenes of an evaluation."""
-    assert isinstance(spec.source, FrozenSource)
-    return spec.source.dataset.scenes
-
-
 def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
-    """CPU seconds of one evaluation: its parts, all its own time, and the limit for its record."""
+    """CPU seconds of one evaluation: its parts, its own time, its record's limit; and what it counted."""
     assert isinstance(spec.source, FrozenSource)
-    scenes = tuple(map(again, scenes_of(spec)))
-    fresh = replace(spec, source=FrozenSource(replace(spec.source.dataset, scenes=scenes)))
     with tempfile.TemporaryDirectory() as folder:
         spent: defaultdict[str, float] = defaultdict(float)
         with ExitStack() as clocks:
@@ -140,17 +112,14 @@ def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
                 for owner, name in PARTS[part]:
                     clocks.enter_context(clocked(owner, name, spent, part))
             start = process_time()
-            out = run.evaluate(fresh, Path(folder) / "run", False, lambda done: None).out
+            out = run.evaluate(spec, Path(folder) / "run", False, lambda done: None).out
             whole = process_time() - start
         own = whole - spent["proxy"]
         other = whole - sum(spent.values())
-        limit = limit_s(fresh, out)
-    return {**spent, "other": other, "own": own, LIMIT: limit}
-
-
-def again(scene: load.Scene) -> load.Scene:
-    """The same scene with nothing remembered from another run."""
-    return load.Scene(scene.record)
+        limit = limit_s(spec, out)
+        made = read(out)
+        counts = {"decisions": len(made.decisions.scenes), "answers": len(made.answers)}
+    return {**spent, "other": other, "own": own, LIMIT: limit, **counts}
 
 
 def limit_s(spec: Spec, out: Path) -> float:
@@ -159,7 +128,9 @@ def limit_s(spec: Spec, out: Path) -> float:
     Every prompt hashed, every answer decoded as JSON, every line of answers encoded as JSON, with the
     standard library alone, and the decisions written by Arrow; rendering and bookkeeping for nothing.
     """
-    messages = [request.messages for request in asking.requests(spec, scenes_of(spec))]
+    assert isinstance(spec.source, FrozenSource)
+    scenes = spec.source.dataset.scenes(list(read(out).decisions.scenes))
+    messages = [request.messages for request in asking.requests(spec, scenes)]
     decoded = [json.loads(line) for line in (out / "answers.jsonl").read_text().splitlines()]
     decisions = read(out).decisions
     start = process_time()

@@ -17,13 +17,14 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from copies import copies, shifted
 from msgspec import structs
 from playwright.sync_api import Browser, sync_playwright
 
 from harness.backends import cards
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
-from harness.dataset.load import Scene, find, load
+from harness.dataset.load import find, load
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
@@ -34,7 +35,6 @@ from harness.runs import folder
 from harness.runs.decisions import Decisions, Labels
 
 READY = "() => document.body.dataset.ready ?? document.readyState === 'complete'"
-SHIFT = 10_000  # of the numbers of repeated episodes
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? 0"
 
 
@@ -75,8 +75,8 @@ def repeated(runs: Runs, decisions: int, out: Path) -> Runs:
     [run], dataset = runs.runs, runs.dataset
     assert dataset is not None
     d, ids = run.decisions, list(run.decisions.scenes)
-    codes = d.codes("scene", ids)
-    shifts = range(0, -(-decisions // len(ids)) * SHIFT, SHIFT)
+    codes, apart = d.codes("scene", ids), len(dataset.trees)
+    shifts = range(0, -(-decisions // len(ids)) * apart, apart)
     folder.write(
         out,
         run.manifest,
@@ -93,21 +93,9 @@ def repeated(runs: Runs, decisions: int, out: Path) -> Runs:
         [structs.replace(answer, scene=shifted(answer.scene, by)) for by in shifts for answer in run.answers],
         run.scores,
     )
-    scenes = [
-        Scene({
-            **scene.record, "scene": shifted(scene.id, by), "episode": scene.record["episode"] + by,
-        })
-        for by in shifts for scene in dataset.scenes
-    ]  # fmt: skip
     many = folder.read(out)
     _ = many.decisions, many.answers, many.scores  # reading is not timed
-    return replace(runs, runs=(many,), dataset=replace(dataset, scenes=tuple(scenes)))
-
-
-def shifted(scene: str, by: int) -> str:
-    """A scene's id in an episode that much further."""
-    episode, _, step = scene.partition("-")
-    return f"{int(episode) + by:05d}-{step}"
+    return replace(runs, runs=(many,), dataset=copies(dataset, len(shifts)))
 
 
 def measured(runs: Runs, out: Path, browser: Browser, repeats: int) -> dict[str, Any]:

@@ -7,10 +7,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.dataset.load import Dataset, Scene
+from harness.dataset.schema import Branching, Edge, End
 from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.live_world import LiveSource
@@ -23,6 +26,7 @@ from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
 from harness.runs.summary import counted, scores
+from harness.world.drivers import DRIVERS
 
 FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
 
@@ -107,20 +111,26 @@ class Walked:
 def asker_of(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Asker:
     """An asker that has asked about every scene."""
     asker = Asker(spec, lambda: backend, latency, kept)
-    asker.ask(list(requests(spec, scenes_of(spec))))
+    assert isinstance(spec.source, FrozenSource)
+    asker.ask(list(requests(spec, all_scenes(spec.source.dataset))))
     return asker
 
 
-def scenes_of(spec: Spec) -> tuple[Scene, ...]:
-    assert isinstance(spec.source, FrozenSource)
-    return spec.source.dataset.scenes
+def all_scenes(dataset: Dataset) -> list[Scene]:
+    """Every scene of a dataset's trees, in their order."""
+    return dataset.scenes(dataset.forest.ids)
+
+
+def scenes_of(dataset: Dataset) -> list[Scene]:
+    """The scenes on the reference drivers' courses, by episode and step."""
+    return dataset.scenes(dataset.courses())
 
 
 def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Walked:
     """A whole evaluation but for its folder: asked, walked and scored."""
-    asker = asker_of(spec, backend, latency, kept)
+    asker = Asker(spec, lambda: backend, latency, kept)
     assert isinstance(spec.source, FrozenSource)
-    world = FrozenWorld(spec.source.dataset, spec.seeds)
+    world = FrozenWorld(spec.source.dataset, spec.points, spec.seeds)
     parts = list(chain.from_iterable(walk(world, spec.points, asker)))
     made = table(parts, world.columns(), spec.actions)
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
@@ -163,15 +173,45 @@ def sure(action: str, role: str = "ego") -> str:
     return says([float(a == action) for a in ("SLOWER", "IDLE", "FASTER")], role)
 
 
-def with_outcomes(dataset: Dataset, steps: int, outcomes: Mapping[str, Mapping[str, float | str]]) -> Dataset:
-    """The scenes' first steps, with a made-up outcome table: seconds to clear, or how it fails."""
-    scenes = []
-    for scene in dataset.scenes:
-        if scene.record["step"] < steps and scene.id in outcomes:
-            made = {
-                action: {"result": "cleared", "time_s": end} if isinstance(end, float)
-                else {"result": end, "time_s": 5.0}
-                for action, end in outcomes[scene.id].items()
-            }  # fmt: skip
-            scenes.append(replace(scene, record={**scene.record, "outcomes": made}))
-    return replace(dataset, scenes=tuple(scenes))
+def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str, float | str]] | None = None,
+           driver: str = "cruise", drives: Mapping[str, str] | None = None) -> Dataset:  # fmt: skip
+    """Trees with one branch: whatever is decided leads to the next scene of a driver's course.
+
+    Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and action,
+    has how: seconds until cleared, or the failure. At the last step every action does, by default cleared
+    after 5 s.
+
+    Args:
+        dataset: whose scenes are taken.
+        steps: at most, of each episode.
+        outcomes: how actions end. If given, scenes that it has not are left out.
+        driver: whose course it is.
+        drives: what every reference driver does in a scene, the full-view driver too; else IDLE.
+    """
+    forest, trees, scenes = dataset.forest, [], {}
+    visited = [forest.ids[n] for n in forest.visited(forest.drivers[driver]).tolist()]
+    for tree in dataset.trees:
+        mine = [name for name in visited if name.startswith(f"{tree.episode:05d}-")][:steps]
+        named = {name[:7]: scene for name, scene in zip(mine, dataset.scenes(mine), strict=True)}
+        if outcomes is not None:
+            named = {name: scene for name, scene in named.items() if name in outcomes}
+        if not named:
+            continue
+        for name, scene in named.items():
+            scenes[name] = replace(scene, record={**scene.record, "scene": name})
+        levels = [
+            [Branching(name, dict.fromkeys(DRIVERS, (drives or {}).get(name, "IDLE")), [
+                _edge(action, (outcomes or {}).get(name, {}).get(action), last=step == len(named) - 1)
+                for action in dataset.actions
+            ])]
+            for step, name in enumerate(named)
+        ]  # fmt: skip
+        trees.append(msgspec.structs.replace(tree, levels=levels))
+    return replace(dataset, trees=tuple(trees), _scenes=scenes)
+
+
+def _edge(action: str, outcome: float | str | None, last: bool) -> Edge:
+    if outcome is None and not last:
+        return Edge([action], 0, None, 1.0, 0, 0)
+    how, time_s = (outcome, 5.0) if isinstance(outcome, str) else ("cleared", outcome or 5.0)
+    return Edge([action], None, End(how, time_s, None, None, None), 1.0, 0, 0)  # type: ignore[arg-type]

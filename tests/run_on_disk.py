@@ -21,9 +21,18 @@ Row = dict[str, Any]
 Change = Callable[[Row], object]
 
 _FROZEN = FrozenScenes(
-    name="made-up", sha256="0" * 64, scenes=0, episodes=0, limit=None, delay_allowance_s=1.0, path="nowhere"
+    name="made-up",
+    sha256="0" * 64,
+    nodes=0,
+    episodes=0,
+    limit=None,
+    delay_allowance_s=1.0,
+    decision_lag_s=0.145,
+    path="nowhere",
 )
-_DRIVEN = ClosedLoop(scenario={"name": "made-up"}, first_seed=0, episodes=0, late_against="nobody")
+_DRIVEN = ClosedLoop(
+    scenario={"name": "made-up", "parameters": {}}, first_seed=0, episodes=0, late_against="nobody"
+)
 
 
 def made_up(
@@ -163,7 +172,7 @@ def _decision(
     if closed_loop:
         row |= {"acts_at_s": step + latency_ms / 1000, "acted": True}
     else:
-        row |= {"safe": True, "delay_s": 0.0}
+        row |= {"value": True, "safe": True, "regret": False, "delay_s": 0.0, "off_lag": False}
         row |= {f"safe_{action}": action == "IDLE" for action in ACTIONS}
         row |= {f"delay_s_{action}": 0.0 if action == "IDLE" else None for action in ACTIONS}
     for place, viewer in enumerate(viewers[1:], 1):

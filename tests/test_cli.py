@@ -17,7 +17,7 @@ from harness import cli
 from harness.cli.options import parse_seeds
 from harness.cli.run import default_out
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",
@@ -123,13 +123,22 @@ def test_a_dataset_that_is_none_is_one_line(harness: Harness, tmp_path: Path) ->
 
 @pytest.mark.parametrize("keep", [0, 1, -1, -4000])
 def test_a_truncated_dataset_is_refused(harness: Harness, broken: Path, keep: int) -> None:
-    data = (broken / "scenes.jsonl").read_bytes()
-    (broken / "scenes.jsonl").write_bytes(data[:keep])
-    line = one_line(harness("eval", "--dataset", broken))
-    assert "scenes.jsonl: changed, its sha256 is not the manifest's" in line
+    data = (broken / "layouts.zip").read_bytes()
+    (broken / "layouts.zip").write_bytes(data[:keep])
+    assert "layouts.zip: cannot be read (" in one_line(harness("eval", "--dataset", broken))
 
 
-@pytest.mark.parametrize("name", ["scenes.jsonl", "scene.schema.json", "manifest.schema.json", "README.md"])
+def test_one_changed_byte_is_noticed_in_the_layouts(harness: Harness, broken: Path) -> None:
+    data = bytearray((broken / "layouts.zip").read_bytes())
+    data[len(data) // 2] ^= 1
+    (broken / "layouts.zip").write_bytes(data)
+    for command in (["eval"], ["prompt", "check", "v2"]):
+        assert "layouts.zip 0000" in one_line(harness(*command, "--dataset", broken))
+
+
+@pytest.mark.parametrize(
+    "name", [f"{of}.schema.json" for of in ("scene", "tree", "manifest")] + ["README.md"]
+)
 def test_one_changed_byte_is_noticed_in_any_file(harness: Harness, broken: Path, name: str) -> None:
     data = bytearray((broken / name).read_bytes())
     data[len(data) // 2] ^= 1
@@ -154,20 +163,23 @@ def test_a_tokenizer_that_is_none_is_one_line(harness: Harness, small_path: Path
 
 
 def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, small_path: Path) -> None:
+    scenes = len(load(small_path, 2).courses())
     said = harness("eval", "--dry-run", "--dataset", small_path, "--limit", "2", "--seeds", "7,9")
     assert (said.code, said.err, os.listdir()) == (0, "", [])
-    assert "48 requests for 12 scenes; would score 3 conditions × 2 seeds; no model was called" in said.out
+    assert f"{4 * scenes} requests for the {scenes} scenes on the reference drivers' courses" in said.out
+    assert "; would score 3 conditions × 2 seeds; no model was called" in said.out
     assert "prompt tokens: not counted" in said.out
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
-    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (24, [0, 1, 2, 3, 4], None)
+    scenes = len(load(small_path).courses())
+    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (scenes, [0, 1, 2, 3, 4], None)
     assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
 
 
 def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     listed = json.loads(harness("prompt", "list", "--json").out)
     assert [p["version"] for p in listed] == ["paper", "v1", "v2", "v3"]
-    args = ("prompt", "show", "v2", "--scene", "00001-2", "--dataset", small_path)
+    args = ("prompt", "show", "v2", "--scene", "00001-0", "--dataset", small_path)
     shown = json.loads(harness(*args, "--json").out)
     assert list(shown) == ["v1", "v2", "v3", "v4"]
     assert [m["role"] for m in shown["v3"]] == ["system", "user"]
@@ -181,10 +193,11 @@ def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Pa
     versions = ["paper", "v1", "v2", "v3"]
     assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions]
     assert max(map(len, said.out.splitlines())) <= 80
-    said = harness("prompt", "show", "v2", "--scene", "00001-2", "--viewer", "v1", "--dataset", small_path)
+    said = harness("prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path)
     assert said.out.startswith("--- v1 system\nYou drive car v1")
     said = harness("prompt", "check", "v2", "--dataset", small_path)
-    assert said.out.startswith("v2: renders for every viewer of 24 scenes; budget 200 to 400 tokens\n")
+    scenes = len(load(small_path).courses())
+    assert said.out.startswith(f"v2: renders for every viewer of {scenes} scenes; budget 200 to 400 tokens\n")
     assert "tokens not counted" in said.out
 
 
@@ -194,15 +207,22 @@ def test_a_prompt_outside_its_budget_ends_with_one(
     """A tokenizer that takes a whole prompt for one word."""
     Tokenizer(models.WordLevel({"?": 0}, unk_token="?")).save(str(tmp_path / "words.json"))
     args = ("prompt", "check", "v2", "--dataset", small_path, "--tokenizer", tmp_path / "words.json")
-    said = harness(*args)
+    said, data = harness(*args), load(small_path)
+    scenes, first = len(data.courses()), data.forest.ids[0]
+    every = 7 * scenes  # four viewers, and the ego with the messages of one, two and three
     assert said.code == 1
-    assert "outside the budget: 168 of 168 prompts; the first are\nscene 00000-0 viewer v1: 2" in said.out
-    assert "scene 00000-0 viewer v1 with messages of 3: 2 tokens" in said.out
+    assert (
+        f"outside the budget: {every} of {every} prompts; the first are\nscene {first} viewer v1: 2"
+        in said.out
+    )
+    assert f"scene {first} viewer v1 with messages of 3: 2 tokens" in said.out
     told = json.loads(harness(*args, "--json").out)
     two = {"least": 2, "mean": 2.0, "most": 2}
-    assert told["tokens"] == {"ego": {"n": 24, **two}, "helper": {"n": 72, **two}, "fusion": {"n": 72, **two}}
+    assert told["tokens"] == {
+        role: {"n": each * scenes, **two} for role, each in (("ego", 1), ("helper", 3), ("fusion", 3))
+    }
     assert {o["messages"] for o in told["outside"]} == {0, 1, 2, 3}
-    assert len(told["outside"]) == 168
+    assert len(told["outside"]) == every
 
 
 @pytest.mark.parametrize("text", ["0:5", "0,1,2,3,4"])

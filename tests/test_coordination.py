@@ -2,7 +2,7 @@
 
 One scene throughout. The ego is 20 m from the conflict zone and in doubt. Three helpers at 10, 20 and
 30 m from the ego, and 10, 20 and 5 m from the zone, answer in 1000 bits each. Everybody infers for
-145 ms. Actions are SLOWER, IDLE, FASTER.
+145 ms. The request has 400 bits. Actions are SLOWER, IDLE, FASTER.
 """
 
 from dataclasses import fields, replace
@@ -55,28 +55,34 @@ def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
 
 
 def test_over_v2x_the_third_reply_is_late_and_not_fused_but_waited_for():
-    """Slots of 25.1 ms: replies end at 170.1, 195.2 and 220.3 ms. Weights are 1/20 : 1/10 : 1/20."""
+    """A request of 40 us, slots of 25.1 ms: replies end at 170.14, 195.24 and 220.34 ms.
+
+    Weights are 1/20 : 1/10 : 1/20.
+    """
     decision = play(V2X)
     assert decision.triggered
-    assert decision.arrival_s == pytest.approx([0.1701, 0.1952, 0.2203])
+    assert decision.arrival_s == pytest.approx([0.17014, 0.19524, 0.22034])
     assert decision.on_time.tolist() == [True, True, False]
     assert decision.weights == pytest.approx([0.25, 0.5, 0.25, 0.0])
     assert decision.fused == pytest.approx([0.625, 0.2, 0.175])
     assert decision.action == 0
-    assert decision.latency_s == pytest.approx(0.2203)
+    assert decision.latency_s == pytest.approx(0.22034)
     assert decision.deadline_missed
     assert (decision.messages, decision.lost, decision.late) == (3, 0, 1)
 
 
 def test_over_6g_all_three_are_fused_and_the_slowest_is_the_latency():
-    """5 ms, 5 us of serialisation and 0, 0.95, 1.9 ms of jitter. Weights are 1/20 : 1/10 : 1/20 : 1/5."""
+    """2 us of the request, 5 ms, 5 us of the reply and 0, 0.95, 1.9 ms of jitter.
+
+    Weights are 1/20 : 1/10 : 1/20 : 1/5.
+    """
     decision = play(SIXG)
-    assert decision.arrival_s == pytest.approx([0.150005, 0.150955, 0.151905])
+    assert decision.arrival_s == pytest.approx([0.150007, 0.150957, 0.151907])
     assert decision.on_time.tolist() == [True, True, True]
     assert decision.weights == pytest.approx([0.125, 0.25, 0.125, 0.5])
     assert decision.fused == pytest.approx([0.3125, 0.1, 0.5875])
     assert decision.action == 2
-    assert decision.latency_s == pytest.approx(0.151905)
+    assert decision.latency_s == pytest.approx(0.151907)
     assert not decision.deadline_missed
     assert (decision.messages, decision.lost, decision.late) == (3, 0, 0)
 
@@ -84,11 +90,33 @@ def test_over_6g_all_three_are_fused_and_the_slowest_is_the_latency():
 @pytest.mark.parametrize("lost_link", [(0.01, 0.9), (0.9, 0.01)], ids=["request", "reply"])
 def test_a_helper_whose_request_or_reply_is_lost_keeps_its_slot_and_is_not_fused(lost_link):
     decision = play(V2X, link=(lost_link, (0.9, 0.9), (0.9, 0.9)))
-    assert decision.arrival_s == pytest.approx([np.inf, 0.1952, 0.2203])
+    assert decision.arrival_s == pytest.approx([np.inf, 0.19524, 0.22034])
     assert decision.weights == pytest.approx([0.5, 0.0, 0.5, 0.0])
     assert decision.fused == pytest.approx([0.45, 0.3, 0.25])
-    assert decision.latency_s == pytest.approx(0.2203)
+    assert decision.latency_s == pytest.approx(0.22034)
     assert (decision.messages, decision.lost, decision.late) == (3, 1, 1)
+
+
+def test_a_request_is_one_message_of_its_own_and_costs_bits_and_airtime():
+    """Over v2x 400 bits are 40 us and three replies of 1000 bits 300 us; the paper counts replies alone."""
+    decision = play(V2X)
+    assert (decision.requests, decision.messages) == (1, 3)
+    assert (decision.request_bits, decision.reply_bits) == (400, 3000)
+    assert decision.airtime_s == pytest.approx(340e-6)
+    twice = play(replace(V2X, roadside_edge=True))
+    assert (twice.requests, twice.reply_bits) == (1, 3000)
+    assert twice.airtime_s == pytest.approx(640e-6), "replies go twice, the request once"
+    long = play(replace(V2X, request_bits=10_000.0))
+    assert long.arrival_s == pytest.approx([0.1711, 0.1962, 0.2213]), "a request of 1 ms holds up every reply"
+    slow = play(replace(SIXG, request_bits=2e6), inference_s=(0.145, 0.145, 0.150, 0.165), jitter=(0, 0, 0))
+    assert slow.arrival_s == pytest.approx([0.160005, 0.160005, 0.170005]), "none leaves before it is heard"
+
+
+@pytest.mark.parametrize("quiet", [{"own": (0.9, 0.05, 0.05)}, {"valid": (False, False, False)}])
+def test_who_asks_nobody_sends_nothing(quiet):
+    decision = play(V2X, **quiet)
+    assert (decision.requests, decision.request_bits, decision.reply_bits, decision.airtime_s) == (0, 0, 0, 0)
+    assert decision.latency_s == 0.145
 
 
 def test_an_ego_that_hears_nobody_falls_back_to_its_own_intent():
@@ -133,9 +161,9 @@ def test_an_invalid_helper_sends_nothing_and_takes_no_slot():
         inference_s=(0.145, 0.145, unknown, 0.145),
     )
     assert decision.asked.tolist() == [True, False, True]
-    assert decision.arrival_s == pytest.approx([0.1701, np.inf, 0.1952])
+    assert decision.arrival_s == pytest.approx([0.17014, np.inf, 0.19524])
     assert decision.weights == pytest.approx([1 / 7, 2 / 7, 0.0, 4 / 7])
-    assert decision.latency_s == pytest.approx(0.1952)
+    assert decision.latency_s == pytest.approx(0.19524)
 
 
 def test_only_the_nearest_in_the_radius_are_asked():
@@ -150,7 +178,7 @@ def test_only_the_nearest_in_the_radius_are_asked():
 
 def test_a_reply_leaves_only_when_the_helper_has_its_own_answer():
     decision = play(SIXG, inference_s=(0.145, 0.100, 0.160, 0.250), jitter=(0.0, 0.0, 0.0))
-    assert decision.arrival_s == pytest.approx([0.150005, 0.165005, 0.255005])
+    assert decision.arrival_s == pytest.approx([0.150007, 0.165005, 0.255005])
     assert decision.on_time.tolist() == [True, True, False]
     assert decision.latency_s == pytest.approx(0.255005)
 
@@ -206,16 +234,16 @@ def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
     draws = ((0.9, 0.05), (0.9, 0.9), (0.05, 0.9))
     decision = play(replace(V2X, roadside_edge=True), link=draws)
     assert decision.delivered.tolist() == [True, True, False]
-    assert decision.arrival_s == pytest.approx([0.1952, 0.2454, np.inf])
+    assert decision.arrival_s == pytest.approx([0.19524, 0.24544, np.inf])
     assert decision.on_time.tolist() == [True, False, False]
 
 
 def test_helpers_on_demand_begin_when_they_are_asked():
-    """145 ms of the ego, 145 of each helper, then slots of 25.1 ms one after another."""
+    """145 ms of the ego, 40 us of the request, 145 ms of each helper, then slots of 25.1 ms."""
     wide = replace(V2X, on_demand=True, window_s=0.4)
-    assert play(wide).arrival_s == pytest.approx([0.3151, 0.3402, 0.3653])
+    assert play(wide).arrival_s == pytest.approx([0.31514, 0.34024, 0.36534])
     slow = play(wide, inference_s=(0.145, 0.145, 0.100, 0.300))
-    assert slow.arrival_s == pytest.approx([0.3151, 0.2701, 0.4701])
+    assert slow.arrival_s == pytest.approx([0.31514, 0.27014, 0.47014])
     assert slow.on_time.tolist() == [True, True, False]
     assert play(replace(V2X, on_demand=True)).fused.tolist() == list(DOUBT), "nobody is on time"
 
@@ -234,20 +262,20 @@ def asked_again(*heard: bool, answer=AGREED, seconds=0.160):
 
 
 def test_ego_prompt_acts_on_the_models_second_answer_and_waits_for_it():
-    """Over 6g the exchange ends at 151.905 ms; the second inference takes 160 ms more."""
+    """Over 6g the exchange ends at 151.907 ms; the second inference takes 160 ms more."""
     decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=asked_again(True, True, True))
     assert decision.fused == pytest.approx(AGREED)
     assert decision.action == 2
-    assert decision.exchange_s == pytest.approx(0.151905)
-    assert decision.latency_s == pytest.approx(0.311905)
+    assert decision.exchange_s == pytest.approx(0.151907)
+    assert decision.latency_s == pytest.approx(0.311907)
     assert decision.deadline_missed
     assert np.isnan(decision.weights).all()
 
 
 def test_ego_prompt_reads_only_what_came_in_time():
-    """Over v2x the third reply ends at 220.3 ms: waited for, not read."""
+    """Over v2x the third reply ends at 220.34 ms: waited for, not read."""
     decision = play(replace(V2X, consensus="ego-prompt"), fusion_call=asked_again(True, True, False))
-    assert decision.latency_s == pytest.approx(0.3803)
+    assert decision.latency_s == pytest.approx(0.38034)
     assert decision.late == 1
 
 
@@ -266,7 +294,7 @@ def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_t
     decision = play(replace(SIXG, consensus="ego-prompt"), fusion_call=failed)
     assert decision.fusion_failed
     assert decision.fused.tolist() == list(DOUBT)
-    assert decision.latency_s == pytest.approx(0.311905)
+    assert decision.latency_s == pytest.approx(0.311907)
 
 
 @pytest.mark.parametrize(

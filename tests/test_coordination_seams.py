@@ -145,15 +145,18 @@ def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws
 def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
     channel = CHANNELS[name]
     links, draws = links_and_draws((40, 4))
-    up, delay_s, loss = channel.deliver(links, draws)
+    up, delay_s, loss, airtime_s = channel.deliver(links, draws)
     assert up.shape == delay_s.shape == (40, 4)
     assert loss.shape in ((40, 4), (40, 1))
+    assert airtime_s.shape == (40, 4)
+    assert 0 <= channel.request_s(400.0) <= channel.request_s(800.0)
     assert np.array_equal(np.isfinite(delay_s), links.asked)
     assert np.all((delay_s >= links.ready_s)[links.asked])
     assert np.nanmin(loss) >= 0
     assert np.nanmax(loss) <= 1
     row = Links(**{field: getattr(links, field)[7] for field in links.__dataclass_fields__})
-    for batch, single in zip((up, delay_s, loss), channel.deliver(row, draws.take(7)), strict=True):
+    alone = channel.deliver(row, draws.take(7))
+    for batch, single in zip((up, delay_s, loss, airtime_s), alone, strict=True):
         assert np.array_equal(batch[7], single, equal_nan=True)
 
 

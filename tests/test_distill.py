@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,25 +11,26 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import torch
+from evaluating import course, scenes_of
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset, load, shared
+from harness.dataset.load import Dataset, load
 from harness.parsing.parse import parse
 from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.training.answers import answer, message
 from harness.training.distill import distill
-from harness.training.examples import alone, excerpts, kl_nats, labels, split, with_messages
+from harness.training.examples import alone, excerpts, kl_nats, labels, split, taught, with_messages
 from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
 from harness.training.train import STAGES, Plan
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
-PLAN = Plan({"excerpts": 64, "alone": 128, "messages": 64, "answers": 96}, batch=8)
+PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 64, "answers": 96}, batch=8)
 VERSIONS = [prompts.load("v1"), prompts.load("v2")]
 
 
@@ -55,21 +55,14 @@ def student(few: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # -- the teacher ------------------------------------------------------------------------------------
 
 
-def outcome(result: str, time_s: float = 5.0) -> dict[str, Any]:
-    return {"result": result, "time_s": time_s}
-
-
 def test_the_teacher_wants_what_turned_out_safe_and_least_late(few: Dataset) -> None:
     """SLOWER costs 0.5 s: exp(-2) beside 1 for IDLE and 0.3 for FASTER."""
-    tables = [
-        {"SLOWER": outcome("cleared", 5.5), "IDLE": outcome("cleared"), "FASTER": outcome("cleared")},
-        {"SLOWER": outcome("cleared", 7.0), "IDLE": outcome("collision"), "FASTER": outcome("collision")},
-        {a: outcome("collision") for a in ACTIONS},
-    ]
-    scenes = tuple(
-        replace(s, record={**s.record, "outcomes": t}) for s, t in zip(few.scenes, tables, strict=False)
-    )
-    free, danger, lost = labels(replace(few, scenes=scenes))
+    outcomes = {
+        "00000-0": {"SLOWER": 5.5, "IDLE": 5.0, "FASTER": 5.0},
+        "00001-0": {"SLOWER": 7.0, "IDLE": "collision", "FASTER": "collision"},
+        "00002-0": dict.fromkeys(ACTIONS, "collision"),
+    }
+    free, danger, lost = labels(course(few, 1, outcomes))
     total = np.exp(-2.0) + 1.3
     assert free == pytest.approx([np.exp(-2.0) / total, 1 / total, 0.3 / total])
     assert danger.tolist() == [1.0, 0.0, 0.0]
@@ -91,7 +84,7 @@ def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
 def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[float], bare: bool) -> None:
     intent = np.array(weights) / sum(weights)
     for prompt in VERSIONS:
-        for graph in few.scenes[2].record["graphs"].values():
+        for graph in scenes_of(few)[2].record["graphs"].values():
             text = answer(prompt, graph, intent, ACTIONS, bare=bare)
             said = parse(text, role=graph["role"], actions=ACTIONS)
             reasons_first = prompt.helper_answer == "recommendation" and not bare
@@ -104,15 +97,15 @@ def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[fl
 
 
 def test_a_helpers_evidence_keeps_to_twelve_words(few: Dataset) -> None:
-    for scene in few.scenes:
+    for scene in scenes_of(few):
         for graph in scene.record["graphs"].values():
             assert len(message(graph, np.array([0.2, 0.5, 0.3]), ACTIONS)["evidence"].split()) <= 12
 
 
 def test_the_ego_with_messages_reads_what_helpers_sent(few: Dataset) -> None:
-    asked = list(alone(few, VERSIONS))
+    asked = list(alone(few, taught(few), VERSIONS))
     intents = {q.key: np.array([0.91, 0.06, 0.03]) for q in asked}
-    heard = list(with_messages(few, VERSIONS, intents))
+    heard = list(with_messages(few, taught(few), VERSIONS, intents))
     assert heard
     for q in heard:
         assert q.key.endswith("+m")
@@ -121,7 +114,7 @@ def test_the_ego_with_messages_reads_what_helpers_sent(few: Dataset) -> None:
 
 
 def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(few: Dataset) -> None:
-    asked = {q.key: q for q in alone(few, VERSIONS)}
+    asked = {q.key: q for q in alone(few, taught(few), VERSIONS)}
     short = list(excerpts(list(asked.values()), ACTIONS))
     assert short
     for q in short:
@@ -184,7 +177,7 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, fe
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(student)
-    for q in list(alone(few, VERSIONS))[:8]:
+    for q in list(alone(few, taught(few), VERSIONS))[:8]:
         asked = readout.asked(q.messages, ACTIONS)
         rendered = tokenizer.apply_chat_template(
             [dict(m) for m in asked], tokenize=False, add_generation_prompt=True
@@ -265,7 +258,13 @@ def test_bad_input_writes_nothing(options: list[str], said: str, small_path: Pat
 
 def test_held_out_episodes_are_in_neither_half_twice(few: Dataset) -> None:
     kept, apart = split(few, 1)
-    assert len(kept.scenes) + len(apart.scenes) == len(few.scenes)
-    assert {s.record["episode"] for s in apart.scenes} == {2}
-    assert shared(kept, apart) == 0
-    assert shared(kept, few) == len(kept.scenes)
+    assert (kept.episodes, apart.episodes) == ((0, 1), (2,))
+
+
+def test_it_learns_from_every_level_of_a_tree(few: Dataset) -> None:
+    """Not from one driver's course alone, and from no more scenes than it needs."""
+    scenes = taught(few)
+    for tree in few.trees:
+        steps = [s.record["step"] for s in scenes if s.record["episode"] == tree.episode]
+        assert [steps.count(step) for step in range(6)] == [1, 2, 3, 3, 3, 3]
+    assert [s.id for s in taught(few)] == [s.id for s in scenes]

@@ -43,9 +43,8 @@ CUT = {
 # Ends otherwise than its page shows, since what it reads was cut.
 CUT_ENDS = {
     # Two episodes pass the gates that 240 fail.
-    "harness compare reports/v1 reports/v2"
+    "harness compare reports/a reports/b"
     " --fail-if '6g:success_rate < -0.01' --fail-if 'unsafe_rate.low > 0'": 0,
-    "harness scenario audit occluded-intersection": 1,  # so few layouts tell something by accident
 }
 
 # Held against the program's options, and not run.
@@ -56,7 +55,7 @@ NOT_RUN = {
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
-    "harness dataset rank occluded-intersection-v1 --json": "long; docs/datasets.md ranks a small one",
+    "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {
     "make": "CI runs it",

@@ -7,11 +7,7 @@ import pytest
 import vl_convert
 
 from harness.core import kept
-from harness.dataset.load import Dataset
-from harness.evaluate import success
-from harness.evaluate.success import reference_success
 from harness.report import library
-from harness.world.drivers import DRIVERS
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +23,6 @@ def _unmade(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("it was kept")
 
     monkeypatch.setattr(vl_convert, "javascript_bundle", again)
-    monkeypatch.setattr(success, "driver_choices", again)
 
 
 def test_the_bundle_is_made_once_and_a_changed_one_is_never_run(
@@ -52,32 +47,6 @@ def test_a_bundle_of_a_version_that_is_not_known_is_made_and_not_kept(
     monkeypatch.setattr(library, "BUNDLES", {})
     assert library.vega.__wrapped__() == "(()=>{other})();"
     assert not folder.exists()
-
-
-def test_reference_drivers_are_played_once_for_a_dataset_and_a_program(
-    small: Dataset, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played = reference_success(small)
-    assert list(played) == list(DRIVERS)
-    with monkeypatch.context() as patch:
-        _unmade(patch)
-        assert reference_success(small) == played
-        patch.setattr(kept, "code_sha256", lambda *patterns: "another planner")
-        with pytest.raises(AssertionError, match="it was kept"):
-            reference_success(small)
-
-
-@pytest.mark.parametrize(
-    "said", [b"", b"\xff", b"[" * 100_000, b"[]", b"null", b'{"brake": 1}', b'{"%s": NaN}', b'{"%s": 2}']
-)
-def test_broken_shares_are_played_again(small: Dataset, folder: Path, said: bytes) -> None:
-    played = reference_success(small)
-    [file] = folder.iterdir()
-    if b"%s" in said:
-        said = b'{"brake": 0, "cruise": 0, "local-view": 0, ' + said.replace(b"%s", b"full-view")[1:]
-    file.write_bytes(said)
-    assert reference_success(small) == played
-    assert file.read_bytes() != said
 
 
 def test_a_folder_that_cannot_be_written_keeps_nothing(folder: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from evaluating import Scripted, run, says, spec_of
+from evaluating import Scripted, run, says, scenes_of, spec_of
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
@@ -133,7 +133,7 @@ class Clock(Scripted):
 
 def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset) -> None:
     """Of five egos one failed at once and one was tried twice: three count."""
-    scenes = timing.spread_over(small.scenes)
+    scenes = timing.spread_over(scenes_of(small))
     good = says((0.2, 0.6, 0.2))
     ids = [f"{scene.id}/v1" for scene in scenes]
     backend = Clock({
@@ -155,10 +155,11 @@ def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset)
 
 def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
     lines = {
-        f"{s.id}/v1": Completion(f"{s.id}/v1", "", None, None, "error", 0.1, 1, "no") for s in small.scenes
+        f"{s.id}/v1": Completion(f"{s.id}/v1", "", None, None, "error", 0.1, 1, "no")
+        for s in scenes_of(small)
     }
     with pytest.raises(UserError, match="no answer of swarm-tiny could be timed in 5 scenes; see what"):
-        measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(small.scenes))
+        measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(scenes_of(small)))
 
 
 # -- and what answers took decides nothing ----------------------------------------------------------------
@@ -177,7 +178,7 @@ def test_no_seconds_retries_or_batches_move_a_row(
         def _say(self, request: Request) -> Completion:
             return replace(super()._say(request), seconds=0.5)
 
-    lines = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in small.scenes}
+    lines = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)}
     points = (*POINTS.values(), named_point("6g:consensus=ego-prompt"))
     found = []
     for name, backend, batch_size in (
@@ -191,7 +192,8 @@ def test_no_seconds_retries_or_batches_move_a_row(
         assert same_rows(tmp_path / name, tmp_path / "a")
     assert [m.latency for m in found] == [PAPER] * 3
     assert found[0].answer_times == found[1].answer_times == {}, "no time, or none of a first attempt"
-    assert found[2].answer_times["ego"] == Times(len(small.scenes), 0.5, 0.5, 0.5)
+    egos = sum(answer.role == "ego" for answer in answers_of(tmp_path / "c"))
+    assert found[2].answer_times["ego"] == Times(egos, 0.5, 0.5, 0.5)
 
 
 def test_times_by_hand(small: Dataset, tmp_path: Path) -> None:

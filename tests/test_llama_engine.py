@@ -16,7 +16,7 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 
 import tiny_qwen3
-from evaluating import spec_of
+from evaluating import scenes_of, spec_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
@@ -105,7 +105,7 @@ TOKENS = st.lists(st.integers(0, VOCABULARY - 1), max_size=5)
 def test_every_prompt_of_a_dataset_is_the_same_text_and_the_same_tokens(
     engine: LlamaEngine, theirs: Any, small: Dataset, prompt: str
 ) -> None:
-    asked = list(requests(spec_of(small, prompt=prompt), small.scenes))
+    asked = list(requests(spec_of(small, prompt=prompt), scenes_of(small)))
     assert len(asked) > 20
     for thinking in (False, True):
         for request in asked:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from evaluating import run, spec_of
+from evaluating import run, scenes_of, spec_of
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -98,7 +98,7 @@ def data(small_path: Path) -> Dataset:
 
 def some(data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int = 24) -> list[Request]:
     spec = replace(spec_of(data, prompt=prompt), card=cards.load("openai-example"), answer=answer)
-    asked = list(requests(spec, data.scenes))[:8]
+    asked = list(requests(spec, scenes_of(data)))[:8]
     # The server tells its template nothing about thinking, which opens no thought and closes none.
     return [replace(r, max_tokens=max_tokens, thinking=True) for r in asked]
 

@@ -12,7 +12,7 @@ pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 import tiny_qwen3
 import torch
 import transformers
-from evaluating import spec_of
+from evaluating import scenes_of, spec_of
 from typer.testing import CliRunner
 
 from harness.backends import cards
@@ -49,8 +49,8 @@ def unlike(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     spec = spec_of(data, str(folder))
-    asked = list(requests(spec, data.scenes))[:PROMPTS]
-    letters = list(requests(spec_of(data, str(folder), answer="readout"), data.scenes))[:PROMPTS]
+    asked = list(requests(spec, scenes_of(data)))[:PROMPTS]
+    letters = list(requests(spec_of(data, str(folder), answer="readout"), scenes_of(data)))[:PROMPTS]
     passes: list[int] = []
     found = compare(spec.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
     assert passes == [1] * PASSES
@@ -75,7 +75,7 @@ def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, smal
     found = compared(unlike, small)
     failed = {what for what, finding in found.items() if not finding.holds}
     assert failed == {"GGUF: greedy text equal", "GGUF: largest difference of a read-out"}
-    first = next(iter(requests(spec_of(small, str(unlike)), small.scenes)))
+    first = next(iter(requests(spec_of(small, str(unlike)), scenes_of(small))))
     assert found["GGUF: greedy text equal"].differences[0].startswith(f"{first.id}: ")
     # Against the checkpoint's own export in F32 nothing fails: the file is at fault, not the engine.
     assert found["F32: greedy text equal"].holds

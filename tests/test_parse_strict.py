@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judging import ROLES, hundredths, judged_strict, unhurried
 
-from harness.parsing.parse import Status, _unmended, parse
+from harness.parsing.parse import Repair, Status, _unmended, parse
 from harness.parsing.strict import fitting
 
 NAMES = st.lists(
@@ -65,12 +65,33 @@ def test_strict_is_what_the_published_schema_says_of_near_valid_helper_messages(
     assert strict == judged_strict(text, "helper")
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if not c.asked.get("thinking")], ids=lambda c: c.name)
+ONLY_JSON = [c for c in CASES if not c.asked.get("thinking") and not c.asked.get("reasons_first")]
+
+
+@pytest.mark.parametrize("case", ONLY_JSON, ids=lambda c: c.name)
 def test_strict_is_what_the_published_schema_and_the_sum_say_of_the_corpus(case: Any) -> None:
     if case.status is Status.ENGINE_ERROR:
         return  # not judged by its text
     text = case.text.removeprefix("<think>\n\n</think>")
     assert (case.status is Status.STRICT) == judged_strict(text, case.asked["role"])
+
+
+PROSE = st.text(st.characters(exclude_characters="{｛<＜[&\\`~", codec="utf-8"), max_size=60)
+
+
+@unhurried
+@given(PROSE.map(lambda prose: f"So: {prose}\n"), ANSWERS, ROLES)
+def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, value: Any, role: str) -> None:
+    """Whatever they say and whatever stands behind them; unasked they are a repair more."""
+    text = json.dumps(value)
+    bare = parse(text, role=role, actions=ACTIONS)
+    asked = parse(reasons + text, role=role, actions=ACTIONS, reasons_first=True)
+    unasked = parse(reasons + text, role=role, actions=ACTIONS)
+    if bare.verdict != "failed":
+        assert (asked.status, asked.repairs, asked.intent) == (bare.status, bare.repairs, bare.intent)
+        assert unasked.status is Status.RECOVERED
+        assert {*unasked.repairs} - {*bare.repairs} >= {Repair.PROSE_AROUND}
+    assert (asked.verdict == "failed") == (unasked.verdict == "failed") == (bare.verdict == "failed")
 
 
 @unhurried

@@ -108,10 +108,11 @@ def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarr
 
 def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables, small: Dataset):
     assert frozen.config["identity"] == {"engine": "cautious", "version": 1}
-    graphs = {scene.record["scene"]: scene.record["graphs"] for scene in small.scenes}
+    asked = small.scenes(frozen.answers.scene.unique().tolist())
+    graphs = {scene.id: scene.record["graphs"] for scene in asked}
     answers = frozen.answers
     assert len(answers) == sum(map(len, graphs.values()))
-    wary = np.array([bool(graphs[a.scene][a.viewer]["conflicts"]) for a in answers.itertuples()])
+    wary = np.array([bool(graphs[str(a.scene)][str(a.viewer)]["conflicts"]) for a in answers.itertuples()])
     assert 0 < wary.sum() < len(wary)
     expected = np.where(wary[:, None], (0.6, 0.3, 0.1), (0.2, 0.4, 0.4))
     assert answers[[f"intent_{action}" for action in ACTIONS]].to_numpy() == pytest.approx(expected)
@@ -131,13 +132,8 @@ def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request
 
 def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, small: Dataset):
     """An answer takes 10 ms, its way 10 ms more; one crossing is lost with 1 % a metre."""
-    range_m = {}
-    for scene in small.scenes:
-        at = {
-            vehicle["id"]: (vehicle["x_m"], vehicle["y_m"]) for vehicle in scene.record["state"]["vehicles"]
-        }
-        for viewer in scene.viewers:
-            range_m[scene.record["scene"], viewer] = float(np.hypot(*np.subtract(at[viewer], at["v1"])))
+    asked_scenes = small.scenes(frozen.answers.scene.unique().tolist())
+    range_m = {(s.id, v): known_m for s in asked_scenes for v, known_m in s.record["range_m"].items()}
     for condition, farthest_m in (("fog", 100.0), (CLOSE, 60.0)):
         decisions = decided(frozen, condition)
         sent = replies(decisions)
@@ -153,8 +149,14 @@ def test_the_channel_takes_its_time_and_loses_with_distance(frozen: Tables, smal
 
 
 def test_what_crosses_the_fog_crosses_a_better_channel_by_the_same_luck(frozen: Tables):
-    fog, clear = replies(decided(frozen, "fog")), replies(decided(frozen, "6g"))
-    assert fog[["scene", "seed", "helper"]].equals(clear[["scene", "seed", "helper"]])
+    """In the decision points to which both come: a lost message may lead elsewhere."""
+    key = ["scene", "seed", "helper"]
+    both = replies(decided(frozen, "fog")).merge(
+        replies(decided(frozen, "6g")), on=key, suffixes=("_fog", "_clear")
+    )
+    fog, clear = (both.filter(like=f"_{name}").rename(columns=lambda c: c.rpartition("_")[0])
+                  for name in ("fog", "clear"))  # fmt: skip
+    assert len(both) > 30
     assert (clear.delivered | ~fog.delivered).all()
     assert fog.delivered.sum() < clear.delivered.sum()
 

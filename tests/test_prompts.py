@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evaluating import scenes_of, spec_of
 from graphs import ACTIONS, CAR, CASES, MESSAGES, STANDING, TRUCK, graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from harness.backends.base import Completion
 from harness.backends.tokens import counter, tokenizer
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset
+from harness.evaluate.asking import answer_of, fusion_request, requests
 from harness.prompts import versions as prompts
 from harness.prompts.densest import EVIDENCE, densest_messages
 
@@ -68,7 +71,7 @@ def test_action_names_are_the_ones_passed_in(version: str) -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 def test_nobody_is_named_who_is_not_in_the_viewers_graph(version: str, small: Dataset) -> None:
     prompt = prompts.load(version)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         present = {v.id for v in scene.state.vehicles}
         for viewer, seen in scene.record["graphs"].items():
             known = {viewer, seen["ego"]["id"], *(n["id"] for n in seen["nodes"])}
@@ -261,6 +264,38 @@ def test_every_version_here_is_released() -> None:
     assert all(prompts.load(version).released for version in VERSIONS)
 
 
+def test_a_version_says_whether_reasons_come_first_and_v1_was_released_before_it_could(copied: Path) -> None:
+    assert {name: prompts.load(name).reasons_first for name in ("v1", "v2")} == {"v1": True, "v2": False}
+    shutil.copytree(copied / "v2", copied / "v9")
+    toml = copied / "v9/prompt.toml"
+    toml.write_text(toml.read_text(encoding="utf-8") + "reasons_first = true\n", encoding="utf-8")
+    assert prompts.load("v9", copied).reasons_first
+
+
+@pytest.mark.parametrize(("version", "status"), [("v1", "strict"), ("v2", "recovered")])
+def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
+    version: str, status: str, small: Dataset
+) -> None:
+    """What the v1 templates ask for, word by word, from the ego and from a helper, also in a fusion call."""
+    spec = spec_of(small, prompt=version)
+    scene = scenes_of(small)[0]
+    ego = 'The truck hides the left.\n{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
+    helper = (
+        'A car comes from the left.\n{"evidence": "car", "risk": "high", "recommended_maneuver": "SLOWER", '
+        '"confidence": 0.8}'
+    )
+    told = {}
+    for request in requests(spec, [scene]):
+        said = Completion(request.id, ego if request.role == "ego" else helper, None, None, "stop", None, 1)
+        told[request.id.partition("/")[2]] = answer_of(request, said)
+    fused = fusion_request(spec, scene, told, scene.viewers[1:])
+    told["merge"] = answer_of(fused, Completion(fused.id, ego, None, None, "stop", None, 1))
+    assert {(a.role, a.status) for a in told.values()} == {
+        ("ego", status), ("helper", status), ("merge", status),
+    }  # fmt: skip
+    assert {a.repairs for a in told.values()} == {() if status == "strict" else ("prose_around",)}
+
+
 @pytest.mark.parametrize("version", ["v9", "v1.1", "über 'v'"])
 def test_a_draft_may_change_until_it_is_locked(version: str, copied: Path) -> None:
     shutil.copytree(copied / "v2", copied / version)
@@ -314,7 +349,7 @@ def test_every_prompt_keeps_its_token_budget(
     assert count is not None
     least, most = prompt.token_budget
     assert (least, most) == (200, 400)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         for viewer, seen in scene.record["graphs"].items():
             if messages and seen["role"] == "helper":
                 continue
@@ -331,7 +366,7 @@ def test_no_evidence_takes_a_fusion_call_over_its_budget(
     prompt, count = prompts.load(version), counter(vocabulary)
     assert count is not None
     assert count([{"content": EVIDENCE}]) == len(EVIDENCE)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         ego, *helpers = scene.viewers
         messages = densest_messages(helpers[:senders], small.actions)
         n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages))

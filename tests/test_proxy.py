@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluating import scenes_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -141,7 +142,7 @@ def test_a_car_that_arrives_with_the_ego_makes_it_brake_and_say_so() -> None:
 
 def test_it_reads_its_own_view_and_neither_messages_nor_truth(small: Dataset) -> None:
     prompt = load("v2")
-    for scene in small.scenes[:6]:
+    for scene in scenes_of(small)[:6]:
         for viewer in scene.viewers:
             graph = scene.record["graphs"][viewer]
             bare = Request("a", graph["role"], (), ACTIONS, 64, view=graph, scenario=SCENARIO)

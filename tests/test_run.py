@@ -11,7 +11,19 @@ from typing import Any
 import msgspec
 import pandas as pd
 import pytest
-from evaluating import FILES, decisions, figure, run, same_decisions, same_files, same_scores, spec_of
+from evaluating import (
+    FILES,
+    all_scenes,
+    course,
+    decisions,
+    figure,
+    run,
+    same_decisions,
+    same_files,
+    same_scores,
+    scenes_of,
+    spec_of,
+)
 from run_on_disk import answers_of, rows_of
 
 from harness.backends import cards
@@ -21,7 +33,6 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
-from harness.evaluate.success import driver_choices
 from harness.prompts import versions as prompts
 from harness.runs.records import Answer, FrozenScenes
 from harness.world.drivers import DRIVERS
@@ -137,7 +148,7 @@ def refused(spec: Spec, out: Path) -> str:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"prompt": "v1"}, "was asked 00000-0/v1 with another prompt or dataset; replay it with that run's"),
+        ({"prompt": "v1"}, "/v1 with another prompt or dataset; replay it with that run's"),
         ({"thinking": True}, "was run with thinking off; leave --thinking out"),
         ({"answer": "constrained"}, "was run with --answer json; replay it with the same"),
         ({"answer": "readout"}, "was run with --answer json; replay it with the same"),
@@ -154,11 +165,12 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
 ) -> None:
     run(spec_of(load(small_path, limit=3)), tmp_path / "three")
     said = refused(spec_of(small, f"replay:{tmp_path / 'three'}"), tmp_path / "out")
-    assert said.endswith("holds no answer for 00003-0/v1; replay a run of the same dataset and limit")
-    moved = replace(
-        small.scenes[0], record={**small.scenes[0].record, "graphs": small.scenes[1].record["graphs"]}
+    assert said.endswith(
+        f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and limit"
     )
-    other = replace(small, scenes=(moved, *small.scenes[1:]))
+    root, after = scenes_of(small)[:2]
+    moved = replace(root, record={**root.record, "graphs": after.record["graphs"]})
+    other = replace(small, _scenes={root.id: moved})
     assert "another prompt or dataset" in refused(spec_of(other, f"replay:{proxy_run}"), tmp_path / "out")
 
 
@@ -289,9 +301,10 @@ def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
 def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
     small: Dataset, tmp_path: Path
 ) -> None:
+    data = course(small)  # whatever is heard, all come to the same scenes
     losses = (0.0, 0.05, 0.3, 0.6, 1.0)
     points = tuple(OperatingPoint(f"loss-{x}", "6g", loss=x, tau_nats=0.0) for x in losses)
-    run(spec_of(small, points=points, seeds=(0, 1, 2)), tmp_path / "run")
+    run(spec_of(data, points=points, seeds=(0, 1, 2)), tmp_path / "run")
     heard = []
     for point in points:
         made = decisions(tmp_path / "run", point.name)
@@ -300,7 +313,7 @@ def test_conditions_share_their_luck_so_more_loss_never_lets_more_through(
     for clearer, worse in pairwise(heard):
         assert all(w <= c for c, w in zip(clearer, worse, strict=True))
     counts = [sum(map(len, by_name)) for by_name in heard]
-    assert counts[0] == 24 * 3 * 3
+    assert counts[0] == len(all_scenes(data)) * 3 * 3
     assert counts[0] > counts[1] > counts[2] > counts[3] > counts[4] == 0
 
 
@@ -323,10 +336,11 @@ def test_a_blocked_link_stays_blocked_for_its_episode_and_for_no_other(
 
 def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_path: Path) -> None:
     """Asked by a proxy with v1 or v2, a helper's link is up or down alike."""
+    data = course(small)  # whatever is decided, both come to the same scenes
     point = OperatingPoint("half", "6g", loss=0.3, tau_nats=0.0)
     links = []
     for prompt in ("v1", "v2"):
-        run(spec_of(small, prompt=prompt, points=(point,)), tmp_path / prompt)
+        run(spec_of(data, prompt=prompt, points=(point,)), tmp_path / prompt)
         links.append(
             [[(m.sender, m.delivered) for m in d.messages] for d in decisions(tmp_path / prompt, "half")]
         )
@@ -338,15 +352,20 @@ def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
     driver: str, small: Dataset, tmp_path: Path
 ) -> None:
     done = run(spec_of(small, driver), tmp_path / "run")
-    chosen = [small.actions[i] for i in driver_choices(small, driver)]
+    forest = small.forest
+    course = forest.visited(forest.drivers[driver])
+    chosen = [small.actions[i] for i in forest.drivers[driver][course]]
     for condition in ALL:
         for seed in (0, 1):
             made = [d for d in decisions(tmp_path / "run", condition) if d.seed == seed]
             assert [d.action for d in made] == chosen
-            assert all((d.messages, d.latency_ms) == ((), 0.0) for d in made)
+            assert all((d.messages, d.latency_ms) == ((), 145.0) for d in made)
         assert figure(done, condition, "messages_per_episode").value == 0
-    assert [a.id for a in answers_of(tmp_path / "run")] == [f"{scene.id}/v1" for scene in small.scenes]
-    for metric in ("success_rate", "brier", "entropy_nats"):
+    assert [a.id for a in answers_of(tmp_path / "run")] == [f"{forest.ids[n]}/v1" for n in course]
+    succeeds = forest.driver_success(driver)
+    assert figure(done, "6g", "success_rate").value == succeeds.mean()
+    assert figure(done, "6g", "off_lag_rate").value == 0, "a driver takes the lag of the dataset"
+    for metric in ("success_rate", "regret_rate", "brier", "entropy_nats"):
         assert len({figure(done, condition, metric).value for condition in ALL}) == 1
     assert figure(done, "6g", "success_gain_over_single-local").value == 0
 
@@ -362,34 +381,29 @@ def test_the_driver_that_sees_everything_is_the_upper_reference(small: Dataset, 
 
 
 def test_the_summary_can_be_made_again_from_the_decisions(proxy_run: Path) -> None:
-    """Recounted with pandas, from nothing but `decisions.parquet`."""
+    """Recounted with pandas, from nothing but `decisions.parquet`: the last decision tells the success."""
     table = pd.DataFrame([
         {"episode": d["episode"], "condition": d["condition"], "seed": d["seed"], "sent": d["messages"],
          "triggered": d["triggered"], "ms": d["latency_ms"], "missed": d["deadline_missed"],
          "entropy": d["entropy_nats"],
-         "unsafe": not d["safe"] and avoidable(d), "delay": d["delay_s"] if d["safe"] else 0.0}
+         "safe": d["safe"], "regret": d["regret"], "delay": d["delay_s"], "off_lag": d["off_lag"]}
         for d in rows_of(proxy_run)
-    ])  # fmt: skip
+    ]).astype({"regret": float, "off_lag": float})  # fmt: skip
     episodes = table.groupby(["condition", "seed", "episode"]).agg(
         sent=("sent", "sum"), triggered=("triggered", "mean"), ms=("ms", "mean"), missed=("missed", "mean"),
-        entropy=("entropy", "mean"), unsafe=("unsafe", "any"), delay=("delay", "sum"),
+        entropy=("entropy", "mean"), success=("safe", "last"), regret=("regret", "mean"),
+        delay=("delay", "mean"), off_lag=("off_lag", "mean"),
     )  # fmt: skip
-    episodes["success"] = ~episodes.unsafe & (episodes.delay <= 1.01)
-    means = episodes.groupby("condition").mean()
+    means = episodes.groupby(["condition", "episode"]).mean().groupby("condition").mean()
     summary = pd.read_csv(proxy_run / "summary.csv").query("interval == 'episodes'")
     figures = summary.set_index(["condition", "metric"]).value
     for condition in ALL:
         for column, metric in {
             "success": "success_rate", "sent": "messages_per_episode", "triggered": "trigger_rate",
             "ms": "latency_proxy_ms", "missed": "deadline_miss_rate", "entropy": "entropy_nats",
-            "unsafe": "unsafe_rate",
+            "regret": "regret_rate", "delay": "delay_s", "off_lag": "off_lag_rate",
         }.items():  # fmt: skip
             assert figures[condition, metric] == pytest.approx(means[column][condition], abs=1e-3)
-
-
-def avoidable(row: dict[str, Any]) -> bool:
-    """Whether some action was safe."""
-    return any(row[f"safe_{action}"] for action in ("SLOWER", "IDLE", "FASTER"))
 
 
 def test_the_episodes_table_agrees_with_the_decisions(proxy_run: Path) -> None:
@@ -403,10 +417,13 @@ def test_the_episodes_table_agrees_with_the_decisions(proxy_run: Path) -> None:
         assert len(mine) == e.decisions
         assert e.messages == sum(d["messages"] for d in mine)
         assert e.deadline_misses == sum(d["deadline_missed"] for d in mine)
-        unsafe = [avoidable(d) and not d["safe"] for d in mine]
-        assert e.success == (not any(unsafe) and e.delay_s <= 1.01)
+        regrets = [d["regret"] for d in mine if d["value"]]
+        assert e.success == mine[-1]["safe"] == (regrets == [False] * len(mine))
+        assert e.success or sum(regrets) == 1 or regrets == [], "one decision lost it, or it was lost before"
         assert (e.failure == "") == e.success
-        assert (e.failure in ("collision", "time_out", "off_road")) == any(unsafe)
+        cleared = e.failure in ("", "late")
+        assert (e.delay_s != "") == cleared
+        assert not cleared or e.success == (float(e.delay_s) <= 1.01)
 
 
 def test_the_manifest_says_how_to_run_it_again(small_path: Path, tmp_path: Path) -> None:

@@ -5,13 +5,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from evaluating import A_TENTH, FILES, asker_of, run, same_files, spec_of
+from evaluating import FILES, run, same_files, spec_of, walked
 
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import read_kept
+from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 
@@ -68,7 +69,7 @@ def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
 def answers(small: Dataset, tmp_path: Path) -> bytes:
     """All answers of a run, as they are kept while it goes on."""
     spec = spec_of(small)
-    asker_of(spec, open_backend(spec.card), kept=tmp_path / "answers.jsonl")
+    walked(spec, open_backend(spec.card), PAPER, tmp_path / "answers.jsonl")
     return (tmp_path / "answers.jsonl").read_bytes()
 
 
@@ -87,9 +88,9 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
     """Killed twice: the answers of the second try stand on lines of their own."""
     kept, spec = tmp_path / "answers.jsonl", spec_of(small)
     kept.write_bytes(answers[:5000])
-    again = asker_of(spec, open_backend(spec.card), A_TENTH, kept)
-    assert read_kept(kept) == again.answers
-    assert len(again.answers) == 4 * 24
+    walked(spec, open_backend(spec.card), PAPER, kept)
+    (tmp_path / "whole.jsonl").write_bytes(answers)
+    assert read_kept(kept) == read_kept(tmp_path / "whole.jsonl")
 
 
 def test_answers_that_are_all_there_are_not_asked_for_again(

@@ -14,7 +14,6 @@ from harness.core.resources import DATASET
 from harness.core.seeds import purpose, stated
 
 ROOT = Path(__file__).parent.parent
-UNTIL_V2 = "the shipped dataset and the tables from it have tune seeds; v2 of the dataset mends that"
 
 
 @pytest.mark.parametrize(
@@ -75,7 +74,6 @@ def test_the_model_that_ships_learnt_from_train_seeds():
     assert purpose(data["seed"], data["episodes"]) == "train"
 
 
-@pytest.mark.xfail(strict=True, reason=UNTIL_V2)
 def test_the_readmes_table_is_from_report_seeds():
     """Its first line ends in the dataset's name, whose manifest has the layout seeds."""
     [name] = re.findall(r"^swarm-tiny · .* · (\S+)$", (ROOT / "README.md").read_text(), re.MULTILINE)

@@ -32,17 +32,19 @@ def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluate
 def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
     said = [answer.verdict for answer in answers_of(done.out)]
     assert len(said) > 1000
-    assert said.count("strict") >= 0.98 * len(said)
+    assert said.count("strict") >= 0.95 * len(said)
 
 
 def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
     """Hidden: some action crashes into a vehicle that the ego does not see. Clear: nothing is hidden, and
     no action crashes."""
     hidden, clear = [], []
-    said = decisions(done.out, "single-local")[::5]  # one seed: nothing of it depends on luck
-    for scene, decision in zip(shipped.scenes, said, strict=True):
+    said = [d for d in decisions(done.out, "single-local") if d.seed == 0]  # nothing of it depends on luck
+    forest = shipped.forest
+    for scene, decision in zip(shipped.scenes([d.scene for d in said]), said, strict=True):
         graph = scene.record["graphs"][scene.state.ego.id]
-        crashes = [o["result"] == "collision" for o in scene.record["outcomes"].values()]
+        ends = forest.then_full_view[forest.place[scene.id]].tolist()
+        crashes = [forest.end(edge).result == "collision" for edge in ends]
         seen = scene.record["danger"]["vehicle"] in {node["id"] for node in graph["nodes"]}
         if scene.record["danger"]["vehicle"] and any(crashes) and not seen:
             hidden.append(decision.entropy_nats)

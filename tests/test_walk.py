@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from evaluating import A_TENTH, Scripted, Walked, asker_of, says, spec_of, sure, walked, with_outcomes
+from evaluating import A_TENTH, Scripted, Walked, all_scenes, asker_of, course, says, spec_of, sure, walked
 
 from harness.coordination.consensus import RULES, Fused, linear_pool
 from harness.coordination.operating_point import OperatingPoint
@@ -13,7 +13,7 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import walk
 
 OUTCOMES = {
-    f"0000{episode}-{step}": {"SLOWER": 5.0, "IDLE": 5.0, "FASTER": "collision"}
+    f"0000{episode}-{step}": {"FASTER": "collision"}
     for episode, steps in ((0, 3), (1, 2), (2, 3)) for step in range(steps)
 }  # fmt: skip
 EGO = says([0.5, 0.3, 0.2])  # 1.03 nats: it asks at every step
@@ -51,18 +51,16 @@ def lossy() -> OperatingPoint:
 @pytest.fixture
 def played(small: Dataset) -> Dataset:
     """Episode 1 ends a step before its neighbours. Every vehicle is as far from the zone as any other."""
-    data = with_outcomes(small, 3, OUTCOMES)
-    near = [dict.fromkeys(scene.record["distance_m"], 10.0) for scene in data.scenes]
-    scenes = zip(data.scenes, near, strict=True)
-    return replace(
-        data, scenes=tuple(replace(scene, record={**scene.record, "distance_m": d}) for scene, d in scenes)
-    )
+    data = course(small, 3, OUTCOMES)
+    for scene in all_scenes(data):
+        scene.record["distance_m"] = dict.fromkeys(scene.record["distance_m"], 10.0)
+    return data
 
 
 def script(data: Dataset) -> Scripted:
     """Helpers are sure of SLOWER at the first step, of IDLE at the second and of FASTER at the third."""
     lines = {}
-    for scene in data.scenes:
+    for scene in all_scenes(data):
         action = data.actions[scene.record["step"]]
         lines |= {f"{scene.id}/{viewer}": sure(action, "helper") for viewer in scene.viewers[1:]}
         lines[f"{scene.id}/{scene.viewers[0]}"] = EGO
@@ -135,7 +133,7 @@ def test_every_step_is_asked_once_and_yields_a_part_a_condition(
     spec = spec_of(played, points=(halves, lossy), seeds=(0, 1))
     asker = asker_of(spec, backend, A_TENTH)
     assert len(backend.asked) == len(set(backend.asked)) == 8 * 4
-    world = FrozenWorld(played, spec.seeds)
+    world = FrozenWorld(played, spec.points, spec.seeds)
     steps = list(walk(world, spec.points, asker))
     assert [[part.point.name for part in parts] for parts in steps] == [["halves", "lossy"]] * 3
     assert [len(parts[0].moments) for parts in steps] == [3, 3, 2]

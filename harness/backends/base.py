@@ -31,6 +31,7 @@ class Request:
             choices of a fixed text. `readout`: the messages ask for one letter (see
             `harness.prompts.readout`), whose probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
+        reasons_first: whether the prompt asks for reasons before the answer.
         sample: which of several answers to one question; 0 where one is asked for.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
@@ -46,6 +47,7 @@ class Request:
     form: str = "distribution"
     answer: AnswerMode = "json"
     thinking: bool = False
+    reasons_first: bool = False
     sample: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None

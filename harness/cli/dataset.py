@@ -1,5 +1,7 @@
 """`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
 
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,16 +29,27 @@ def build(
     episodes: int = typer.Option(200, help="Episodes."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = 2,
+    lag: float | None = typer.Option(
+        None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
+    ),
+    audit: bool = typer.Option(True, help="Audit 100 layouts or more for tells, on the dataset's card."),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
-    """Freeze episodes into a dataset. The same command again continues a build that was stopped."""
+    """Freeze every course of some layouts. The same command again continues a build that was stopped."""
     scenario = ready_to_drive(name, episodes, seed, workers)
+    if lag is not None:
+        period_s = scenario.parameters.decision_period_s
+        if not 0 <= lag < period_s:
+            raise UserError(f"--lag {lag}: give seconds from 0 to below {period_s:g}, the decision period")
+        scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
 
+    begun_s = time.monotonic()
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(scenario, out, episodes, seed, workers, progress)
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit)
     typer.echo(
-        f"wrote {printable(out)}: {manifest['episodes']} episodes, {manifest['decisions']} decision points"
+        f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "
+        f"{time.monotonic() - begun_s:.0f} s"
     )
 
 
@@ -49,14 +62,14 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
     if as_json:
-        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "decisions")}
+        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
         echo_json({**counts, "sha256": digest, "problems": problems})
     elif problems:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest.name} is sound: {manifest.episodes} episodes, {manifest.decisions} decision "
-            f"points, {len(manifest.files)} files\nmanifest sha256 {digest}"
+            f"{manifest.name} is sound: {manifest.episodes} layouts, {manifest.nodes} decision points\n"
+            f"manifest sha256 {digest}"
         )
     if problems:
         raise typer.Exit(1)
@@ -65,7 +78,7 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
 @app.command()
 def show(
     dataset: Dataset,
-    scene: str = typer.Argument(help="Scene id, such as 00003-2."),
+    scene: str = typer.Argument(help="Scene id, such as 00003-0."),
     out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
     viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
 ) -> None:
@@ -126,4 +139,9 @@ def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None
         agreement = f"{100 * s.agreement.value:.0f}"
         rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
-    console().print(f"n = {episodes} episodes; ranks agree: {'yes' if agree else 'no'}")
+    order = "the same order" if agree else "another order"
+    text = console()
+    text.print(
+        f"n = {episodes} episodes; frozen and in closed loop the {len(standings)} drivers have {order}"
+    )
+    text.print("so few are no rank correlation: that these scenes rank models takes runs, `harness fidelity`")

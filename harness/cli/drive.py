@@ -30,7 +30,9 @@ def command(
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
     condition: options.Conditions = None,
-    scenario: str = typer.Option("occluded-intersection", help="Scenario to drive. `harness scenario list`."),
+    scenario: str = typer.Option(
+        "occluded-intersection", help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons."
+    ),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     seeds: options.Seeds = "0:5",
@@ -71,10 +73,11 @@ def command(
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     options.in_range("--save-video", save_video, 0, episodes)
     names = POINTS if condition in (None, [], [ALL]) else condition
+    scenarios.get(scenario)
     spec = Spec(
         card=cards.resolve(model, engine),
         prompt=versions.load(prompt),
-        source=LiveSource(first_seed, episodes, scenarios.get(scenario).name),
+        source=LiveSource(first_seed, episodes, scenario),
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),
         thinking=thinking,

@@ -56,7 +56,6 @@ def command(
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load
-    from harness.evaluate.asking import request_count
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
@@ -84,9 +83,7 @@ def command(
         return
     folder = out or default_out(spec, resume)
     silent = as_json or quiet
-    with bar(
-        f"asking {printable(spec.card.name, 30)}", request_count(spec, frozen.scenes), silent
-    ) as progress:
+    with bar(f"asking {printable(spec.card.name, 30)}", 0, silent) as progress:
         cache = None if no_cache else default_file()
         done = evaluate(spec, folder, resume, progress, cache, progress.more)
     from harness.cli.report import write
@@ -111,8 +108,8 @@ def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: b
 
     count = counter(tokenizer, spec.card)
     sizes: dict[str, list[int]] = {}
-    asked = 0
-    for request in requests(spec, dataset.scenes):
+    asked, scenes = 0, dataset.scenes(dataset.courses())
+    for request in requests(spec, scenes):
         asked += 1
         if count:
             sizes.setdefault(request.role, []).append(count(request.messages))
@@ -121,9 +118,10 @@ def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: b
         echo_json({**spec.settings(), "requests": asked, "prompt_tokens": stats or None})
     if as_json or quiet:
         return
-    scenes = len(dataset.scenes)
-    typer.echo(f"{asked} requests for {scenes} scenes; would score {len(spec.points)} conditions × "
-               f"{len(spec.seeds)} seeds; no model was called")  # fmt: skip
+    typer.echo(
+        f"{asked} requests for the {len(scenes)} scenes on the reference drivers' courses; would score "
+        f"{len(spec.points)} conditions × {len(spec.seeds)} seeds; no model was called"
+    )
     for role, s in stats.items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
     if not stats:

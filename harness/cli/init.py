@@ -34,4 +34,7 @@ def command(
     except OSError as error:
         reason = printable(error.strerror)
         raise UserError(f"{printable(folder)} cannot be made ({reason}); give another folder") from None
-    typer.echo(f"made {printable(folder)}; next: cd there, `harness eval --prompt mine`; README.md says more")
+    typer.echo(
+        f"made {printable(folder)}; next: cd there, `harness eval --model swarm-tiny --prompt mine`; "
+        "README.md says more"
+    )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def command(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
     """List runs and studies, newest first. Each has the success of its best condition."""
-    from harness.runs.listing import runs
+    from harness.runs.listing import UNREAD, runs
 
     listed = runs(folder)
     if as_json:
@@ -29,6 +29,9 @@ def command(folder: options.Reports = Path("reports"), as_json: options.Json = F
         left = WIDTH - 9 - len(outcome)
         parts = " · ".join(part for part in (run.model, run.prompt, run.answer) if part is not None)
         typer.echo(f"  {run.kind:<6}{printable(parts, left):<{left}} {outcome}".rstrip())
+        if run.unread is not None and run.unread >= UNREAD:
+            share = "none" if run.unread == 1 else f"only {100 * (1 - run.unread):.1f} %"
+            typer.echo(f"{'':8}{share} of the ego's answers could be read: it drives by the fallback")
         if run.tags:
             typer.echo(f"{'':8}{printable('tags: ' + ', '.join(run.tags), WIDTH - 8)}")
     if not listed:

@@ -113,8 +113,9 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
         card, prompts.load(PROMPT), FrozenSource(data, 1), (), (0,), thinking, "json", 1, device, dtype
     )
     ways = ("json",) if spec.thinking else get_args(AnswerMode)
+    scenes = data.scenes(data.forest.ids[:1])
     # The first of a scene's questions is the ego's.
-    asked = [next(requests(replace(spec, answer=way), data.scenes)) for way in ways]
+    asked = [next(requests(replace(spec, answer=way), scenes)) for way in ways]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
     return spec, look(cast("Rendering", backend), asked)
 

@@ -40,7 +40,7 @@ def command(
             )
     data = load.load(load.find(dataset))
     spec = Spec(reference, versions.load(prompt), FrozenSource(data), tuple(POINTS.values()), (0,))
-    asked = list(requests(spec, data.scenes))
+    asked = list(requests(spec, data.scenes(data.courses())))
     asked = asked[:: max(1, len(asked) // prompts)][:prompts]
     letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]
     with bar(f"comparing {printable(reference.name, 30)}", PASSES, as_json) as progress:

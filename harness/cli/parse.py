@@ -17,6 +17,9 @@ def command(
     scenario: str = typer.Option("occluded-intersection", help="Scenario that names the actions."),
     role: str = typer.Option("ego", help="Who answered: ego or helper."),
     thinking: bool = typer.Option(False, "--thinking", help="The model was asked to think first."),
+    reasons_first: bool = typer.Option(
+        False, "--reasons-first", help="The prompt asked for reasons before the answer."
+    ),
     finish_reason: str = typer.Option("stop", help="Why the engine stopped: stop, length or error."),
     as_json: options.Json = False,
 ) -> None:
@@ -28,7 +31,10 @@ def command(
         raise errors.unknown("finish reason", finish_reason, FINISH_REASONS)
     actions = scenarios.get(scenario).actions
     text = _read(file)
-    parsed = parse(text, role=role, actions=actions, thinking=thinking, finish_reason=finish_reason)
+    parsed = parse(
+        text, role=role, actions=actions, thinking=thinking, reasons_first=reasons_first,
+        finish_reason=finish_reason,
+    )  # fmt: skip
     shares = None if parsed.intent is None else dict(zip(actions, parsed.intent, strict=True))
     if as_json:
         fields = ("status", "verdict", "repairs", "intent", "mass", "message", "reasoning", "detail")

@@ -41,7 +41,7 @@ def list_prompts(as_json: options.Json = False) -> None:
 @app.command()
 def show(
     version: Version,
-    scene: str = typer.Option(..., help="Scene id, such as 00003-2."),
+    scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
     viewer: str | None = typer.Option(None, help="Vehicle id. Default: every viewer."),
     dataset: options.Dataset = resources.DATASET,
     as_json: options.Json = False,
@@ -83,6 +83,7 @@ def check(
     from harness.prompts.densest import densest_messages
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
+    scenes = data.scenes(data.courses())
     count = counter(tokenizer)
     least, most = prompt.token_budget
     sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION)}
@@ -98,8 +99,8 @@ def check(
                 at = {"scene": scene.id, "viewer": viewer, "messages": len(messages), "tokens": n}
                 outside.append(at)
 
-    with bar("scenes", len(data.scenes), as_json) as progress:
-        for scene in data.scenes:
+    with bar("scenes", len(scenes), as_json) as progress:
+        for scene in scenes:
             ego, *helpers = scene.viewers
             dense = densest_messages(helpers, data.actions)
             for viewer in scene.viewers:
@@ -113,8 +114,7 @@ def check(
         echo_json(figures, indent=None)
     else:
         typer.echo(
-            f"{version}: renders for every viewer of {len(data.scenes)} scenes; "
-            f"budget {least} to {most} tokens"
+            f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
         )
         for role, s in stats.items():
             typer.echo(f"{role:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")

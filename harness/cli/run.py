@@ -53,11 +53,14 @@ def default_out(spec: "Spec", resume: bool) -> Path:
 
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
-    """A finished run for machines: its folder, its manifest and the rows of its summary."""
+    """A finished run for machines: its folder, its manifest, its caveats and the rows of its summary."""
+    from harness.report.caveats import caveats
+
     variant = msgspec.to_builtins(done.manifest.variant)
     return {
         "run": str(done.out),
         "manifest": msgspec.to_builtins(done.manifest),
+        "caveats": caveats(done.manifest, done.scores),
         "summary": [{**variant, **msgspec.to_builtins(score)} for score in done.scores],
     }
 
@@ -66,11 +69,15 @@ def show(
     done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str], tight: bool = False
 ) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
+    from harness.report.caveats import caveats
+
     m = done.manifest
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
     names = [point["name"] for point in m.conditions]
     text = console()
     text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
+    for caveat in caveats(m, done.scores):
+        text.print(caveat)
     table(
         ("condition", *(column.head for column in columns)),
         [(name, *(column.cell(figures.get((name, column.metric))) for column in columns)) for name in names],

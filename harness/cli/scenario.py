@@ -48,10 +48,9 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
         return
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     for parameter, of in parameters.items():
-        value = (
-            ", ".join(f"{v:g}" for v in of["value"]) if isinstance(of["value"], tuple) else f"{of['value']:g}"
-        )
-        typer.echo(f"{parameter} = {value}")
+        values = of["value"] if isinstance(of["value"], tuple) else (of["value"],)
+        shown_values = ", ".join(str(v).lower() if isinstance(v, bool) else f"{v:g}" for v in values)
+        typer.echo(f"{parameter} = {shown_values}")
         typer.echo(textwrap.fill(of["meaning"], 80, initial_indent="    ", subsequent_indent="    "))
 
 

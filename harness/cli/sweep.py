@@ -38,12 +38,15 @@ def command(
     ),
     seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
     latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
+    no_model: bool = typer.Option(
+        False, "--no-model", help="Leave out walks to decision points that the run has no answer for."
+    ),
     proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
     out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Score stored answers at other operating points. Needs no model, except for ego-prompt."""
+    """Score stored answers at other operating points. The model is asked only what the run has not."""
     from harness.studies.axes import axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
@@ -60,7 +63,7 @@ def command(
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
     with bar("grid points", 0, silent) as progress:
-        stored = [Stored(run, latency, progress.more, progress) for run in runs]
+        stored = [Stored(run, latency, progress.more, progress, not no_model) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)
             for axis, values in zip(axes, grids, strict=True)
@@ -74,6 +77,12 @@ def command(
         typer.echo(summary.to_json(orient="records"))
     if not silent:
         tables(summary)
+        for source in stored:
+            if left := source.left_out:
+                typer.echo(
+                    f"{printable(source.name)}: walks to {len(left)} decision points are left out, since the "
+                    "run has no answer for them; without --no-model they are asked"
+                )
         typer.echo(f"wrote {printable(where / 'sweep.svg')}")
 
 

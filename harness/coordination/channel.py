@@ -42,8 +42,9 @@ class Links:
 
     Attributes:
         asked: who was asked, `(..., H)`. What is said of the others may be anything, NaN included.
-        ready_s: seconds from the request until the helper has its answer, `(..., H)`; 0 if it waits.
-        range_m: ego-helper distance, `(..., H)`.
+        ready_s: seconds from the start of the request until the helper has heard it and has its own answer,
+            `(..., H)`.
+        range_m: ego-helper distance, `(..., H)`, as the ego knows it: a beacon's error off the true one.
         payload_bits: size of the reply, `(..., H)`.
         in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
@@ -66,11 +67,14 @@ class Delivery(NamedTuple):
             lost reply keeps its slot.
         loss: probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` where all
             links have the same.
+        airtime_s: seconds that the reply occupies the medium, `(..., H)`; anything where not asked, NaN where
+            the model does not know.
     """
 
     up: Bools
     delay_s: Floats
     loss: Floats
+    airtime_s: Floats
 
 
 @runtime_checkable
@@ -78,6 +82,9 @@ class Channel(Protocol):
     """A frozen dataclass. The operating point's overrides replace the fields of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def request_s(self, bits: float) -> float:
+        """Seconds that a broadcast request of so many bits is on air; then the helpers have it."""
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """What happens to the request and the reply of each link."""
@@ -91,7 +98,7 @@ class Radio:
         latency_s: nominal seconds of one exchange, the request included, without serialisation.
         loss: probability that one crossing is lost. Where helpers open rounds of their own, the loss under
             so many active vehicles, if that is larger.
-        bandwidth_bps: bits per second while a reply is on air.
+        bandwidth_bps: bits per second while a message is on air.
         access: `serial`, replies share one medium and are served one after another, so that the k-th
             pays k slots; `parallel`, all replies are on air at once.
         jitter_s: largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s).
@@ -108,17 +115,23 @@ class Radio:
     density_coupled: bool = False
     roadside_edge: bool = False
 
+    def request_s(self, bits: float) -> float:
+        """Serialisation alone: the rest of a request's time is in the nominal latency."""
+        return bits / self.bandwidth_bps
+
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
         loss = loss if self.density_coupled else np.maximum(self.loss, loss)
-        hop_s = self.latency_s + links.payload_bits / self.bandwidth_bps + self.jitter_s * draws.jitter
-        slot_s = np.where(links.asked, (2 if self.roadside_edge else 1) * hop_s, 0.0)
+        hops = 2 if self.roadside_edge else 1
+        airtime_s = hops * links.payload_bits / self.bandwidth_bps
+        slot_s = hops * (self.latency_s + self.jitter_s * draws.jitter) + airtime_s
+        slot_s = np.where(links.asked, slot_s, 0.0)
         ready_s = np.where(links.asked, links.ready_s, np.inf)
         serial = self.access == "serial"
         delay_s = served_s(ready_s, slot_s, links.range_m) if serial else ready_s + slot_s
-        return Delivery(link_up(draws.link, loss, self.roadside_edge), delay_s, loss)
+        return Delivery(link_up(draws.link, loss, self.roadside_edge), delay_s, loss, airtime_s)
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:

@@ -4,18 +4,20 @@ In seconds from the start of the decision:
 
     0                     every vehicle sees the scene; the ego infers, and the helpers in parallel with it
     inference_s[0]        the ego has its own intent. Sure enough, or nobody to ask: it acts now.
-                          Unsure: it broadcasts its request to the nearest helpers in its radius.
-                          Where helpers infer on demand, they see and begin only now
+                          Unsure: it broadcasts one request to the nearest helpers in its radius
+    heard                 the request has been on air for request_bits / bandwidth, and helpers have it. Where
+                          they infer on demand, they begin only now
     ready                 a helper has the request and its own intent, and its reply can leave:
-                          max(inference_s[0], inference_s[1+h]); on demand their sum
+                          max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
                           nominal latency + payload / bandwidth + jitter, twice over a roadside edge
     arrival_s[h]          the end of the helper's slot, if request and reply crossed; else inf
     window_s              what has arrived by now is fused
     exchange_s            the end of the last slot: the ego also waits out a lost or late reply
 
-The paper counts the whole exchange as the decision's latency even when it outlasts the window, and so
-does this. Everything here is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
+The nominal latency of a slot covers the way of the request, but not its time on air. The paper counts the
+whole exchange as the decision's latency even when it outlasts the window, and so does this. Everything here
+is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
 """
 
 from dataclasses import dataclass
@@ -41,6 +43,10 @@ class Exchange:
         entropy_nats: entropy of `own`, `(...)`.
         triggered: the entropy is above tau and the point has a channel, `(...)`.
         asked: helpers asked, each a scheduled reply, `(..., H)`.
+        request_bits: size of the request; 0 where nobody is asked, `(...)`.
+        reply_bits: size of all scheduled replies together, `(...)`.
+        airtime_s: how long the request and the scheduled replies occupy the medium in all, `(...)`; NaN where
+            the channel model does not know.
         loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
             asked, where links differ; NaN without a channel.
         delivered: asked, and request and reply crossed, `(..., H)`.
@@ -54,6 +60,9 @@ class Exchange:
     entropy_nats: Floats
     triggered: Bools
     asked: Bools
+    request_bits: Floats
+    reply_bits: Floats
+    airtime_s: Floats
     loss: Floats
     delivered: Bools
     arrival_s: Floats
@@ -69,6 +78,11 @@ class Exchange:
     def messages(self) -> Ints:
         """Replies scheduled, `(...)`. As in the paper's count, the request is none."""
         return np.asarray(np.sum(self.asked, axis=-1))
+
+    @cached_property
+    def requests(self) -> Ints:
+        """Requests broadcast, `(...)`: 1 for all who are asked together, else 0."""
+        return np.asarray(np.any(self.asked, axis=-1)).astype(int)
 
     @cached_property
     def lost(self) -> Ints:
@@ -100,9 +114,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
 
     inference_s = np.where(np.isnan(intents.inference_s), 0.0, intents.inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
-    ready_s = helpers_s if point.on_demand else np.maximum(helpers_s - request_s, 0.0)
+    channel = point.channel()
+    air_s = channel.request_s(point.request_bits)
+    ready_s = air_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, air_s)
     links = Links(asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure)
-    up, delay_s, loss = point.channel().deliver(links, draws)
+    up, delay_s, loss, airtime_s = channel.deliver(links, draws)
+    requested = np.any(asked, axis=-1)
     delivered = asked & up
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)
@@ -113,6 +130,9 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         entropy_nats=entropy,
         triggered=asks,
         asked=asked,
+        request_bits=np.where(requested, point.request_bits, 0.0),
+        reply_bits=np.sum(np.where(asked, intents.payload_bits, 0.0), axis=-1),
+        airtime_s=np.where(requested, air_s, 0.0) + np.sum(np.where(asked, airtime_s, 0.0), axis=-1),
         loss=loss[..., 0] if loss.shape[-1] == 1 else known_mean(np.where(asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,

@@ -15,8 +15,9 @@ class Intents:
         helpers: helpers' intents, `(..., H, A)`.
         valid: the helper exists and its answer parsed, `(..., H)`. Any other sends nothing, takes no
             slot, and may hold NaN in every array.
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first.
-        range_m: distance to the ego, `(..., H)`.
+        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; a helper's as
+            the ego knows it, from beacons.
+        range_m: distance to the ego, `(..., H)`, as the ego knows it.
         payload_bits: size of the reply, `(..., H)`.
         inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
     """

@@ -31,6 +31,8 @@ class OperatingPoint:
         fallback: what a failed ego answer becomes: `uniform`, all actions alike, or `brake`, all mass on
             the first action, which is the most conservative one.
         consensus: consensus rule, or `ego-prompt`.
+        request_bits: size of the ego's request. By default 50 bytes: who asks whom, and until when, as
+            compact JSON, which is how replies are counted, without a signature or headers.
         loss: probability that one crossing is lost, in place of the profile's; None keeps the profile's.
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
@@ -49,6 +51,7 @@ class OperatingPoint:
     ego_distance_m: float | None = None
     fallback: str = "uniform"
     consensus: str = "linear"
+    request_bits: float = 400.0
     loss: float | None = None
     latency_s: float | None = None
     density_coupled: bool = False
@@ -71,6 +74,7 @@ class OperatingPoint:
         self._number("min_distance_m", "metres above 0")
         if self.ego_distance_m is not None:
             self._number("ego_distance_m", "metres above 0")
+        self._number("request_bits", "bits, 0 or more", zero=True)
         if self.loss is not None:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
         if self.latency_s is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from harness.core.errors import UserError, printable
 
-DATASET = "occluded-intersection-v1"  # the one that ships
+DATASET = "occluded-intersection-v2"  # the one that ships
 MARKER = "swarmdrive.toml"
 
 _PACKAGE = Path(__file__).resolve().parent.parent

@@ -1,7 +1,7 @@
-"""`harness dataset build`: episodes into a folder, in any number of processes, and on after a kill.
+"""`harness dataset build`: layouts into a folder, in any number of processes, and on after a kill.
 
-Each finished episode is a file of its own under `.building/`; when all are there they become one
-`scenes.jsonl`. The bytes depend on the scenario, the seed, the number of episodes and the folder's name
+Each finished layout is a file of its own under `.building/`; when all are there they become one
+`layouts.zip`. What is in it depends on the scenario, the seed, the number of episodes and the folder's name
 alone.
 """
 
@@ -14,23 +14,40 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import msgspec
 
 from harness import __version__
 from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.parallel import spread
-from harness.dataset.freeze import Behaviour, freeze
-from harness.dataset.schema import FILE_NAME, manifest_schema, record_schema, record_type
+from harness.core.seeds import purpose, stated
+from harness.dataset.forest import Forest
+from harness.dataset.freeze import freeze
+from harness.dataset.schema import (
+    FILE_NAME,
+    LAYOUTS,
+    Danger,
+    Tree,
+    manifest_schema,
+    record_schema,
+    record_type,
+    tree_schema,
+)
+from harness.dataset.verify import level_name, tree_name
+from harness.world.audit import Audit, audit, ready
+from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
 WORK = ".building"
+LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
 
 def build(
-    scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None]
-) -> dict[str, Any]:
+    scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None],
+    audits: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """Build a dataset in `out`.
 
     Args:
@@ -40,18 +57,23 @@ def build(
         seed: first layout seed.
         workers: processes.
         progress: called with the number of episodes just finished.
+        audits: whether the layouts are audited for tells, from `LEAST_AUDITED` on.
 
     Returns:
         The manifest.
 
     Raises:
-        UserError: the folder holds a finished dataset, or one begun with other settings, or something else.
+        UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
+            the seeds are for several purposes; or the audit needs a package that is missing.
     """
+    audits = audits and episodes >= LEAST_AUDITED
+    if audits:
+        ready()
     config = {
         **settings(scenario),
-        "behaviour": asdict(Behaviour()),
         "episodes": episodes,
         "seed": seed,
+        "purpose": purpose(seed, episodes),
         "versions": {
             "harness": __version__,
             **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
@@ -68,19 +90,23 @@ def build(
     todo = sorted(set(range(episodes)) - set(done))
     spread(partial(_freeze_to_file, scenario, work, seed), todo, workers, progress)
 
-    shards = [(work / _shard(e)).read_bytes() for e in range(episodes)]
+    texts = _join(work, episodes, out / LAYOUTS)
+    trees = [msgspec.json.decode(text, type=Tree) for text in texts]
+    forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
+    found = audit(scenario, episodes, seed, lambda done: None, workers) if audits else None
     files = {
-        "README.md": _readme(out.absolute().name, config).encode(),
-        "scenes.jsonl": b"".join(shards),
+        "README.md": _readme(out.absolute().name, config, forest, found).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
+        "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
     }
     manifest = {
-        "format": "swarmdrive-dataset/1",
+        "format": "swarmdrive-dataset/2",
         "name": out.absolute().name,
         **config,
-        "decisions": sum(shard.count(b"\n") for shard in shards),
+        "nodes": sum(len(level) for tree in trees for level in tree.levels),
         "files": {name: sha256_bytes(data) for name, data in files.items()},
+        "trees_sha256": list(map(sha256_bytes, texts)),
     }
     for name, data in files.items():
         write_whole(out / name, data)
@@ -119,32 +145,94 @@ def _begin(out: Path, config: dict[str, Any]) -> Path:
     return work
 
 
-def _shard(episode: int) -> str:
-    return f"{episode:05d}.jsonl"
-
-
 def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> None:
-    records = freeze(scenario, seed + episode, episode, Behaviour())
-    lines = [canonical_json(record) + "\n" for record in records]
-    for line in lines:
+    levels, scenes = freeze(scenario, seed + episode, episode)
+    texts = ["".join(canonical_json(record) + "\n" for record in level).encode() for level in scenes]
+    for line in b"".join(texts).splitlines():
         msgspec.json.decode(line, type=record_type(scenario))  # a record that breaks its own form is a bug
-    write_whole(work / _shard(episode), "".join(lines))
+    danger = scenes[0][0]["danger"]
+    tree = Tree(
+        episode, seed + episode, Danger(danger["sector"], danger["vehicle"]), levels,
+        list(map(sha256_bytes, texts)),
+    )  # fmt: skip
+    _check(scenario, tree)
+    with replacing(work / _shard(episode)) as part, ZipFile(part, "w") as file:
+        file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
+        for step, text in enumerate(texts):
+            file.writestr(_entry(level_name(episode, step)), text)
+
+
+def _check(scenario: Scenario, tree: Tree) -> None:
+    """Drive the layout: a tree in which a reference driver ends otherwise is a bug."""
+    forest = Forest.of([tree], scenario.actions, scenario.parameters.delay_allowance_s)
+    for driver, outcome in drive_all(scenario, tree.episode_seed).items():
+        end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))
+        walked = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
+        if walked != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
+            raise RuntimeError(f"layout {tree.episode_seed}: {driver} drives to {outcome}, walks to {end}")
+
+
+def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
+    """One file of all layouts; returns their trees as they are in it."""
+    trees = []
+    with replacing(layouts) as part, ZipFile(part, "w") as file:
+        for episode in range(episodes):
+            with ZipFile(work / _shard(episode)) as shard:
+                for name in shard.namelist():
+                    file.writestr(_entry(name), shard.read(name))
+                trees.append(shard.read(tree_name(episode)))
+    return trees
+
+
+def _entry(name: str) -> ZipInfo:
+    entry = ZipInfo(name)  # of the year 1980: no clock in a dataset
+    entry.compress_type = ZIP_DEFLATED
+    return entry
+
+
+def _shard(episode: int) -> str:
+    return f"{episode:05d}.zip"
 
 
 def _pretty(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _readme(name: str, config: dict[str, Any]) -> str:
+def _readme(name: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
+    seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
+    drivers = "\n".join(
+        f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
+    )
+    parameters = config["parameters"]
+    told = "Not audited for tells."
+    if found:
+        auc = found.auc["danger"]
+        told = (
+            "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
+            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness scenario audit`, n = {auc.n} "
+            "layouts; .50 is a guess)."
+        )
     return f"""# {name}
 
-{config["episodes"]} episodes of `{config["scenario"]}`, seeds {config["seed"]} to \
-{config["seed"] + config["episodes"] - 1}, one record a decision point.
-Built by `harness dataset build {config["scenario"]} --episodes {config["episodes"]} --seed {config["seed"]}`.
+Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:
+{nodes} decision points, {nodes / seeds:.0f} a layout.
+Built by `harness dataset build {config["scenario"]} --episodes {seeds} --seed {config["seed"]}`.
 
-- `scenes.jsonl`: one JSON object a line; fields and units in `scene.schema.json`.
-- `manifest.json`: scenario parameters, behaviour, versions, and the sha256 of every file.
+A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
+built every reference driver drove every layout in closed loop too, and ended as in the trees.
 
-Each record holds the whole state, every viewer's scene graph, and an outcome table: each meta-action taken,
-followed by the full-view driver until the episode ends. `harness dataset check` verifies all of it.
+{told}
+
+| who decides | success, % of {seeds} layouts |
+|---|---|
+| the best policy | {rate:.1f} |
+{drivers}
+
+- `layouts.zip`: of each layout `tree.json`, where each action leads and what the reference drivers do, and
+  for each level of the tree `<step>.jsonl`, a line a decision point, in the order of the tree. Each line
+  holds the whole state and every viewer's scene graph.
+- `tree.schema.json`, `scene.schema.json`: fields and units of both.
+- `manifest.json`: scenario parameters, versions, the sha256 of every file and tree; a tree pins its scenes.
+
+`harness dataset check` verifies all of it, `harness dataset rank` drives the reference drivers again.
 """

@@ -1,22 +1,22 @@
-"""Freezing an episode: one record a decision point, with an outcome table for look-up later.
+"""Freezing a layout: its decision tree, with every course that the ego's decisions can take.
 
-The behaviour that leads the ego through is declared and varied (`Behaviour`): it drives as `cruise` or
-`local-view`, now and then takes a random action, and a guard stops it at the last instant: where its action
-would end badly, it takes the best safe action instead and `full-view` drives on. So every episode comes as
-close to failure as that behaviour gets, and still has all its decision points.
+From the first decision point on every meta-action is taken, each a lag after its moment, and the decision
+points that come are frozen. Those in the same state are one, whatever led there; actions that set the same
+target speed are one edge. So the tree of six decisions has some hundred decision points, and every leaf of it
+is an episode that is decided.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from harness.core import noise
-from harness.world.drivers import PRIVILEGED
+from harness.core.files import digest
+from harness.dataset.schema import Branching, Edge, End
+from harness.world.beacons import known
+from harness.world.drivers import DRIVERS, choose
 from harness.world.outcome import Outcome
-from harness.world.perception.graph import scene_graph
-from harness.world.reference import decide, finish
+from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import World
@@ -24,75 +24,89 @@ from harness.world.world import World
 Record = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Behaviour:
-    """Who drives the ego through a frozen episode.
-
-    Attributes:
-        cruise_share: probability that an episode is led by `cruise`, else by `local-view`.
-        random_share: probability that a decision is a random action instead.
-    """
-
-    cruise_share: float = 0.6
-    random_share: float = 0.1
-
-
-def freeze(scenario: Scenario, seed: int, episode: int, behaviour: Behaviour) -> list[Record]:
-    """Every decision point of one episode."""
+def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branching]], list[list[Record]]]:
+    """The decision tree of a layout, and the scene of each of its decision points, both level by level."""
     world = World.start(scenario, seed)
-    chance = noise.generator("behaviour", seed)
-    driver = "cruise" if chance.random() < behaviour.cruise_share else "local-view"
-    records = []
-    while not world.outcome.ended and world.step < scenario.parameters.decisions:
-        outcomes = {action: rollout(world, action) for action in world.actions}
-        action, reason = decide(driver, world), driver
-        if chance.random() < behaviour.random_share:
-            action, reason = world.actions[int(chance.integers(len(world.actions)))], "random"
-        safe = [a for a in world.actions if outcomes[a].success]
-        if safe and action not in safe:
-            action, reason = min(safe, key=lambda a: outcomes[a].time_s or np.inf), "guard"
-            driver = PRIVILEGED
-        records.append(_record(world, episode, outcomes, {"action": action, "reason": reason}))
-        world.act(action)
-    return records
+    level = {scene_id(episode, world.state()): world}
+    branchings, scenes = [], []
+    while level:
+        following: dict[str, World] = {}
+        records = [_record(world, episode) for world in level.values()]
+        scenes.append(records)
+        branchings.append([
+            Branching(record["scene"], _drivers(world, record), list(_edges(world, episode, following)))
+            for world, record in zip(level.values(), records, strict=True)
+        ])  # fmt: skip
+        level = following
+    return branchings, scenes
 
 
-def rollout(world: World, action: str) -> Outcome:
-    """What becomes of the ego if it takes an action now and the full-view driver takes the rest.
+def _edges(world: World, episode: int, following: dict[str, World]) -> Iterator[Edge]:
+    """Where each action leads; decision points that are new are added to those `following`, by id."""
+    waiting = world.branch()
+    waiting.outcome, waiting.hard_brakings = Outcome(), 0  # what happens from here on
+    p = world.scenario.parameters
+    waiting.advance(p.due_frame(world.step) + p.lag_frames)
+    by_target: dict[int, list[str]] = {}
+    for action in world.actions:
+        index = waiting.speed_index if waiting.outcome.ended else waiting.speed_index_after(action)
+        by_target.setdefault(index, []).append(action)
+    for left, actions in zip(reversed(range(len(by_target))), by_target.values(), strict=True):
+        branch = waiting.branch() if left else waiting
+        branch.act(actions[0])
+        outcome, end, to = branch.outcome, None, None
+        if outcome.ended:
+            assert outcome.time_s is not None
+            how = outcome.partner, outcome.striker, outcome.fault
+            end = End(outcome.result, outcome.time_s, *how)  # type: ignore[arg-type]
+        else:
+            name = scene_id(episode, branch.state())
+            following.setdefault(name, branch)
+            to = list(following).index(name)
+        gap_m = round(outcome.least_gap_m, 3)
+        yield Edge(actions, to, end, gap_m, branch.hard_brakings, outcome.other_crashes)
 
-    `least_gap_m` and `other_crashes` count from now on.
-    """
-    branch = world.branch()
-    branch.outcome = Outcome()
-    branch.act(action)
-    return finish(branch, PRIVILEGED)
+
+def _drivers(world: World, record: Record) -> dict[str, str]:
+    """What each reference driver does at a decision point."""
+    state = world.state()
+    seen, truth = record["graphs"][state.ego.id], truth_graph(world.scenario, state)
+    return {driver: choose(world.scenario, driver, seen, truth) for driver in DRIVERS}
 
 
-def _record(world: World, episode: int, outcomes: dict[str, Outcome], behaviour: dict[str, str]) -> Record:
+def _record(world: World, episode: int) -> Record:
     state = world.state()
     return {
         **moment(world, state, episode, (state.ego, *state.helpers)),
         "road": world.scenario.road().facts,
-        "behaviour": behaviour,
-        "outcomes": {action: _row(outcome) for action, outcome in outcomes.items()},
         "snapshot": world.snapshot(),
     }
 
 
+def scene_id(episode: int, state: WorldState) -> str:
+    """`<episode>-<step>-<digest>`: equal states have equal ids, frozen and in the closed loop."""
+    return f"{episode:05d}-{state.step}-{digest(state.to_dict())[:12]}"
+
+
 def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
-    """What is there at a decision point, and what the viewers see of it; the ego is the first of them."""
-    zone = world.scenario.road().zone_m
+    """What is there at a decision point, and what the viewers see of it; the ego is the first of them.
+
+    Distances to the conflict zone and to the ego are those that the ego knows.
+    """
+    zone, ego = world.scenario.road().zone_m, viewers[0]
+    taken = {v.id: known(state, v.id, ego.id) for v in viewers}
     return {
-        "scene": f"{episode:05d}-{state.step}",
+        "scene": scene_id(episode, state),
         "episode": episode,
         "episode_seed": world.seed,
         "step": state.step,
         "danger": {"sector": world.layout.danger, "vehicle": world.layout.danger_id},
         "state": state.to_dict(),
         "graphs": {v.id: scene_graph(world.scenario, state, v.id) for v in viewers},
-        "distance_m": {v.id: round(float(np.hypot(v.x_m - zone[0], v.y_m - zone[1])), 3) for v in viewers},
+        "distance_m": {id_: _apart_m(v, *zone) for id_, v in taken.items()},
+        "range_m": {id_: _apart_m(v, ego.x_m, ego.y_m) for id_, v in taken.items() if id_ != ego.id},
     }
 
 
-def _row(outcome: Outcome) -> dict[str, Any]:
-    return asdict(replace(outcome, least_gap_m=round(outcome.least_gap_m, 3)))
+def _apart_m(v: VehicleState, x_m: float, y_m: float) -> float:
+    return round(float(np.hypot(v.x_m - x_m, v.y_m - y_m)), 3)

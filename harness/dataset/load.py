@@ -2,22 +2,33 @@
 
 import os
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+from zipfile import ZipFile
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from harness.core.errors import UserError, printable, unknown
-from harness.core.files import canonical_json
+from harness.core.errors import UserError, unknown
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
-from harness.dataset.schema import Manifest
-from harness.dataset.verify import file_problems, read_manifest, records, released
-from harness.world import scenarios
+from harness.dataset.forest import Forest
+from harness.dataset.schema import Manifest, Tree
+from harness.dataset.verify import (
+    Damaged,
+    decoded,
+    file_problems,
+    opened,
+    read_level,
+    read_manifest,
+    read_tree,
+    scenario_of,
+    unusable,
+)
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 
@@ -30,7 +41,7 @@ class Scene:
 
     @property
     def id(self) -> str:
-        """`<episode>-<step>`."""
+        """`<episode>-<step>-<digest>`."""
         return str(self.record["scene"])
 
     @cached_property
@@ -53,19 +64,22 @@ class Scene:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A verified dataset.
+    """A verified dataset. Its scenes are read, and verified, when they are first asked for.
 
     Attributes:
         path: its folder.
         manifest: its manifest.
         sha256: digest of the manifest, which pins every file.
-        scenes: in order of episode and step.
+        trees: the decision trees of its layouts, in order of episode.
+        trusted: it is a released one, whose scenes are known by their digests.
     """
 
     path: Path
     manifest: Manifest
     sha256: str
-    scenes: tuple[Scene, ...]
+    trees: tuple[Tree, ...]
+    trusted: bool = False
+    _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def name(self) -> str:
@@ -74,8 +88,8 @@ class Dataset:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What was frozen."""
-        return scenarios.get(self.manifest.scenario)
+        """What was frozen, with the parameters that it was frozen with."""
+        return scenario_of(self.manifest)
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -83,35 +97,66 @@ class Dataset:
         return tuple(self.manifest.actions)
 
     @property
-    def delay_allowance_s(self) -> float:
-        """Needless delay that an episode is forgiven."""
-        return cast(float, self.manifest.parameters["delay_allowance_s"])
-
-    @property
     def episodes(self) -> tuple[int, ...]:
         """Numbers of the episodes."""
-        return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
+        return tuple(tree.episode for tree in self.trees)
+
+    @cached_property
+    def forest(self) -> Forest:
+        """The trees as arrays."""
+        return Forest.of(self.trees, self.actions, self.scenario.parameters.delay_allowance_s)
+
+    def of_episodes(self, numbers: Collection[int]) -> "Dataset":
+        """The same with these episodes only."""
+        return replace(self, trees=tuple(tree for tree in self.trees if tree.episode in numbers))
+
+    def scenes(self, ids: Sequence[str]) -> list[Scene]:
+        """The scenes of decision points. Raises UserError for a damaged one, KeyError for an unknown one."""
+        wanted: dict[tuple[int, int], list[int]] = {}  # places in each level of each tree
+        forest = self.forest
+        for name in ids:
+            if name not in self._scenes:
+                n = forest.place[name]
+                tree, step = int(forest.tree[n]), int(forest.step[n])
+                start = int(forest.root[tree]) + sum(map(len, self.trees[tree].levels[:step]))
+                wanted.setdefault((tree, step), []).append(n - start)
+        if wanted:
+            with opened(self.path) as file:
+                for (tree, step), places in wanted.items():
+                    for record in self._records(file, self.trees[tree], step, places):
+                        self._scenes[record["scene"]] = Scene(record)
+        return [self._scenes[name] for name in ids]
+
+    def _records(
+        self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]
+    ) -> Iterator[dict[str, Any]]:
+        try:
+            lines = read_level(file, tree, step)
+        except Damaged as damage:
+            raise unusable(self.path, str(damage)) from None
+        for place in places:
+            if self.trusted:
+                yield msgspec.json.decode(lines[place])
+                continue
+            record, problems = decoded(lines[place], self.manifest, tree.levels[step][place].scene)
+            for problem in problems:
+                raise unusable(self.path, problem)
+            yield record
 
     def scene(self, scene_id: str) -> Scene:
-        """The scene of that id."""
-        for scene in self.scenes:
-            if scene.id == scene_id:
-                return scene
-        raise unknown("scene", scene_id, [s.id for s in self.scenes[:12]], " … (first dozen)")
+        """The scene of that id, or of the one id that begins so."""
+        ids = self.forest.ids
+        begin_so = [name for name in ids if name.startswith(scene_id)] if scene_id else []
+        if len(begin_so) != 1:
+            shown = (begin_so or ids)[:12]
+            raise unknown("scene", scene_id, shown, " … (first dozen)" if len(begin_so or ids) > 12 else "")
+        return self.scenes(begin_so)[0]
 
-    def outcome_arrays(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """For each scene and action (n, A): whether it is safe, and its delay in s.
-
-        The delay is against the best safe action of that scene; NaN where the action is not safe.
-        """
-        tables = [[s.record["outcomes"][a] for a in self.actions] for s in self.scenes]
-        safe = np.array([[o["result"] == "cleared" for o in row] for row in tables])
-        time_s = np.array(
-            [[o["time_s"] if o["result"] == "cleared" else np.inf for o in row] for row in tables]
-        )
-        with np.errstate(invalid="ignore"):
-            delay_s = np.where(safe, time_s - time_s.min(axis=1, keepdims=True), np.nan)
-        return safe, delay_s
+    def courses(self) -> tuple[str, ...]:
+        """Ids of the decision points that the reference drivers come to."""
+        forest = self.forest
+        met = [forest.visited(chosen) for chosen in forest.drivers.values()]
+        return tuple(forest.ids[n] for n in np.unique(np.concatenate(met)).tolist())
 
 
 def find(name: str) -> Path:
@@ -135,16 +180,6 @@ def argument(path: Path) -> str:
     return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
 
 
-def shared(one: Dataset, other: Dataset) -> int:
-    """How many scenes of one are in the other too: of the same layout seed, or in the same state."""
-    seeds = {scene.record["episode_seed"] for scene in other.scenes}
-    states = {canonical_json(scene.record["state"]) for scene in other.scenes}
-    return sum(
-        scene.record["episode_seed"] in seeds or canonical_json(scene.record["state"]) in states
-        for scene in one.scenes
-    )
-
-
 def released_digests() -> set[str]:
     """Digests of the manifests of released datasets, `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"
@@ -153,31 +188,22 @@ def released_digests() -> set[str]:
 
 @uncollected()
 def load(path: Path, limit: int | None = None) -> Dataset:
-    """Read and verify a dataset; with `limit`, keep its first episodes only.
+    """Read a dataset; with `limit`, its first episodes only.
 
-    Every file has the digest its manifest states. The decision points of a released dataset are then what
-    they were when its manifest was pinned; any other's are checked one by one.
+    Every file has the digest its manifest states, and so has every tree, which pins its scenes. What a
+    released dataset holds is then what it was when its manifest was pinned; any other's is checked.
 
     Raises:
         UserError: a file is missing, changed or broken.
     """
     manifest, digest = read_manifest(path)
-    scenes: list[Scene] = []
     for problem in file_problems(path, manifest):
-        raise _unusable(path, problem)
-    file = path / "scenes.jsonl"
-    for record, problems in released(file) if digest in released_digests() else records(file, manifest):
-        if problems:
-            raise _unusable(path, problems[0])
-        if limit is not None and record["episode"] >= limit:
-            break
-        scenes.append(Scene(record))
-    if not scenes:
-        raise UserError(f"dataset {printable(path)} holds no scenes; build it with at least one episode")
-    return Dataset(path, manifest, digest, tuple(scenes))
-
-
-def _unusable(path: Path, problem: str) -> UserError:
-    return UserError(
-        f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or rebuild it"
-    )
+        raise unusable(path, problem)
+    trusted = digest in released_digests()
+    numbers = range(manifest.episodes)[:limit]
+    try:
+        with opened(path) as file:
+            trees = tuple(read_tree(file, manifest, number, trusted) for number in numbers)
+    except Damaged as damage:
+        raise unusable(path, str(damage)) from None
+    return Dataset(path, manifest, digest, trees, trusted)

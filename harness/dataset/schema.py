@@ -12,11 +12,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, field
 
+from harness.core.seeds import Purpose
 from harness.world.scenario import Scenario
 from harness.world.state import Kind, Part, indicator
 
 FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # of a dataset and of its files: never a path
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
+LAYOUTS = "layouts.zip"
 
 # No metre, second or share comes near these bounds; infinity and thousand-digit integers do not pass them.
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -27,6 +29,7 @@ Text = Annotated[str, Meta(max_length=200)]
 FileName = Annotated[str, Meta(pattern=FILE_NAME)]
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
+SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
 
 
 class Closed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,6 +61,20 @@ class Building(Closed, frozen=True):
     south_m: Number
 
 
+class Beacon(Closed, frozen=True):
+    """`harness.world.state.Beacon` in a file."""
+
+    sender: VehicleId
+    time_s: Number
+    arrives_s: Number
+    x_m: Number
+    y_m: Number
+    heading_rad: Number
+    speed_mps: Number
+    target_speed_mps: Number | None
+    heard_by: list[VehicleId]
+
+
 class State(Closed, frozen=True):
     """`harness.world.state.WorldState` in a file."""
 
@@ -68,6 +85,7 @@ class State(Closed, frozen=True):
     target_speed_mps: Number
     vehicles: Annotated[list[Vehicle], Meta(min_length=1)]
     buildings: list[Building]
+    beacons: list[Beacon]
 
 
 class Viewer(Closed, frozen=True):
@@ -87,6 +105,7 @@ class Ego(Closed, frozen=True):
     zone_m: Number
     forward_m: Number
     left_m: Number
+    age_s: Number
 
 
 class Node(Closed, frozen=True):
@@ -157,18 +176,6 @@ class Graph(Closed, frozen=True):
     sectors: list[SectorSeen]
 
 
-class Outcome(Closed, frozen=True):
-    """What an action leads to."""
-
-    result: Literal["cleared", "collision", "time_out", "off_road"]
-    time_s: Number
-    partner: VehicleId | None
-    striker: Literal["ego", "other", "both", "neither", None]
-    fault: Literal["ego", "other", None]
-    least_gap_m: Number
-    other_crashes: Count
-
-
 class Road(Closed, frozen=True):
     """What the scenario says of its road."""
 
@@ -180,13 +187,6 @@ class Danger(Closed, frozen=True):
     vehicle: VehicleId | None
 
 
-class Lead(Closed, frozen=True):
-    """The action that was taken when the episode was frozen, and who chose it."""
-
-    action: str
-    reason: Literal["cruise", "local-view", "full-view", "random", "guard"]
-
-
 class Snapshot(Closed, frozen=True):
     """What the simulator needs beyond the state to go on from here."""
 
@@ -196,36 +196,92 @@ class Snapshot(Closed, frozen=True):
 
 
 class Record(Closed, frozen=True):
-    """A decision point: one line of `scenes.jsonl`. `record_type` has the names of a scenario's places."""
+    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
 
-    scene: Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]$")]
+    scene: SceneId
     episode: Episode
     episode_seed: Seed
     step: Count
     road: Road
     danger: Danger
-    behaviour: Lead
     state: State
     graphs: dict[VehicleId, Graph]
     distance_m: dict[VehicleId, Number]
-    outcomes: dict[str, Outcome]
+    range_m: dict[VehicleId, Number]
     snapshot: Snapshot
 
 
-class Manifest(Closed, frozen=True):
-    """`manifest.json`: what a dataset was built from, and the sha256 of every file."""
+class End(Closed, frozen=True):
+    """How an episode ended."""
 
-    format: Literal["swarmdrive-dataset/1"]
+    result: Literal["cleared", "collision", "time_out", "off_road"]
+    time_s: Number
+    partner: VehicleId | None
+    striker: Literal["ego", "other", "both", "neither", None]
+    fault: Literal["ego", "other", None]
+
+
+class Edge(Closed, frozen=True):
+    """Where actions lead that come to the same, and what happens on the way.
+
+    Attributes:
+        actions: meta-actions.
+        to: place of the next decision point in the next level; None where the episode ends.
+        end: how it ends; None where it goes on.
+        least_gap_m: smallest distance to another vehicle's outline on the way.
+        hard_brakings: times the ego begins to brake harder than 4 m/s² on the way.
+        other_crashes: vehicles that crash without the ego on the way.
+    """
+
+    actions: Annotated[list[Text], Meta(min_length=1)]
+    to: Count | None
+    end: End | None
+    least_gap_m: Number
+    hard_brakings: Count
+    other_crashes: Count
+
+
+class Branching(Closed, frozen=True):
+    """A decision point in its tree: what each reference driver does there, and where actions lead."""
+
+    scene: SceneId
+    drivers: dict[str, Text]
+    edges: Annotated[list[Edge], Meta(min_length=1)]
+
+
+class Tree(Closed, frozen=True):
+    """Every course of a layout: `<episode>/tree.json` in `layouts.zip`.
+
+    Attributes:
+        episode: its number.
+        episode_seed: seed of the layout.
+        danger: the vehicle that the layout sends against the ego, if any.
+        levels: decision points by step; the first level is the start alone.
+        scenes_sha256: digest of each level's scenes, `<episode>/<step>.jsonl` in `layouts.zip`.
+    """
+
+    episode: Episode
+    episode_seed: Seed
+    danger: Danger
+    levels: Annotated[list[list[Branching]], Meta(min_length=1, max_length=10)]
+    scenes_sha256: list[Sha256]
+
+
+class Manifest(Closed, frozen=True):
+    """`manifest.json`: what a dataset was built from, and the sha256 of every file and of every tree."""
+
+    format: Literal["swarmdrive-dataset/2"]
     name: FileName
     scenario: Text
     actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
-    parameters: dict[str, Number | list[Number]]
-    behaviour: dict[str, Number]
+    parameters: dict[str, bool | Number | list[Number]]
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
-    decisions: Annotated[int, Meta(ge=1, le=1_000_000)]
+    nodes: Annotated[int, Meta(ge=1, le=10_000_000)]
     seed: Annotated[int, Meta(ge=0, le=LAST_SEED)]
+    purpose: Purpose
     versions: dict[str, Text]
-    files: Annotated[dict[FileName, Sha256], Meta(extra_json_schema={"required": ["scenes.jsonl"]})]
+    files: dict[FileName, Sha256]
+    trees_sha256: list[Sha256]
 
     def number(self, parameter: str) -> float:
         """A scenario parameter that is one number."""
@@ -278,12 +334,13 @@ def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
 
 
 def record_schema(scenario: Scenario) -> dict[str, Any]:
-    """JSON Schema of one line of `scenes.jsonl`."""
-    schema, actions = _published(record_type(scenario), "decision point"), scenario.actions
-    schema["$defs"]["Lead"]["properties"]["action"] = {"enum": list(actions)}
-    outcomes = schema["$defs"]["Record"]["properties"]["outcomes"]
-    outcomes |= {"propertyNames": {"enum": list(actions)}, "required": sorted(actions)}
-    return schema
+    """JSON Schema of one line of an `<episode>/<step>.jsonl`."""
+    return _published(record_type(scenario), "decision point")
+
+
+def tree_schema() -> dict[str, Any]:
+    """JSON Schema of a `tree.json`."""
+    return _published(Tree, "decision tree of a layout")
 
 
 def manifest_schema() -> dict[str, Any]:

@@ -1,22 +1,29 @@
-"""Whether a dataset is what it says: its files by digest, each decision point by form and by sense."""
+"""Whether a dataset is what it says: its files by digest, each tree and decision point by form and sense."""
 
+import zipfile
+import zlib
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import msgspec
 
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_bytes, sha256_file
-from harness.dataset.schema import Manifest, Record, record_type
+from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, record_type
 from harness.world import scenarios
+from harness.world.drivers import DRIVERS
 from harness.world.scenario import Scenario
 
 _MANIFEST = msgspec.json.Decoder(Manifest)
+_TREE = msgspec.json.Decoder(Tree)
 _JSON = msgspec.json.Decoder()
-_Lines = Iterator[tuple[dict[str, Any], list[str]]]
+LARGEST_ENTRY = 1 << 28  # bytes
 
 
 def read_manifest(path: Path) -> tuple[Manifest, str]:
@@ -49,8 +56,8 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
     """What is wrong with a manifest that no type can state."""
     if len(set(manifest.actions)) < len(manifest.actions):
         yield "[actions]: an action stands there twice"
-    if "scenes.jsonl" not in manifest.files:
-        yield "[files] has no scenes.jsonl"
+    if len(manifest.trees_sha256) != manifest.episodes:
+        yield f"[trees_sha256] has {len(manifest.trees_sha256)} digests for {manifest.episodes} episodes"
     expected = asdict(scenario.parameters)
     for name, value in manifest.parameters.items():
         if name not in expected:
@@ -61,22 +68,44 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
         yield f"[parameters] has no {', '.join(sorted(missing))}"
 
 
+def scenario_of(manifest: Manifest) -> Scenario:
+    """The scenario of a manifest, with the manifest's parameters."""
+    scenario = scenarios.get(manifest.scenario)
+    values: Any = {
+        name: tuple(value) if isinstance(value, list) else type(getattr(scenario.parameters, name))(value)
+        for name, value in manifest.parameters.items()
+    }
+    return replace(scenario, parameters=replace(scenario.parameters, **values))
+
+
 def check(path: Path) -> list[str]:
-    """Everything that is wrong with a dataset, one line each, with file and line number. Empty if sound."""
+    """Everything that is wrong with a dataset, one line each. Empty if sound."""
     manifest, _ = read_manifest(path)
-    problems = list(file_problems(path, manifest))
-    if (path / "scenes.jsonl").is_file():
-        count, last_episode = 0, None
-        for record, of_line in records(path / "scenes.jsonl", manifest):
-            problems += of_line
-            count, last_episode = count + 1, None if of_line else record["episode"]
-        if count != manifest.decisions:
-            problems.append(f"scenes.jsonl: {count} decision points, the manifest says {manifest.decisions}")
-        elif last_episode is not None and last_episode + 1 != manifest.episodes:
-            problems.append(
-                f"scenes.jsonl: {last_episode + 1} episodes, the manifest says {manifest.episodes}"
-            )
+    problems, nodes = list(file_problems(path, manifest)), 0
+    try:
+        with opened(path) as file:
+            for episode in range(manifest.episodes):
+                of_tree, points = _check_tree(file, manifest, episode)
+                problems += of_tree
+                nodes += points
+    except UserError as error:
+        return [*problems, str(error)]
+    if not problems and nodes != manifest.nodes:
+        problems.append(f"{LAYOUTS}: {nodes} decision points, the manifest says {manifest.nodes}")
     return problems
+
+
+def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[str], int]:
+    """What is wrong with a layout's tree and scenes, and how many decision points it has."""
+    try:
+        tree = read_tree(file, manifest, episode)
+        problems = []
+        for step, level in enumerate(tree.levels):
+            for line, point in zip(read_level(file, tree, step), level, strict=True):
+                problems += decoded(line, manifest, point.scene)[1]
+        return problems, sum(map(len, tree.levels))
+    except Damaged as error:
+        return [str(error)], 0
 
 
 def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
@@ -88,39 +117,122 @@ def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
             yield f"{name}: changed, its sha256 is not the manifest's"
 
 
-def records(file: Path, manifest: Manifest) -> _Lines:
-    """Each line's record, and what is wrong with it; a record is good for use only if nothing is."""
+class Damaged(Exception):
+    """Part of a dataset that is not what was pinned, in words."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[ZipFile]:
+    """A dataset's layouts. Digests pin what is in them: how a machine compresses it is its own."""
+    try:
+        with ZipFile(path / LAYOUTS) as file:
+            yield file
+    except (OSError, zipfile.BadZipFile) as error:
+        raise unusable(path, f"{LAYOUTS}: cannot be read ({printable(error)})") from None
+
+
+def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
+    """A file in `layouts.zip`. Raises Damaged if it is not the one that was pinned."""
+    try:
+        if file.getinfo(name).file_size > LARGEST_ENTRY:
+            raise Damaged(f"{LAYOUTS} {name}: too large")
+        data = file.read(name)
+    except (KeyError, OSError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise Damaged(f"{LAYOUTS} {name}: cannot be read ({printable(error)})") from None
+    if sha256_bytes(data) != sha256:
+        raise Damaged(f"{LAYOUTS} {name}: changed, its sha256 is not the one that was pinned")
+    return data
+
+
+def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = False) -> Tree:
+    """The tree of an episode. Raises Damaged if it is not the manifest's, or is broken."""
+    name = tree_name(episode)
+    data = _entry(file, name, manifest.trees_sha256[episode])
+    try:
+        tree = _TREE.decode(data)
+    except msgspec.ValidationError as error:
+        raise Damaged(f"{LAYOUTS} {name}: {misfit(error, data, Tree, 'tree')}") from None
+    except (ValueError, RecursionError) as error:
+        raise Damaged(f"{LAYOUTS} {name}: no JSON ({printable(error)})") from None
+    for problem in () if trusted else tree_contradictions(tree, manifest, episode):
+        raise Damaged(f"{LAYOUTS} {name}: {problem}")
+    return tree
+
+
+def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
+    """The scenes of one level of a tree, a line each, in the level's order. Raises Damaged."""
+    name = level_name(tree.episode, step)
+    lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
+    if len(lines) != len(tree.levels[step]):
+        raise Damaged(f"{LAYOUTS} {name}: {len(lines)} scenes, the tree has {len(tree.levels[step])}")
+    return lines
+
+
+def tree_name(episode: int) -> str:
+    """Name of a tree in `layouts.zip`."""
+    return f"{episode:05d}/tree.json"
+
+
+def level_name(episode: int, step: int) -> str:
+    """Name of a level's scenes in `layouts.zip`."""
+    return f"{episode:05d}/{step}.jsonl"
+
+
+def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str]:
+    """Where one part of a tree speaks against another or the manifest, which no type can state."""
+    actions, points = Counter(manifest.actions), [point for level in tree.levels for point in level]
+    edges = [edge for point in points for edge in point.edges]
+    leads = [
+        (edge.to, len(following))
+        for level, following in zip(tree.levels, [*tree.levels[1:], []], strict=True)
+        for point in level
+        for edge in point.edges
+        if edge.to is not None
+    ]
+    ids = [point.scene for point in points]
+    chosen = {action for point in points for action in point.drivers.values()}
+    holds = {
+        "its number is not that of its folder": tree.episode == number,
+        "its seed is not the manifest's, counted on": tree.episode_seed == manifest.seed + number,
+        "the first level is not the start alone": len(tree.levels[0]) == 1,
+        "there is not a digest a level": len(tree.scenes_sha256) == len(tree.levels),
+        "two decision points have one id": len(set(ids)) == len(ids),
+        "an id is not <episode>-<step>-<digest>": all(
+            point.scene.startswith(f"{number:05d}-{step}-")
+            for step, level in enumerate(tree.levels) for point in level
+        ),
+        "a reference driver is missing": all(point.drivers.keys() == set(DRIVERS) for point in points),
+        "a reference driver's action is not one of the manifest's": chosen <= actions.keys(),
+        "the edges of a decision point are not one an action": all(
+            Counter(action for edge in point.edges for action in edge.actions) == actions for point in points
+        ),
+        "an edge leads nowhere, or goes on after the end": all(
+            (edge.to is None) != (edge.end is None) for edge in edges
+        ),
+        "an edge leads to a decision point that is not there": all(to < n for to, n in leads),
+    }  # fmt: skip
+    return [what for what, true in holds.items() if not true]
+
+
+def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[dict[str, Any], list[str]]:
+    """A scene's record, and what is wrong with it; it is good for use only if nothing is."""
     scenario = scenarios.get(manifest.scenario)
-    kind = record_type(scenario)
-    decoder = msgspec.json.Decoder(kind)
-    before: tuple[int, int] | None = (-1, 0)  # episode and step; None after a line that cannot be read
-    with file.open("rb") as lines:
-        for number, text in enumerate(lines, 1):
-            where = f"{file.name} line {number}"
-            last, before = before, None
-            if not text.endswith(b"\n"):
-                yield {}, [f"{where}: cut off"]
-                continue
-            try:
-                record = decoder.decode(text)
-            except msgspec.ValidationError as error:
-                yield {}, [f"{where}: {misfit(error, text, kind, 'record')}"]
-                continue
-            except (ValueError, RecursionError) as error:
-                yield {}, [f"{where}: no JSON ({printable(error)})"]
-                continue
-            problems = [f"{where}: {what}" for what in contradictions(scenario, record, manifest)]
-            before = (record.episode, record.step)
-            if last and before not in ((last[0], last[1] + 1), (last[0] + 1, 0)):
-                problems.append(f"{where}: scene {record.scene} does not follow the line before")
-            yield _JSON.decode(text), problems
+    kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
+    try:
+        record = msgspec.json.decode(line, type=kind)
+    except msgspec.ValidationError as error:
+        return {}, [f"{where}: {misfit(error, line, kind, 'record')}"]
+    except (ValueError, RecursionError) as error:
+        return {}, [f"{where}: no JSON ({printable(error)})"]
+    problems = [f"{where}: {what}" for what in contradictions(scenario, record, manifest, name)]
+    return _JSON.decode(line), problems
 
 
-def released(file: Path) -> _Lines:
-    """Each line's record of a file known by its digest, in the form of `records`."""
-    with file.open("rb") as lines:
-        for text in lines:
-            yield _JSON.decode(text), []
+def unusable(path: Path, problem: str) -> UserError:
+    """What a reader of a dataset is told of a problem."""
+    return UserError(
+        f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or rebuild it"
+    )
 
 
 def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
@@ -135,7 +247,7 @@ def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -
     return printable(error)
 
 
-def contradictions(scenario: Scenario, record: Record, manifest: Manifest) -> list[str]:
+def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name: str) -> list[str]:
     """Where one part of a record speaks against another or the manifest, which no type can state."""
     state, graphs = record.state, record.graphs
     ids = [v.id for v in state.vehicles]
@@ -144,11 +256,12 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest) -> li
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
     speeds = manifest.parameters["target_speeds_mps"]
     holds = {
-        "the action is not one of the manifest's": record.behaviour.action in manifest.actions,
-        "outcomes are not those of the manifest's actions": record.outcomes.keys() == set(manifest.actions),
+        "it is the scene of another decision point": record.scene == name,
         "there is no target speed of that index": isinstance(speeds, list)
         and record.snapshot.speed_index < len(speeds),
-        "scene is not <episode>-<step>": record.scene == f"{record.episode:05d}-{record.step}",
+        "scene is not <episode>-<step>-<digest>": record.scene.startswith(
+            f"{record.episode:05d}-{record.step}-"
+        ),
         "state is of another step": state.step == record.step,
         "state is of another episode seed": state.episode_seed == record.episode_seed,
         "two vehicles have one id": len(set(ids)) == len(ids),
@@ -160,6 +273,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest) -> li
         "a conflict is on a path that does not cross the ego's": {(c.sector, c.route) for c in conflicts}
         <= scenario.road().crossings.keys(),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
+        "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
         "sections are not one a vehicle": len(record.snapshot.sections) == len(ids),
     }

@@ -27,11 +27,6 @@ from harness.world.perception.graph import truth_graph
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
-def request_count(spec: Spec, scenes: Sequence[Scene]) -> int:
-    """Number of requests for these scenes."""
-    return sum(len(spec.viewers(scene)) for scene in scenes)
-
-
 def most_tokens(spec: Spec, role: Role) -> int:
     """Most tokens that an answer may have, its thought included if the model thinks first."""
     answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
@@ -54,6 +49,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 form=spec.prompt.helper_answer,
                 answer=spec.answer,
                 thinking=spec.thinking,
+                reasons_first=spec.prompt.reasons_first,
                 view=graph,
                 truth=truth,
                 scenario=spec.scenario,
@@ -79,6 +75,7 @@ def fusion_request(
         form=spec.prompt.helper_answer,
         answer=spec.answer,
         thinking=spec.thinking,
+        reasons_first=spec.prompt.reasons_first,
     )
 
 
@@ -95,7 +92,8 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     said = parse(
         # A read-out is a bare distribution, a helper's too.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
-        thinking=request.thinking, finish_reason=completion.finish_reason, error=completion.error,
+        thinking=request.thinking, reasons_first=request.reasons_first,
+        finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
     return Answer(
         scene=scene, viewer=viewer, heard=tuple(heard), role="merge" if heard else request.role, raw=raw,
@@ -137,11 +135,12 @@ class Asker:
             kept: JSON Lines file of answers so far; may be torn at its end by a kill.
             answers: further answers that are there already, by request id.
             progress: called with the number of new answers, those kept from before included.
-            more: called with the number of fusion calls, once it is known.
+            more: called with the number of requests before they are made.
         """
         self.spec, self._backend, self._kept = spec, backend, kept
         self._progress, self._more = progress, more
         self.latency = latency
+        self._given = frozenset(answers or {})
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
@@ -161,9 +160,16 @@ class Asker:
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN for one without a request, or whose answer failed."""
-        viewers = [(scene.id, self.spec.viewers(scene)) for scene in moments]
-        if any(f"{scene}/{viewer}" not in self.answers for scene, some in viewers for viewer in some):
-            self.ask(list(requests(self.spec, moments)))
+        if any(self.lacks(moments)):
+            self._owed(list(requests(self.spec, moments)))
+        return self.laid_out(moments)
+
+    def lacks(self, moments: Sequence[Scene]) -> list[bool]:
+        """Whether some viewer's answer is missing, of each."""
+        return [any(f"{s.id}/{v}" not in self.answers for v in self.spec.viewers(s)) for s in moments]
+
+    def laid_out(self, moments: Sequence[Scene]) -> Intents:
+        """The answers that are there as arrays; NaN for one that is not, or that failed."""
         answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
         return self._laid_out(moments, answers)
 
@@ -171,8 +177,7 @@ class Asker:
         """The ego's answers to these sets of messages."""
         ids = [_fusion_id(*each) for each in _heard(moments, codes)]
         if not self.answers.keys() >= set(ids):
-            asked = self.fusion_requests(moments, codes)
-            self.ask_fusion([request for request in asked if request.id not in self.answers])
+            self._owed(self.fusion_requests(moments, codes))
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
@@ -186,11 +191,11 @@ class Asker:
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
         return asked
 
-    def ask_fusion(self, owed: Sequence[Request]) -> None:
-        """Make the fusion calls that are owed."""
-        if owed:
-            self._more(len(owed))
-            self.ask(owed)
+    def _owed(self, requests: Sequence[Request]) -> None:
+        # Those kept from before a kill are among them, so that chunks begin where they did.
+        asked = [request for request in requests if request.id not in self._given]
+        self._more(len(asked))
+        self.ask(asked)
 
     def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
         width, actions = max(map(len, answers)), len(self.spec.actions)
@@ -199,14 +204,12 @@ class Asker:
         bits = np.zeros((len(moments), width - 1))
         for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
             at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
-            ego_x_m, ego_y_m = at[scene.viewers[0]]
             for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
                 distance[i, j] = scene.record["distance_m"][viewer]
                 if answer and answer.intent is not None:
                     p[i, j] = answer.intent
                 if j:
-                    x_m, y_m = at[viewer]
-                    reach[i, j - 1] = np.hypot(x_m - ego_x_m, y_m - ego_y_m)
+                    reach[i, j - 1] = scene.record["range_m"][viewer]
                     bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
             row += [None] * (width - len(row))
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)

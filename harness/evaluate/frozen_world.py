@@ -1,21 +1,19 @@
-"""The frozen world: recorded courses of scenes; a table says where each action would lead."""
+"""The frozen world: an episode is a walk through its layout's decision tree."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
-from harness.evaluate.success import Verdict, judge_choices, table
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
-from harness.world.scenario import Scenario
+from harness.world.scenario import Scenario, frames
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,11 @@ class FrozenSource:
 
     def record(self) -> FrozenScenes:
         """The dataset, pinned by its digest."""
-        scenes = self.dataset.scenes
+        p = self.scenario.parameters
         return FrozenScenes(
-            name=self.dataset.name, sha256=self.dataset.sha256, scenes=len(scenes),
+            name=self.dataset.name, sha256=self.dataset.sha256, nodes=len(self.dataset.forest.ids),
             episodes=len(self.dataset.episodes), limit=self.limit,
-            delay_allowance_s=self.dataset.delay_allowance_s,
+            delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path),
         )  # fmt: skip
 
@@ -57,113 +55,129 @@ class FrozenSource:
         return [("--dataset", argument(self.dataset.path)), ("--limit", self.limit)]
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """The scenes of a step, their positions in the dataset, and the decisions that are due in them."""
+class _Walks:
+    """The walks under one condition, arrays (S, E).
 
-    places: Ints
-    scenes: Sequence[Scene]
-    due: Due
+    Attributes:
+        at: the decision point of each, among the forest's; -1 once the episode is decided.
+        last: the edge taken last.
+        least_gap_m: so far.
+        hard_brakings: so far.
+        other_crashes: so far.
+        dropped: walks that are left out.
+    """
+
+    def __init__(self, seeds: int, root: Ints) -> None:
+        shape = seeds, len(root)
+        self.at, self.last = np.tile(root, (seeds, 1)), np.full(shape, -1)
+        self.least_gap_m = np.full(shape, np.inf)
+        self.hard_brakings, self.other_crashes = np.zeros(shape, dtype=int), np.zeros(shape, dtype=int)
+        self.dropped = np.zeros(shape, dtype=bool)
 
 
 class FrozenWorld:
     """Every episode of a dataset, under all conditions and seeds.
 
-    An episode takes the recorded course whatever it decides; a decision counts by its scene's outcome table.
+    A decision acts the dataset's lag after its moment, however long it took.
     """
 
-    def __init__(self, dataset: Dataset, seeds: Sequence[int]) -> None:
-        self._dataset, self._seeds = dataset, seeds
-        self._laid = table(dataset)
-        self._shown: list[_Shown] = []  # of each step observed so far
-        self._step = -1
-        self._chosen: dict[str, Ints] = {}  # by condition, (S, n)
+    def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
+        self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
+        self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
         self._columns: list[dict[str, Any]] = []
-
-    def undecided(self) -> "FrozenWorld":
-        """The same world before its first decision; both lay out a step's scenes and draws once."""
-        world = copy(self)
-        world._step, world._chosen, world._columns = -1, {}, []
-        return world
+        edges = self._forest.edges
+        self._gap_m = np.array([edge.least_gap_m for edge in edges])
+        self._hard_brakings = np.array([edge.hard_brakings for edge in edges])
+        self._other_crashes = np.array([edge.other_crashes for edge in edges])
 
     def observe(self) -> Sequence[Scene]:
-        """The scenes of the next step."""
-        self._step += 1
-        if self._step == self._laid.index.shape[1]:
-            return ()
-        if self._step == len(self._shown):
-            self._shown.append(self._show())
-        return self._shown[self._step].scenes
-
-    def _show(self) -> "_Shown":
-        column, steps = self._laid.index[:, self._step], self._laid.index.shape[1]
-        there = column >= 0
-        places = column[there]
-        scenes = [self._dataset.scenes[n] for n in places.tolist()]
-        n, helpers = len(scenes), max(len(scene.viewers) for scene in scenes) - 1
-        at, seed = np.tile(np.arange(n), len(self._seeds)), np.repeat(self._seeds, n)
-        draws = channel_draws(seed, self._laid.seeds[there][at], np.full(len(at), self._step), steps, helpers)
-        return _Shown(places, scenes, Due(at, self._laid.episodes[there][at], seed, draws))
+        """Every decision point to which some walk has come."""
+        places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
+        self._moments = places[places >= 0]
+        scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
+        self._helpers = max((len(scene.viewers) for scene in scenes), default=1) - 1
+        return scenes
 
     def due(self, point: OperatingPoint) -> Due:
-        """Each scene of the step, with every seed."""
-        return self._shown[self._step].due
+        """Each walk of the condition that is not at its end."""
+        walks, forest = self._walks[point.name], self._forest
+        of_seed, tree = np.nonzero(walks.at >= 0)
+        at = np.searchsorted(self._moments, walks.at[of_seed, tree])
+        p = self._dataset.scenario.parameters
+        seed, step = self._seeds[of_seed], forest.step[self._moments[at]]
+        draws = channel_draws(seed, forest.seeds[tree], step, p.decisions, self._helpers)
+        return Due(at, forest.episodes[tree], seed, draws)
+
+    def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
+        """End the walks that have come to these of the moments just shown, and count them no longer."""
+        walks = self._walks[point.name]
+        there = walks.at >= 0
+        out = np.zeros_like(there)
+        out[there] = moments[np.searchsorted(self._moments, walks.at[there])]
+        walks.dropped |= out
+        walks.at[out] = -1
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Look up where each action leads."""
-        laid, n, shown = self._laid, len(self._laid.safe), self._shown[self._step]
-        place = shown.places[shown.due.at]
-        of_seed = np.repeat(np.arange(len(self._seeds)), len(shown.places))
+        """Take the edge of each action."""
+        forest, p = self._forest, self._dataset.scenario.parameters
         for part in decided:
-            action = part.result.action
-            chosen = self._chosen.setdefault(part.point.name, np.zeros((len(self._seeds), n), dtype=int))
-            chosen[of_seed, place] = action
+            walks, action = self._walks[part.point.name], part.result.action
+            place = np.nonzero(walks.at >= 0)
+            at = walks.at[place]
+            edge = forest.edge[at, action]
+            walks.last[place] = edge
+            walks.least_gap_m[place] = np.minimum(walks.least_gap_m[place], self._gap_m[edge])
+            walks.hard_brakings[place] += self._hard_brakings[edge]
+            walks.other_crashes[place] += self._other_crashes[edge]
+            walks.at[place] = forest.child[at, action]
+            latency_s = part.result.latency_s
+            off_lag = [frames(each, p.simulation_hz) != p.lag_frames for each in np.nan_to_num(latency_s)]
             self._columns.append({
-                "safe": laid.safe[place, action], "delay_s": laid.delay_s[place, action],
-                **by_action("safe", laid.safe[place], self._dataset.actions),
-                **by_action("delay_s", laid.delay_s[place], self._dataset.actions),
+                "value": forest.value[at], "safe": forest.safe[at, action],
+                "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
+                "delay_s": forest.delay_s[at, action],
+                "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
+                **by_action("safe", forest.safe[at], forest.actions),
+                **by_action("delay_s", forest.delay_s[at], forest.actions),
             })  # fmt: skip
 
     def columns(self) -> dict[str, Any]:
-        """Outcome of each decision, and of every other action, in the order of decisions."""
+        """What each decision was worth, and every other action, in the order of decisions."""
         return {name: np.concatenate([each[name] for each in self._columns]) for name in self._columns[0]}
 
     @property
     def numbers(self) -> Ints:
         """Of the episodes, (E,)."""
-        return self._laid.episodes
+        return self._forest.episodes
 
-    def verdicts(self, point: OperatingPoint) -> list[Verdict]:
-        """How the episodes ended under a condition, arrays (E,) for each seed."""
-        return [judge_choices(self._laid, chosen) for chosen in self._chosen[point.name]]
+    def ends(self, point: OperatingPoint) -> dict[str, Floats]:
+        """Success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
+        walks, trees = self._walks[point.name], np.arange(len(self._forest.root))
+        cleared = np.isfinite(self._forest.cleared_s[walks.last])
+        success = self._forest.succeeds(walks.last, trees)
+        ends = {"success_rate": success, "unsafe_rate": ~cleared, "late_rate": cleared & ~success}
+        return {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
 
     def episodes(self) -> list[Episode]:
         """How each episode ended under each condition and seed."""
         return [
-            episode
-            for condition, chosen in self._chosen.items()
-            for seed, of_seed in zip(self._seeds, chosen, strict=True)
-            for episode in self._judged(condition, seed, of_seed)
+            self._episode(condition, walks, place)
+            for condition, walks in self._walks.items()
+            for place in np.ndindex(*walks.at.shape)
         ]
 
-    def _judged(self, condition: str, seed: int, chosen: Ints) -> list[Episode]:
-        laid, scenes = self._laid, self._dataset.scenes
-        verdict = judge_choices(laid, chosen)
-        return [
-            Episode(
-                condition=condition, seed=seed, episode=int(laid.episodes[row]),
-                layout_seed=int(laid.seeds[row]),
-                danger=scenes[places[0]].record["danger"]["sector"] or "none",
-                success=bool(verdict.success[row]),
-                failure=self._first_unsafe(places, chosen) if verdict.unsafe[row]
-                else "late" if verdict.late[row] else "",
-                delay_s=round(float(verdict.delay_s[row]), 3),
-            )
-            for row, places in enumerate(laid.index)
-        ]  # fmt: skip
-
-    def _first_unsafe(self, places: Ints, chosen: Ints) -> str:
-        """What the first unsafe decision of an episode leads to."""
-        safe, actions = self._laid.safe, self._dataset.actions
-        place = next(n for n in places[places >= 0] if safe[n].any() and not safe[n, chosen[n]])
-        return str(self._dataset.scenes[place].record["outcomes"][actions[chosen[place]]]["result"])
+    def _episode(self, condition: str, walks: _Walks, place: tuple[int, ...]) -> Episode:
+        seed, tree = place
+        forest, last = self._forest, int(walks.last[place])
+        end, reference_s = forest.end(last), float(forest.reference_s[tree])
+        cleared = end.result == "cleared"
+        success = bool(forest.succeeds(np.array(last), np.array(tree)))
+        return Episode(
+            condition=condition, seed=int(self._seeds[seed]), episode=int(forest.episodes[tree]),
+            layout_seed=int(forest.seeds[tree]), danger=forest.dangers[tree] or "none", success=success,
+            failure="" if success else "late" if cleared else end.result,
+            delay_s=round(end.time_s - reference_s, 3) if cleared and np.isfinite(reference_s) else None,
+            time_s=end.time_s, partner=end.partner, striker=end.striker, fault=end.fault,
+            least_gap_m=float(walks.least_gap_m[place]), hard_brakings=int(walks.hard_brakings[place]),
+            other_crashes=int(walks.other_crashes[place]),
+        )  # fmt: skip

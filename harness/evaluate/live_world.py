@@ -5,7 +5,6 @@ taken in the first frame that begins after the decision's latency, and until the
 action. A decision that is still open when the next is due continues, and the next one is skipped.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -15,7 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.files import digest
 from harness.dataset.freeze import moment
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Course, Decision, Trajectory
@@ -25,10 +23,8 @@ from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
-from harness.world.scenario import Scenario
+from harness.world.scenario import Scenario, frames
 from harness.world.world import World
-
-ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class LiveSource:
         parameters = asdict(self.scenario.parameters)
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
-            episodes=self.episodes, late_against="full-view driver, whose decisions act at once",
+            episodes=self.episodes, late_against="full-view driver, whose decisions act after decision_lag_s",
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
@@ -133,7 +129,7 @@ class LiveWorld:
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Open every decision, and simulate until the next are due."""
         actions, hz = self._scenario.actions, self._p.simulation_hz
-        begun = round(self._step * self._p.decision_period_s * hz)
+        begun = self._p.due_frame(self._step)
         for part in decided:
             latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
             for (_, course), latency_s, action in zip(
@@ -151,9 +147,8 @@ class LiveWorld:
 
     def _advance(self) -> None:
         self._step += 1
-        p = self._p
-        until_s = p.time_limit_s if self._step == p.decisions else self._step * p.decision_period_s
-        parts = [part for t in self._going for part in t.advance(round(until_s * p.simulation_hz))]
+        until = self._p.due_frame(self._step)
+        parts = [part for t in self._going for part in t.advance(until)]
         self._ended += [part for part in parts if part.world.outcome.ended]
         self._going = [part for part in parts if not part.world.outcome.ended]
 
@@ -165,7 +160,7 @@ class LiveWorld:
         }
 
     def episodes(self) -> list[Episode]:
-        """How each episode ended; late against a full-view driver whose decisions act at once."""
+        """How each episode ended; late against a full-view driver whose decisions act after the lag."""
         references = {
             number: reference.drive(self._scenario, PRIVILEGED, self._first_seed + number)
             for number in sorted({t.number for t in self._ended if t.world.outcome.success})
@@ -173,18 +168,12 @@ class LiveWorld:
         return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
 
 
-def frames(latency_s: float, simulation_hz: int) -> int:
-    """Whole frames that a decision takes."""
-    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
-
-
 def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
-    """The decision point of a trajectory now. Equal states have equal ids anywhere."""
+    """The decision point of a trajectory now."""
     world = trajectory.world
     state = replace(world.state(), step=step)
     viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
-    seen = moment(world, state, trajectory.number, viewers)
-    return Scene({**seen, "scene": f"{seen['scene']}-{digest(seen['state'])[:12]}"})
+    return Scene(moment(world, state, trajectory.number, viewers))
 
 
 def _episode(trajectory: Trajectory, course: Course, against: Outcome | None) -> Episode:

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from harness.backends.base import Backend, Request
+from harness.backends.base import Backend
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
@@ -24,10 +24,10 @@ from harness.core.parallel import spread
 from harness.dataset.load import Scene
 from harness.evaluate import latency as latencies
 from harness.evaluate import timing
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.spec import Spec, versions
-from harness.evaluate.walk import heard_codes, table, walk
+from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.formats import CONFIG, FORMAT, WORK
@@ -69,7 +69,7 @@ def evaluate(
         progress: called with the number of new answers, or of episodes just driven, those kept from before
             included.
         cache: file of completions kept between runs, for language models; None for no cache.
-        more: called with the number of fusion calls on frozen scenes, once it is known.
+        more: called with the number of answers that are owed next, where scenes are frozen.
         workers: processes that drive, each with a backend of its own.
 
     Raises:
@@ -88,7 +88,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class Walked:
-    """All that a walk decided, how its episodes ended, and the answers by request id."""
+    """All that a walk decided, rounded, how its episodes ended, and the answers by request id."""
 
     decisions: Decisions
     episodes: Sequence[Episode]
@@ -97,39 +97,23 @@ class Walked:
 
 def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
-    return Walked(table(decided, world.columns(), spec.actions), world.episodes(), asker.answers)
+    decisions = table(decided, world.columns(), spec.actions).rounded()
+    return Walked(decisions, world.episodes(), asker.answers)
 
 
 def _frozen(
     spec: Spec, source: FrozenSource, out: Path, progress: Callable[[int], None], cache: Path | None,
     more: Callable[[int], None],
 ) -> Evaluated:  # fmt: skip
-    scenes = source.dataset.scenes
+    dataset = source.dataset
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
-    latency = _latency(spec, out, backend, lambda: timing.spread_over(scenes))
+    latency = _latency(spec, out, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     with working(spec, out, backend.identity(), latency) as work:
         asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
-        asker.ask(list(requests(spec, scenes)))
-        if any(point.asks_again for point in spec.points):
-            asker.ask_fusion(_fusion_calls(spec, source, asker))
+        walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
-            walked = _walked(spec, FrozenWorld(source.dataset, spec.seeds), asker)
-        return _written(spec, out, work, source.dataset.episodes, walked, backend.identity(), latency)
-
-
-def _fusion_calls(spec: Spec, source: FrozenSource, asker: Asker) -> list[Request]:
-    """All fusion calls of a run, scene by scene: what frozen scenes show depends on no decision.
-
-    They are made before the walk, so that they fill batches, whatever their steps.
-    """
-    world = FrozenWorld(source.dataset, spec.seeds)
-    asked: list[Request] = []
-    while scenes := world.observe():
-        codes = heard_codes({point: world.due(point) for point in spec.points}, asker(scenes))
-        asked += asker.fusion_requests(scenes, codes)
-    place = {scene.id: n for n, scene in enumerate(source.dataset.scenes)}
-    return sorted(asked, key=lambda request: place[request.id.partition("/")[0]])
+            return _written(spec, out, work, dataset.episodes, walked, backend.identity(), latency)
 
 
 def _closed_loop(
@@ -169,7 +153,7 @@ def _driven(
         )
         world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
-        folder.write_part(part, walked.decisions.rounded(), walked.episodes, list(walked.answers.values()))
+        folder.write_part(part, walked.decisions, walked.episodes, list(walked.answers.values()))
     return part
 
 
@@ -222,7 +206,7 @@ def _written(
         "engine_errors": sum(answer.error is not None for answer in answers),
         "versions": versions(),
     }, Manifest)  # fmt: skip
-    folder.write(out, manifest, walked.decisions.rounded(), episodes, answers, summary)
+    folder.write(out, manifest, walked.decisions, episodes, answers, summary)
     return Evaluated(out, manifest, summary)
 
 
@@ -283,7 +267,7 @@ def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
 @contextmanager
 def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -> Iterator[Path]:
     """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
-    work, existed = out / WORK, out.exists()
+    work, made = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     new = not (work / CONFIG).is_file()
     if not new and _begun(work)["identity"] != digest(identity):
         raise UserError(
@@ -310,6 +294,7 @@ def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -
     except UserError:
         if new:
             shutil.rmtree(work)
-            if not existed:
-                out.rmdir()
+            for path in made:
+                with suppress(OSError):  # somebody else's run is in it by now
+                    path.rmdir()
         raise

@@ -21,7 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import codes_of
-from harness.runs.decisions import Decisions, Labels, by_action, by_message
+from harness.runs.decisions import DECIMALS, Decisions, Labels, by_action, by_message
 
 Moment = TypeVar("Moment")
 AskedMoment = TypeVar("AskedMoment", contravariant=True)
@@ -165,11 +165,13 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:
-    """Numbers of decisions (n,) by name, as the table of decisions has them, NaN where unknown."""
+    """Numbers of decisions (n,) by name, with the decimals that are kept, NaN where unknown."""
     c, point = decided.result, decided.point
     anybody = c.on_time.any(axis=-1)
-    return {
-        "messages": c.messages, "triggered": c.triggered, "own_failed": c.own_failed,
+    numbers = {
+        "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
+        "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
+        "own_failed": c.own_failed,
         "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
         "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
         "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
@@ -177,6 +179,9 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
         "fusion_failed": np.where(anybody & point.asks_again, c.fusion_failed, np.nan),
         "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
     }  # fmt: skip
+    return {
+        name: values.round(DECIMALS[name]) if name in DECIMALS else values for name, values in numbers.items()
+    }
 
 
 def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:

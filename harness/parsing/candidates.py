@@ -47,7 +47,9 @@ def whole(text: str, role: str, actions: tuple[str, ...]) -> Candidate | None:
     return Candidate(value) if _shaped(value, role, actions) else None
 
 
-def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> list[Candidate]:
+def candidates(
+    text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
+) -> list[Candidate]:
     """All candidates, in the text's order.
 
     Args:
@@ -55,6 +57,7 @@ def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> lis
         role: whose fields to look for.
         actions: whose names to look for.
         cut: the engine stopped at its token limit, so an open bracket is never closed here.
+        reasons_first: the prompt asked for reasons before the answer, so prose there is no repair.
 
     Raises:
         Failure: no_json, label_only, truncated_json, syntax or, without any candidate, missing_action.
@@ -76,11 +79,12 @@ def candidates(text: str, role: str, actions: tuple[str, ...], cut: bool) -> lis
             outside.append(text[at:start])
             at = reading.end
     if shaped:
-        around = _around("\n".join([*outside, text[at:]]))
+        before, *behind = [*outside, text[at:]]
+        around = _around(before, "\n".join(behind), reasons_first)
         return [Candidate(one.members, one.repairs | around) for one in shaped]
     if objects.broken is not None:
         mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
-        extra = escapes | _around(text[: objects.broken] + rest) | {Repair.JSON_REPAIR}
+        extra = escapes | _around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
         inside = list(_answers(mended, role, actions))
         if not inside:
             raise mend.unreadable()
@@ -159,8 +163,14 @@ def _answers(
             stack += [(child, frozenset({Repair.NESTED})) for child in reversed(inner)]
 
 
-def _around(outside: str) -> frozenset[Repair]:
-    """What the text outside the answers is."""
+def _around(before: str, behind: str, reasons_first: bool) -> frozenset[Repair]:
+    """What the text before the first answer, and all that is behind it and no answer, takes to overlook."""
+    if reasons_first:
+        return _outside(behind) | _outside(before) - {Repair.PROSE_AROUND}
+    return _outside(f"{before}\n{behind}")
+
+
+def _outside(outside: str) -> frozenset[Repair]:
     bare, fences = _FENCE.subn("", outside)
     repairs = {Repair.CODE_FENCE} if fences else set()
     rest = "".join(bare.split())

@@ -65,6 +65,7 @@ def parse(
     role: str,
     actions: Sequence[str],
     thinking: bool = False,
+    reasons_first: bool = False,
     finish_reason: str = "stop",
     error: str | None = None,
 ) -> Parsed:
@@ -79,6 +80,8 @@ def parse(
         actions: meta-action names, in the environment's order.
         thinking: whether the text has to hold a closed thought: the model was asked to think, and the engine
             did not take the thought out of the text itself.
+        reasons_first: whether the prompt asked for reasons before the answer, in whose prose nothing is
+            then a repair.
         finish_reason: the engine's; `length` means cut off by the token limit.
         error: the engine's message if it failed.
 
@@ -99,7 +102,7 @@ def parse(
             thought_leads = text.rstrip().endswith(rest.strip())
             answer = _strict(rest, role, actions) if thought_leads else None
             if answer is None:
-                answer = _recovered(rest, role, actions, finish_reason == "length")
+                answer = _recovered(rest, role, actions, finish_reason == "length", reasons_first)
             if (thought and not thinking) or not thought_leads:
                 answer = answer.mended(Repair.THINK_BLOCK)
     except Failure as failure:
@@ -149,12 +152,15 @@ def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
     return None if answer.repairs else answer
 
 
-def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool) -> Answer:
+def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
-    text, zero_width = _INVISIBLE.subn(lambda match: " " if match.group().isspace() else "", text)
+    # A narrow space between a number and its unit is good typography in prose, and none of JSON's.
+    zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
+    text = _INVISIBLE.sub(lambda match: " " if match.group().isspace() else "", text)
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
-    answer = _choose(candidates.candidates(text, role, actions, cut), role, actions)
+    offered = candidates.candidates(text, role, actions, cut, reasons_first)
+    answer = _choose(offered, role, actions)
     if special:
         answer = answer.mended(Repair.SPECIAL_TOKENS)
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer

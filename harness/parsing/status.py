@@ -19,7 +19,11 @@ class _Documented(StrEnum):
 class Status(_Documented):
     """The one outcome of a completion. All but the first two are failures and give no intent."""
 
-    STRICT = "strict", "The raw text is JSON that fits the schema and sums to 1 within 0.001."
+    STRICT = (
+        "strict",
+        "The raw text is JSON that fits the schema and sums to 1 within 0.001; "
+        "reasons may stand before it if the prompt asked for them.",
+    )
     RECOVERED = "recovered", "One unambiguous answer stands in the text, and the repairs name what was wrong."
     EMPTY = "empty", "There is nothing but white space, special tokens or a closed thought."
     NO_JSON = "no_json", "There is no JSON object, and not exactly one action is named."
@@ -52,7 +56,7 @@ class Repair(_Documented):
     SPECIAL_TOKENS = "special_tokens", "Template tokens such as <|im_end|> were removed."
     INVISIBLE_CHARACTERS = "invisible_characters", "BOM, zero-width characters or exotic spaces were removed."
     CODE_FENCE = "code_fence", "The answer stood in a markdown code fence."
-    PROSE_AROUND = "prose_around", "Text stood before or after the answer."
+    PROSE_AROUND = "prose_around", "Text that was not asked for stood before or after the answer."
     STRAY_PUNCTUATION = "stray_punctuation", "Loose brackets, quotes or commas stood around the answer."
     NESTED = "nested", "The answer stood inside another object, such as a tool call."
     UNWRAPPED = "unwrapped", "The actions stood without the action_distribution around them."

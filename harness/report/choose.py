@@ -13,10 +13,9 @@ def failures(run: Run) -> dict[str, int]:
 
 
 def _unsafe(run: Run) -> dict[str, int]:
-    """Each episode's first action of the run's first seed that is unsafe where another was safe."""
+    """The decision that lost each episode of the run's first seed, under the first condition that lost it."""
     d, seed = run.decisions, run.manifest.seeds[0]
-    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
-    bad = avoidable & ~d.flags("safe") & (d.whole("seed") == seed)
+    bad = d.flags("regret") & (d.whole("seed") == seed)
     episode = d.whole("episode")
     first: dict[int, str] = {}
     for scene, rows in d.scenes.items():

@@ -16,7 +16,7 @@ def summary(run: Run) -> list[dict[str, Any]]:
     return [
         {
             "name": metrics.label(metric),
-            "meaning": metrics.meaning(metric, run.world),
+            "meaning": metrics.meaning(metric),
             "cells": [(s := run.score(condition, metric)) and words.shown(s) for condition in run.conditions],
         }
         for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")

@@ -85,15 +85,15 @@ class Decisions:
 
     def _frozen(self) -> dict[str, Scene]:
         assert self._runs.dataset is not None
-        by_id = {scene.id: scene for scene in self._runs.dataset.scenes}
+        places = self._runs.dataset.forest.place
         for run in self._runs.runs:
             for scene in run.decisions.scenes:
-                if scene not in by_id:
+                if scene not in places:
                     raise UserError(
                         f"{printable(run.path / 'decisions.parquet')} has scene {printable(scene)!r}, "
                         "which its dataset has not; make the run again"
                     )
-        return by_id
+        return dict(zip(self.ids, self._runs.dataset.scenes(self.ids), strict=True))
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling decision points, replayed; none where this simulator differs from the run's."""
@@ -152,8 +152,7 @@ class Decisions:
         sent: dict[str, Any] = {}
         outcomes = None
         if scene and self._runs.dataset:
-            run = next(run for run in self._runs.runs if name in run.decisions.scenes)
-            outcomes = scenes.outcomes(scene, run.decisions, run.decisions.scenes[name].start)
+            outcomes = scenes.outcomes(self._runs.dataset.forest, name)
         return {
             "world": scene and scenes.world(scene),
             "outcomes": outcomes,
@@ -187,18 +186,16 @@ class Decisions:
         for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
             shown = {**_shown(d), "end": str(self._ends[n][row])}
             decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
-        ends = None
-        if run.world == "closed-loop":
-            number = int(run.decisions.whole("episode")[rows.start])
-            ends = [
-                {
-                    "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
-                    "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
-                    "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
-                    "other_crashes": e.other_crashes,
-                }
-                for e in run.episodes if e.episode == number
-            ]  # fmt: skip
+        number = int(run.decisions.whole("episode")[rows.start])
+        ends = [
+            {
+                "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
+                "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
+                "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
+                "other_crashes": e.other_crashes,
+            }
+            for e in run.episodes if e.episode == number
+        ]  # fmt: skip
         return {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
 
 
@@ -221,6 +218,5 @@ def _ends(run: Run) -> Any:
     if run.world == "closed-loop":
         letters = {"": GOOD, "late": SLOW}
         return np.array([letters.get(e.failure, BAD) for e in run.episodes])[run.grid.places(d)]
-    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
     safe = np.where(np.nan_to_num(d["delay_s"]) > 0, SLOW, GOOD)
-    return np.where(avoidable, np.where(d.flags("safe"), safe, BAD), BLAMELESS)
+    return np.where(d.flags("value"), np.where(d.flags("safe"), safe, BAD), BLAMELESS)

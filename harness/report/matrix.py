@@ -1,19 +1,23 @@
 """Prompts and models side by side: what each run scored, and which cannot be told from the best."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from statistics import median
 
 import numpy as np
 
-from harness.core.paired import SuccessTest, success_test
+from harness.core.arrays import Floats
+from harness.core.multiplicity import LEVEL, holm
+from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import success_of
 from harness.runs.folder import Run
-from harness.runs.metrics import LATENCY, SUCCESS
+from harness.runs.metrics import LATENCY, SUCCESS, difference, p_value
 from harness.runs.records import Score
 
-P_VALUE = 0.05
+Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
+
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 
@@ -22,21 +26,18 @@ class Behind:
     """A run against the best one, over the episodes that both have.
 
     Attributes:
-        difference: its success minus the best one's.
-        episodes: how many both have.
-        test: what says whether that is chance.
+        change: its success minus the best one's, with a 95 % interval over the episodes that both have.
+        p_value: of no difference, by that interval, corrected by Holm's method for the pairs of runs under
+            all conditions.
     """
 
-    difference: float
-    episodes: int
-    test: SuccessTest
+    change: Estimate
+    p_value: float
 
     @property
     def undecided(self) -> bool:
         """Whether the two cannot be told apart."""
-        if self.test.p_value is not None:
-            return self.test.p_value > P_VALUE
-        return self.test.low is None or self.test.high is None or self.test.low <= 0.0 <= self.test.high
+        return self.p_value > LEVEL
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Line:
         condition: operating point.
         scores: metrics by name; None where the run has none.
         tokens: median tokens of a prompt and of an answer; None where the engine counts none.
-        mark: `BEST` success under its condition, `CLOSE` or `WORSE`; empty where runs cannot be paired.
+        mark: `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best.
         behind: how it stands to the best; None for the best.
     """
 
@@ -90,9 +91,9 @@ def lines(runs: Runs) -> list[Line]:
     """Every run under each of its conditions, by condition and then in the runs' order."""
     ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
+    all_marks = marked([[of.get(condition, {}) for of in ended] for condition in runs.conditions])
     rows = []
-    for condition in runs.conditions:
-        marks = _marks([of.get(condition) for of in ended])
+    for condition, marks in zip(runs.conditions, all_marks, strict=True):
         for n, run in enumerate(runs.runs):
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
@@ -134,48 +135,89 @@ def _tokens(run: Run) -> tuple[float | None, float | None]:
 
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
-    """Success, 0 or 1, by condition and, in each, by episode and seed."""
+    """Success by condition and, in each, by episode and seed."""
     by_condition: dict[str, dict[tuple[int, int], float]] = {name: {} for name in run.conditions}
     for episode in run.episodes:
         by_condition[episode.condition][episode.episode, episode.seed] = float(episode.success)
     return by_condition
 
 
-def _marks(ended: Sequence[Mapping[tuple[int, int], float] | None]) -> list[tuple[str, Behind | None]]:
-    """What each run is against the best, paired by episode; nothing where there is only one."""
-    scored = [n for n, of in enumerate(ended) if of]
-    if len(scored) < 2:
-        return [("", None)] * len(ended)
-    best = max(scored, key=lambda n: np.mean(list((ended[n] or {}).values())))
-    marks: list[tuple[str, Behind | None]] = []
-    for n, of in enumerate(ended):
-        behind = None if n == best else _behind(of or {}, ended[best] or {})
-        mark = "" if behind is None else CLOSE if behind.undecided else WORSE
-        marks.append((BEST if n == best else mark, behind))
+def marked(conditions: Sequence[Sequence[Successes]]) -> list[list[tuple[str, Behind | None]]]:
+    """The mark of each run under each condition, and how it stands to the best one there.
+
+    Args:
+        conditions: of each, the successes of every run; empty for one that was not made under it.
+    """
+    found = [_behind_best(ended) for ended in conditions]
+    every = [(n, run) for n, (_, behind) in enumerate(found) for run in behind]
+    p_values = [found[n][1][run].p_value for n, run in every]
+    pairs = sum(len(list(combinations(filter(None, ended), 2))) for ended in conditions)
+    corrected = dict(zip(every, holm(p_values, pairs), strict=True))
+    marks: list[list[tuple[str, Behind | None]]] = []
+    for n, (ended, (best, behind)) in enumerate(zip(conditions, found, strict=True)):
+        of_runs: list[tuple[str, Behind | None]] = [("", None)] * len(ended)
+        for run, one in behind.items():
+            one = replace(one, p_value=corrected[n, run])
+            of_runs[run] = (CLOSE if one.undecided else WORSE, one)
+        if best is not None:
+            of_runs[best] = (BEST, None)
+        marks.append(of_runs)
     return marks
 
 
-def _behind(one: Mapping[tuple[int, int], float], best: Mapping[tuple[int, int], float]) -> Behind | None:
-    both = sorted(one.keys() & best.keys())
-    episodes, seeds = ({key[place] for key in both} for place in (0, 1))
-    if len(both) != len(episodes) * len(seeds) or not both:
+def _behind_best(ended: Sequence[Successes]) -> tuple[int | None, dict[int, Behind]]:
+    """The best run and the others against it, p not yet corrected; None where there is no such run.
+
+    The best is not behind any other on the episodes and seeds that the two share: a run of other episodes is
+    no better for their being easy.
+    """
+    scored = [n for n, of in enumerate(ended) if of]
+    for best in scored:
+        pairs = {n: _shared(ended[n], ended[best]) for n in scored if n != best}
+        if pairs and all(len(a) and a.mean() <= b.mean() for a, b in pairs.values()):
+            return best, {n: _behind(a, b) for n, (a, b) in pairs.items()}
+    return None, {}
+
+
+def _shared(one: Successes, other: Successes) -> tuple[Floats, Floats]:
+    """Successes of the episodes and seeds that both have, each (E, S); empty where there are none."""
+    both = sorted(one.keys() & other.keys())
+    episodes = {episode for episode, _ in both}
+    a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) if both else np.empty((0, 0))
+            for of in (one, other))  # fmt: skip
+    return a, b
+
+
+def _behind(a: Floats, b: Floats) -> Behind:
+    p = p_value(SUCCESS, a, b)
+    # One episode has no interval: nothing says that it is more than chance.
+    return Behind(difference(SUCCESS, a, b), 1.0 if p is None else p)
+
+
+def uneven(runs: Runs) -> str | None:
+    """That the runs have not the same episodes and seeds, and which; None where they have."""
+    sizes = [(len(run.grid.episodes), len(run.grid.seeds)) for run in runs.runs]
+    if len({(run.grid.episodes, run.grid.seeds) for run in runs.runs}) < 2:
         return None
-    a, b = (np.array([of[key] for key in both]).reshape(len(episodes), -1) for of in (one, best))
-    test = success_test(b, a)
-    return None if test is None else Behind(float((a - b).mean()), len(episodes), test)
+    each = "; ".join(
+        f"{name}: {episodes} × {seeds}" for name, (episodes, seeds) in zip(runs.names, sizes, strict=True)
+    )
+    return (
+        f"The runs have not the same episodes × seeds ({each}): a success rate is over a run's own, and two "
+        "runs are compared on those that they share."
+    )
 
 
 def headline(found: Sequence[Line]) -> str:
     """What came out of several runs: under each condition the best, and which cannot be told from it."""
-    best = []
-    for line in found:
-        success = line.scores[SUCCESS]
-        if line.mark == BEST and success:
-            close = [o.name for o in found if o.condition == line.condition and o.mark == CLOSE]
+    outcomes = []
+    for condition in dict.fromkeys(line.condition for line in found):
+        of_condition = [line for line in found if line.condition == condition]
+        best = next((line for line in of_condition if line.mark == BEST), None)
+        if best is not None and (success := best.scores[SUCCESS]):
+            close = [line.name for line in of_condition if line.mark == CLOSE]
             rest = f", not told apart from {', '.join(close)}" if close else ""
-            best.append(f"{line.condition}: {line.name} {success_of(success)}{rest}")
-    return (
-        f"Best under {'; '.join(best)}."
-        if best
-        else "The runs share no episodes, so none is called the best."
-    )
+            outcomes.append(f"{condition}: {best.name} {success_of(success)}{rest}")
+        elif len(of_condition) > 1:
+            outcomes.append(f"{condition}: none, as each is behind another run or shares no episodes with it")
+    return f"Best under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."

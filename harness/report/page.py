@@ -17,7 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
-from harness.report import contents, library, matrix, words
+from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
 from harness.report.drawing.geometry import VIEW_M, ground_of
@@ -80,9 +80,16 @@ def render(
         runs=runs,
         title=runs.names[0] if len(runs.names) == 1 else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
+        unread=[
+            f"{name}: {said}" if len(runs.names) > 1 else said
+            for name, run in zip(runs.names, runs.runs, strict=True)
+            for said in caveats.unread(run.scores)
+        ],
+        no_prompt=caveats.no_prompt(run.manifest for run in runs.runs),
         headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
         lines=lines,
         grids=matrix.grids(lines),
+        uneven=matrix.uneven(runs),
         summaries=[contents.summary(run) for run in runs.runs],
         answers=contents.answers(runs),
         charts=charts,
@@ -134,7 +141,7 @@ def environment(*more: Path) -> Environment:
         finalize=visible,
     )
     templates.filters |= {
-        "number": words.number, "facts": words.facts, "shown": words.shown,
+        "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
         "latency_source": words.latency_source, "answer_times": words.answer_times,
         "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip

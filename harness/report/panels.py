@@ -1,11 +1,10 @@
 """Which charts a report has, in what part of it, and what is to be read from each."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from harness.backends.registry import find
-from harness.evaluate.success import reference_success
 from harness.report import charts, layers, statistics
 from harness.report.runs import Runs
 from harness.runs.folder import Run
@@ -53,7 +52,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "success-latency", "overview", "Success and latency",
             "Lines through a point are 95 % intervals, over episodes where the summary has one. Shaded: the "
             "paper's reaction window in an urban intersection." + (
-                " Dashed: reference drivers that need no model, on the same scenes, at no latency."
+                " Dashed: reference drivers that need no model, in the same episodes."
                 if references else ""
             ),
             charts.success_latency(rows, references),
@@ -111,7 +110,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
 
 
 def _references(runs: Runs) -> dict[str, float]:
-    """Success of the reference drivers: on frozen scenes by the rule, in closed loop from their own runs."""
+    """Success of the reference drivers: from the trees, in closed loop from their own runs."""
     if runs.dataset is None:
         drivers = {
             run.manifest.model["name"]: run
@@ -120,8 +119,5 @@ def _references(runs: Runs) -> dict[str, float]:
         }
         scores = {name: run.score(run.conditions[0], "success_rate") for name, run in drivers.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}
-    episodes = {number for run in runs.runs for number in run.grid.episodes}
-    driven = replace(
-        runs.dataset, scenes=tuple(s for s in runs.dataset.scenes if s.record["episode"] in episodes)
-    )
-    return reference_success(driven)
+    forest = runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}).forest
+    return {driver: float(forest.driver_success(driver).mean()) for driver in forest.drivers}

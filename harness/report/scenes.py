@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.report.drawing.geometry import conflict_points
-from harness.runs.decisions import Decisions
 
 
 def world(scene: Scene) -> dict[str, Any]:
@@ -43,13 +44,15 @@ def world(scene: Scene) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def outcomes(scene: Scene, decisions: Decisions, row: int) -> list[dict[str, Any]]:
-    """What each action leads to, in a frozen scene, of which a row of decisions is one."""
+def outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
+    """What each action leads to at a decision point if the full-view driver takes the rest."""
+    n = forest.place[name]
+    last = forest.then_full_view[n]
+    in_time = forest.succeeds(last, forest.tree[n])
+    rows = zip(forest.actions, last.tolist(), in_time, forest.safe[n], forest.delay_s[n], strict=True)
     return [
-        {**scene.record["outcomes"][action], "action": action, "safe": bool(safe == 1.0),
-         "delay_s": None if np.isnan(delay_s) else float(delay_s)}
-        for action, safe, delay_s in zip(
-            decisions.actions, decisions.of_actions("safe")[row], decisions.of_actions("delay_s")[row],
-            strict=True,
-        )
+        {**msgspec.to_builtins(end := forest.end(edge)), "action": action, "safe": bool(safe),
+         "result": "late" if end.result == "cleared" and not success else end.result,
+         "delay_s": None if np.isnan(delay_s) else round(float(delay_s), 3)}
+        for action, edge, success, safe, delay_s in rows
     ]  # fmt: skip

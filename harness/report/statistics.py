@@ -54,21 +54,14 @@ def reliability(run: Run) -> Table:
     """How often the action taken was safe, by how probable fusion held it."""
     certainty = run.decisions.of_actions("fused").max(axis=1)
     bins = np.minimum((certainty / CERTAINTY).astype(int), round(1 / CERTAINTY) - 1)
-    return list(_shares(run, bins, certainty, 1.0 - _unsafe(run), "certainty"))
+    return list(_shares(run, bins, certainty, 1.0 - run.decisions["regret"], "certainty"))
 
 
 def errors(run: Run) -> Table:
     """How often a decision was unsafe, by the entropy of the ego's own intent."""
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
-    return list(_shares(run, bins, nats, _unsafe(run), "entropy_nats"))
-
-
-def _unsafe(run: Run) -> Floats:
-    """1 or 0 a decision, (n,); NaN where that is unknown or no action was safe."""
-    d = run.decisions
-    avoidable = (d.of_actions("safe") == 1.0).any(axis=1)
-    return np.where(avoidable, 1.0 - d["safe"], np.nan)
+    return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
 
 
 def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Iterator[dict[str, Any]]:

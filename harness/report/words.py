@@ -3,6 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from harness.core.multiplicity import LEVEL, holm
+from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
 from harness.runs.records import Latency, Score, Times
@@ -48,10 +52,24 @@ def headline(run: Run) -> str:
         return text + (", and no other condition does better." if len(scores) > 1 else ".")
     text += f"; {base} {_clears(scores[base])}"
     gain = run.score(best, GAIN + base)
-    if gain is not None and gain.low is not None and gain.high is not None:
-        clear = "a clear difference" if gain.low > 0 or gain.high < 0 else "which may be chance"
+    if gain is not None and interval(gain):
+        clear = "a clear difference" if _p_values(run, base)[best] <= LEVEL else "which may be chance"
         text += f", a gap of {shown(gain)['value']} ({interval(gain)}), {clear}"
     return text + "."
+
+
+def _p_values(run: Run, base: str) -> dict[str, float]:
+    """Of the gain in success of each condition over one of them, corrected by Holm's method."""
+    ended = np.array([e.success for e in run.episodes], dtype=float).reshape(run.grid.shape)
+    success = {c: of.T for c, of in zip(run.conditions, ended, strict=True)}
+    alone = success.pop(base)
+    p_values = [metrics.p_value(SUCCESS, of, alone) for of in success.values()]
+    return dict(zip(success, holm([1.0 if p is None else p for p in p_values]), strict=True))
+
+
+def p_value(p: float) -> str:
+    """What stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
+    return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
 def _clears(score: Score) -> str:

@@ -23,10 +23,12 @@ LABEL, WHOLE, FLAG, NUMBER = pa.dictionary(pa.int32(), pa.string()), pa.int64(),
 # Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
 COLUMNS = {
     "scene": LABEL, "episode": WHOLE, "step": WHOLE, "danger": LABEL, "condition": LABEL, "seed": WHOLE,
-    "action": LABEL, "messages": WHOLE, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
+    "action": LABEL, "messages": WHOLE, "requests": WHOLE, "request_bits": NUMBER, "reply_bits": NUMBER,
+    "airtime_ms": NUMBER, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
     "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
-    "safe": FLAG, "delay_s": NUMBER, "acts_at_s": NUMBER, "acted": FLAG,
+    "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
+    "acted": FLAG,
 }  # fmt: skip
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and the outcome of each action.
@@ -35,7 +37,7 @@ OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
 OF_MESSAGES = {"helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER}
 DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
     "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
-    "arrival_ms": 3, "weight": 6,
+    "airtime_ms": 6, "arrival_ms": 3, "weight": 6,
 }  # fmt: skip
 
 ROWS = 2048  # that become mappings at a time

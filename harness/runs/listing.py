@@ -16,6 +16,8 @@ from harness.runs.formats import CONFIG, FORMAT, READ_BY, WORK
 DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
+SUCCESS, FAILED = "success_rate", "failed_rate_ego"
+UNREAD = 0.5  # least share of failed answers of which a run's headline speaks
 _BROKEN = (
     OSError,
     ValueError,
@@ -47,6 +49,7 @@ class Listed:
         success: that rate, 0 to 1, over episodes.
         low: lower end of its 95 % interval; None where the data cannot bound it.
         high: upper end.
+        unread: share of the ego's answers that could not be read.
     """
 
     name: str
@@ -62,6 +65,7 @@ class Listed:
     success: float | None = None
     low: float | None = None
     high: float | None = None
+    unread: float | None = None
 
 
 def runs(folder: Path) -> list[Listed]:
@@ -139,14 +143,17 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
             return listed
         with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
             # A summary may have a thousand rows, and a folder a thousand summaries.
-            head, *lines = [line for n, line in enumerate(file) if n == 0 or ",success_rate," in line]
-        which = ("success_rate", "episodes")
-        rows = [row for row in csv.DictReader([head, *lines]) if (row["metric"], row["interval"]) == which]
+            wanted = (f",{SUCCESS},", f",{FAILED},")
+            head, *lines = [x for n, x in enumerate(file) if n == 0 or any(each in x for each in wanted)]
+        table = list(csv.DictReader([head, *lines]))
+        rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]
         best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
         value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
+        unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)
         return replace(
-            listed, state="finished", why=None, condition=best["condition"], success=value, low=low, high=high
-        )
+            listed, state="finished", why=None, condition=best["condition"], success=value, low=low,
+            high=high, unread=unread,
+        )  # fmt: skip
     except _BROKEN:
         return listed
 

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from harness.core import multiplicity
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import (
     Estimate,
@@ -46,7 +47,6 @@ class Metric:
         episodes: an episode's value; None for a metric of decisions.
         total: an episode has the sum over its decisions, not the mean.
         world: where it is known; None for everywhere.
-        closed_loop: what it means in the closed loop, where that differs.
     """
 
     name: str
@@ -55,12 +55,10 @@ class Metric:
     episodes: Callable[[Episode], Any] | None = None
     total: bool = False
     world: World | None = None
-    closed_loop: str | None = None
 
 
-def _ends(name: str, meaning: str, of: Callable[[Episode], bool], world: World | None = None,
-          closed_loop: str | None = None) -> Metric:  # fmt: skip
-    return Metric(name, meaning, episodes=of, world=world, closed_loop=closed_loop)
+def _ends(name: str, meaning: str, of: Callable[[Episode], bool]) -> Metric:
+    return Metric(name, meaning, episodes=of)
 
 
 def _fails(*how: str) -> Callable[[Episode], bool]:
@@ -78,39 +76,44 @@ def _column(name: str) -> Callable[[Columns], Floats]:
 METRICS = {
     metric.name: metric
     for metric in (
-        _ends(SUCCESS, "episodes with every decision safe, and their delays within the allowance",
-              _field("success"),
-              closed_loop="episodes in which the ego clears the intersection, no later than the allowance"),
-        _ends("unsafe_rate", "episodes with a decision that leads to a collision or a forced failure",
-              lambda e: not e.success and e.failure != "late",
-              closed_loop="episodes that end in a collision, by time-out or off the road"),
-        _ends("collision_rate", "episodes that end in a collision", _fails("collision"), "closed-loop"),
+        _ends(SUCCESS, "episodes in which the ego clears the intersection, no later than the allowance",
+              _field("success")),
+        _ends("unsafe_rate", "episodes that end in a collision, by time-out or off the road",
+              lambda e: not e.success and e.failure != "late"),
+        _ends("collision_rate", "episodes that end in a collision", _fails("collision")),
         _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
-              lambda e: e.fault == "ego", "closed-loop"),
-        _ends("late_rate", "episodes with all decisions safe, but delays beyond the allowance",
-              _fails("late"),
-              closed_loop="episodes cleared, but too long after the full-view driver, whose decisions act at "
-              "once"),
+              lambda e: e.fault == "ego"),
+        _ends("late_rate", "episodes cleared, but too long after the full-view driver", _fails("late")),
         _ends("time_out_rate", "episodes in which the ego does not clear the intersection in time",
-              _fails("time_out"), "closed-loop"),
-        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road"),
-              "closed-loop"),
+              _fails("time_out")),
+        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road")),
+        Metric("regret_rate", "decisions that gave success away, of those in which it was still possible",
+               _column("regret"), world="frozen"),
+        Metric("delay_s", "by which a decision that is safe puts off the earliest success",
+               _column("delay_s"), world="frozen"),
+        Metric("off_lag_rate", "decisions that would act in another frame than the dataset's lag",
+               _column("off_lag"), world="frozen"),
         Metric("time_to_clear_s", "until the ego has cleared the intersection, where it does, late or not",
-               episodes=lambda e: e.time_s if e.failure in ("", "late") else None, world="closed-loop"),
+               episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
         Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
-               episodes=_field("least_gap_m"), world="closed-loop"),
+               episodes=_field("least_gap_m")),
         Metric("hard_brakings_per_episode", "times the ego begins to brake harder than 4 m/s²",
-               episodes=_field("hard_brakings"), world="closed-loop"),
+               episodes=_field("hard_brakings")),
         Metric("other_crashes_per_episode", "vehicles that crash without the ego",
-               episodes=_field("other_crashes"), world="closed-loop"),
-        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions"),
-               world="closed-loop"),
+               episodes=_field("other_crashes")),
+        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions")),
         Metric("skipped_per_episode", "decisions not begun, since the one before was still open",
                episodes=_field("skipped"), world="closed-loop"),
         Metric("never_acted_per_episode", "decisions that were not ready before the episode ended",
                episodes=_field("never_acted"), world="closed-loop"),
         Metric("messages_per_episode", "replies scheduled; the request is none", _column("messages"),
                total=True),
+        Metric("requests_per_episode", "requests broadcast, one for all helpers that are asked together",
+               _column("requests"), total=True),
+        Metric("bits_per_episode", "requests and scheduled replies together",
+               lambda d: d["request_bits"] + d["reply_bits"], total=True),
+        Metric("airtime_ms", "how long an episode's requests and scheduled replies occupy the medium in all",
+               _column("airtime_ms"), total=True),
         Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
                "included", _column("latency_ms")),
         Metric("deadline_miss_rate", "decisions that took longer than the decision window",
@@ -148,14 +151,10 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
     return tuple(metric for metric in METRICS.values() if metric.world in (None, world))
 
 
-def meaning(name: str, world: World) -> str:
-    """A metric's meaning in a world; empty for a name that says it all."""
-    if name in DERIVED:
-        return DERIVED[name]
+def meaning(name: str) -> str:
+    """A metric's meaning; empty for a name that says it all."""
     metric = METRICS.get(name)
-    if metric is None:
-        return ""
-    return (world == "closed-loop" and metric.closed_loop) or metric.meaning
+    return metric.meaning if metric else DERIVED.get(name, "")
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,10 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
     """A metric of n episodes, (n,), from their decisions, each at its episode's place."""
     assert metric.decisions
     values = np.asarray(metric.decisions(decisions), dtype=float)
-    return sum_by_place(values, places, n) if metric.total else mean_by_place(values, places, n)
+    if not metric.total:
+        return mean_by_place(values, places, n)
+    unknown = sum_by_place(np.isnan(values), places, n)
+    return np.where(unknown > 0, np.nan, sum_by_place(values, places, n))
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
@@ -250,9 +252,14 @@ def over_episodes(name: str, values: Floats) -> Estimate:
     return rate_interval(each) if is_rate(name) else in_range(name, episode_interval(each))
 
 
-def difference(name: str, a: Floats, b: Floats) -> Estimate:
+def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate:
     """Interval over episodes of a metric's a - b, both (E, S)."""
-    return rate_difference(a, b) if is_rate(name) else episode_interval(a - b)
+    return rate_difference(a, b, level) if is_rate(name) else episode_interval(a - b, level=level)
+
+
+def p_value(name: str, a: Floats, b: Floats) -> float | None:
+    """Of no difference of a metric's a - b, both (E, S), by the interval of `difference`."""
+    return multiplicity.p_value(lambda level: difference(name, a, b, level))
 
 
 def is_rate(name: str) -> bool:
@@ -280,7 +287,8 @@ def unit(name: str) -> tuple[float, str, int]:
     if "_rate" in name or name.endswith("_loss"):
         return 100.0, " %", 1
     endings: Mapping[str, tuple[str, int]] = {
-        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1), "_per_episode": ("", 2),
+        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1),
+        "bits_per_episode": (" bit", 0), "_per_episode": ("", 2),
     }  # fmt: skip
     for ending, (suffix, digits) in endings.items():
         if name.endswith(ending):

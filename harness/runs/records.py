@@ -129,8 +129,11 @@ class Decision(Struct, frozen=True, kw_only=True):
         latency_ms: from seeing to acting.
         deadline_missed: it took longer than the window.
         messages: replies scheduled.
-        safe: whether the action is safe; known of frozen scenes.
-        delay_s: its needless delay; known of frozen scenes.
+        value: whether success was still possible; known of frozen scenes, as are the next four.
+        safe: whether it still is after the action.
+        regret: whether the action gave it away; None where it was gone.
+        delay_s: how much later the action lets the ego be, at best.
+        off_lag: whether the decision took longer or shorter than the dataset's lag, in whole frames.
         acts_at_s: when it acts; in the closed loop.
         acted: whether the episode lasted until then; in the closed loop.
     """
@@ -150,16 +153,17 @@ class Decision(Struct, frozen=True, kw_only=True):
     latency_ms: float | None
     deadline_missed: bool | None
     messages: tuple[Message, ...]
+    value: bool | None
     safe: bool | None
+    regret: bool | None
     delay_s: float | None
+    off_lag: bool | None
     acts_at_s: float | None
     acted: bool | None
 
 
 class Episode(Struct, frozen=True, kw_only=True):
     """How one layout ended under one condition and seed: a line of `episodes.csv`.
-
-    What only the closed loop shows is None in a frozen run.
 
     Attributes:
         condition: name of the operating point.
@@ -252,14 +256,15 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
 
 class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True):
-    """A world of frozen scenes: the dataset, of which a run with `limit` has the first episodes only."""
+    """A world of decision trees: the dataset, of which a run with `limit` has the first episodes only."""
 
     name: str
     sha256: str
-    scenes: int
+    nodes: int
     episodes: int
     limit: int | None
     delay_allowance_s: float
+    decision_lag_s: float
     path: str
 
 

@@ -30,6 +30,7 @@ WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
 TEMPLATES = Path(__file__).parent / "templates"
+LEAST_RANKED = 5  # four in the same order are chance in 1 of 12, five in 1 of 60, both ways round
 SHOWN = 20  # ways to disagree that the page lists
 
 
@@ -43,7 +44,8 @@ class Fidelity:
             result), each with `_low` and `_high`, and `n` episodes; shares from 0 to 1.
         episodes: a row an episode, condition and seed, with the result and the failure of both.
         rank: Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make
-            no difference to a model count once. NaN for fewer than 3 rows, or where all are alike.
+            no difference to a model count once. NaN for fewer than `LEAST_RANKED` rows, or where all are
+            alike.
         ranked: how many rows that is over.
     """
 
@@ -89,7 +91,7 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
     from scipy.stats import spearmanr
 
     distinct = rows.drop_duplicates([*WHO, "frozen", "closed"])
-    if len(distinct) < 3 or distinct.frozen.nunique() == 1 or distinct.closed.nunique() == 1:
+    if len(distinct) < LEAST_RANKED or distinct.frozen.nunique() == 1 or distinct.closed.nunique() == 1:
         return np.nan, len(distinct)
     return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
 
@@ -148,7 +150,7 @@ def write(result: Fidelity, out: Path) -> Path:
 
 
 def headline(result: Fidelity) -> list[str]:
-    """The outcome in sentences: the rank correlation and the largest difference."""
+    """The outcome in sentences: the rank correlation, or why there is none, and the largest difference."""
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
@@ -159,6 +161,11 @@ def headline(result: Fidelity) -> list[str]:
     if not np.isnan(result.rank):
         models = f"{result.ranked} models and conditions"
         sentences.insert(0, f"Spearman's rank correlation of {models}: {result.rank:.2f}.")
+    elif result.ranked < LEAST_RANKED:
+        sentences.append(
+            f"No rank correlation: {result.ranked} different models and conditions are too few, it takes "
+            f"{LEAST_RANKED}."
+        )
     return sentences
 
 

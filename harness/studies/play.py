@@ -44,7 +44,7 @@ class Walked:
 
     Attributes:
         episodes: their numbers, (E,).
-        ends: each of `ENDS`, (S, E).
+        ends: each of `ENDS`, (S, E); NaN where an episode was left out.
         columns: numbers of the decisions (n,) by name.
         places: the episode of each decision, counted row by row in (S, E), (n,).
     """
@@ -146,7 +146,8 @@ def play(
 def _metric(name: str, walked: Walked, seeds: int) -> Floats:
     """A metric of the decisions by episode, (S, E)."""
     n = len(walked.episodes)
-    return of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
+    values = of_decisions(METRICS[name], walked.columns, walked.places, seeds * n).reshape(seeds, n)
+    return np.where(np.isnan(walked.ends["success_rate"]), np.nan, values)
 
 
 def _of_seed(walked: Walked, place: int) -> Floats:
@@ -200,6 +201,8 @@ def _episode_table(
 
     swept = [np.nan if s.value is None else s.value for s in settings]
     kind = object if any(isinstance(v, str) for v in swept) else float
+    whole = ~np.isnan(column["success_rate"])  # those that were not left out
+    column, point = {name: values[whole] for name, values in column.items()}, point[whole]
     return pd.DataFrame({
         "source": named([source] * len(settings)),
         "panel": named([panel] * len(settings)),

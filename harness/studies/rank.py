@@ -8,12 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from harness.core.arrays import Bools
-from harness.core.errors import UserError, printable
 from harness.core.parallel import spread
 from harness.core.statistics import Estimate, rate_difference, rate_interval
-from harness.dataset.build import settings
 from harness.dataset.load import Dataset
-from harness.evaluate.success import driver_choices, judge_choices, table
 from harness.world.drivers import DRIVERS
 from harness.world.reference import drive_all
 
@@ -23,7 +20,7 @@ class Standing:
     """One driver, frozen and live.
 
     Attributes:
-        frozen: success by the rule of `harness.evaluate.success`.
+        frozen: success in the trees.
         live: success in the simulator.
         difference_points: frozen minus live, in percentage points, paired by episode.
         agreement: share of episodes with the same result.
@@ -36,29 +33,13 @@ class Standing:
 
 
 def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
-    """Each driver's standing over the dataset's episodes; every one of them is driven again in closed loop.
-
-    Raises:
-        UserError: the dataset was built from another scenario than the one that would be driven.
-    """
-    scenario = dataset.scenario
-    for what, here in settings(scenario).items():
-        if getattr(dataset.manifest, what) != here:
-            raise UserError(
-                f"dataset {printable(dataset.path)} was built with other {what} than are driven here; "
-                "build it again to compare"
-            )
-    seeds = {s.record["episode"]: s.record["episode_seed"] for s in dataset.scenes}
-    live = spread(partial(drive_all, scenario), seeds.values(), workers, progress)
+    """Each driver's standing over the dataset's episodes, every one of which is driven again."""
+    seeds = [tree.episode_seed for tree in dataset.trees]
+    live = spread(partial(drive_all, dataset.scenario), seeds, workers, progress)
     return {
-        driver: _standing(frozen_success(dataset, driver), np.array([o[driver].success for o in live]))
+        driver: _standing(dataset.forest.driver_success(driver), np.array([o[driver].success for o in live]))
         for driver in DRIVERS
     }
-
-
-def frozen_success(dataset: Dataset, driver: str) -> Bools:
-    """Success of each frozen episode if a reference driver takes its decisions, `(E,)`."""
-    return judge_choices(table(dataset), driver_choices(dataset, driver)).success
 
 
 def ranks_agree(standings: dict[str, Standing]) -> bool:

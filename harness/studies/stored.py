@@ -1,8 +1,9 @@
 """A finished run as a source: its answers are coordinated again, and no model is asked what the run has."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import nearest
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.arrays import Ints
+from harness.core.arrays import Bools, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
@@ -30,7 +31,7 @@ from harness.prompts import versions
 from harness.runs.folder import dataset_of, read
 from harness.studies.play import Walked, walk_through
 
-CALLS = "fusion-calls.jsonl"  # what fusion calls that none of the run's conditions needed say
+MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
 
 
 class Stored:
@@ -43,6 +44,7 @@ class Stored:
         seeds: the run's own.
         points: the run's operating points, by name.
         same_episodes: every seed plays the run's.
+        left_out: ids of the decision points without an answer at which walks were left out.
     """
 
     same_episodes = True
@@ -50,8 +52,17 @@ class Stored:
     def __init__(
         self, folder: Path, latency: str | None = None,
         more: Callable[[int], None] = lambda count: None, done: Callable[[int], None] = lambda count: None,
+        asks: bool = True,
     ) -> None:  # fmt: skip
-        """A run. `more` is told how many fusion calls are owed, and `done` how many have an answer."""
+        """A run.
+
+        Args:
+            folder: its folder.
+            latency: `paper` for the paper's inference times.
+            more: told how many answers are owed.
+            done: told how many have come.
+            asks: whether its model is asked what the run has no answer to; else such walks are left out.
+        """
         self.run = read(folder)
         if self.run.world != "frozen":
             raise UserError(
@@ -62,23 +73,25 @@ class Stored:
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
-        mine, whole = self.run.decisions.scenes, dataset_of(self.run)
-        self._dataset = replace(whole, scenes=tuple(scene for scene in whole.scenes if scene.id in mine))
-        if len(self._dataset.scenes) != len(mine):
-            raise UserError(f"{printable(folder)} has scenes that its dataset has not; make the run again")
-        self.vehicles = max(len(scene.viewers) for scene in self._dataset.scenes)
+        self._dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
+        self.vehicles = max(len(scene.viewers) for scene in self._dataset.scenes(self._roots()))
+        self._asks = asks
+        self.left_out: set[str] = set()
         self._asker = Asker(
-            self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / CALLS,
+            self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
             {answer.id: answer for answer in self.run.answers}, done, more,
         )  # fmt: skip
-        self._world = lru_cache(maxsize=2)(partial(FrozenWorld, self._dataset))
-        self._intents: dict[str, Intents] = {}  # of each step, by the first of its scenes
+
+    def _roots(self) -> list[str]:
+        forest = self._dataset.forest
+        return [forest.ids[n] for n in forest.root.tolist()]
 
     def manifest(self) -> dict[str, Any]:
         """The run, the digest of its dataset, and where its times come from."""
         return {
             "name": self.name, "run": str(self.run.path), "dataset_sha256": self._dataset.sha256,
             "latency": msgspec.to_builtins(self._asker.latency),
+            "decision_points_without_answer": sorted(self.left_out),
         }  # fmt: skip
 
     def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
@@ -87,39 +100,46 @@ class Stored:
         Raises:
             UserError: the point has the run's model fuse, and it cannot.
         """
-        replace(self._asker.spec, points=(point,))
-        world = self._world(tuple(seeds)).undecided()
-        columns, places = walk_through(world, point, _Nearest(self, vehicles - 1), seeds, world.numbers)
-        verdicts = world.verdicts(point)
-        ends = {
-            name: np.stack([getattr(verdict, field) for verdict in verdicts]).astype(float)
-            for name, field in (("success_rate", "success"), ("unsafe_rate", "unsafe"), ("late_rate", "late"))
-        }
-        yield Walked(world.numbers, ends, columns, places)
+        replace(self._asker.spec, points=(point,))  # which checks that they go together
+        world = FrozenWorld(self._dataset, [point], seeds)
+        ask = _Nearest(self, vehicles - 1, partial(world.leave_out, point))
+        columns, places = walk_through(world, point, ask, seeds, world.numbers)
+        yield Walked(world.numbers, world.ends(point), columns, places)
 
-    def intents(self, moments: Sequence[Scene]) -> Intents:
-        """What every vehicle intends, from the run's answers."""
-        if moments[0].id not in self._intents:
-            self._intents[moments[0].id] = self._asker(moments)
-        return self._intents[moments[0].id]
+    def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
+        """What every vehicle intends. Where the run has no answer its model is asked, or it is left out."""
+        lacks = np.array(self._asker.lacks(moments))
+        if not lacks.any():
+            return self._asker.laid_out(moments)
+        if self._asks:
+            with self._writing():
+                return self._asker(moments)
+        self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
+        leave_out(lacks)
+        return self._asker.laid_out(moments)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
+        if not self._asks:
+            raise UserError(
+                f"--no-model: {printable(self.run.path)} may lack answers to other sets of messages, which "
+                "consensus ego-prompt needs; leave it out"
+            )
+        with self._writing():
+            return self._asker.fusion_call(moments, codes)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
         try:
-            with alone(self.run.path / f".{CALLS}.lock"):
-                return self._asker.fusion_call(moments, codes)
+            with alone(self.run.path / f".{MORE}.lock"):
+                yield
         except BlockingIOError:
             raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
 
     def _spec(self) -> Spec:
         """The evaluation that made the run, with all that decides its answers."""
         manifest, shown = self.run.manifest, printable(self.run.path)
-        version = manifest.prompt["version"]
-        prompt = versions.load(version)
-        if prompt.sha256 != manifest.prompt["sha256"]:
-            raise UserError(
-                f"{shown}: prompt {printable(version)} has changed since; restore it or run again"
-            )
+        prompt = versions.load(manifest.prompt["version"])
         return Spec(
             convert(manifest.model, Card, f"{shown}: its model"), prompt, FrozenSource(self._dataset), (),
             manifest.seeds, thinking=manifest.thinking, answer=cast("AnswerMode", manifest.answer),
@@ -127,14 +147,17 @@ class Stored:
         )  # fmt: skip
 
     def _open(self) -> Backend:
-        spec = self._asker.spec
+        spec, shown = self._asker.spec, printable(self.run.path)
+        if spec.prompt.sha256 != self.run.manifest.prompt["sha256"]:
+            raise UserError(
+                f"{shown}: prompt {printable(spec.prompt.version)} has changed since; restore it or run again"
+            )
         backend = open_backend(spec.card, dtype=spec.dtype, batch_size=spec.batch_size)
         stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(backend.identity()))
         if now != stored:
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
-                f"{printable(self.run.path)}: the model is not what it was "
-                f"({printable(', '.join(other))}); run again"
+                f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"
             )
         return cached(backend, spec.card, default_file())
 
@@ -142,11 +165,11 @@ class Stored:
 class _Nearest:
     """A run's intents, of which only the nearest helpers' count."""
 
-    def __init__(self, stored: Stored, helpers: int) -> None:
-        self._stored, self._helpers = stored, helpers
+    def __init__(self, stored: Stored, helpers: int, leave_out: Callable[[Bools], None]) -> None:
+        self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        intents = self._stored.intents(moments)
+        intents = self._stored.intents(moments, self._leave_out)
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
 

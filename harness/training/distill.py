@@ -55,7 +55,7 @@ def distill(
     curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
         "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest.seed,
-                    "episodes": dataset.manifest.episodes, "scenes": len(dataset.scenes)},
+                    "episodes": dataset.manifest.episodes, "scenes": len(student.scenes)},
         "prompts": {p.version: p.sha256 for p in prompts},
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),
@@ -112,7 +112,7 @@ that fits beside the source; it says nothing about Qwen3-4B or any other model, 
 - Data: `{data["name"]}`, {data["episodes"]} episodes from seed {data["seed"]}, {data["scenes"]} scenes
   (manifest sha256 `{data["sha256"]}`), prompts {", ".join(facts["prompts"])}; every viewer, and the ego with
   messages.
-- Teacher: the scenes' outcome tables, as soft labels over the actions that turned out safe. A viewer that
+- Teacher: the decision trees, as soft labels over the actions after which success is possible. A viewer that
   cannot tell scenes apart learns their mean, so what is hidden makes it unsure.
 - Seed {plan["seed"]}, batches of {plan["batch"]}, Muon {plan["muon_lr"]:g} and AdamW {plan["adam_lr"]:g}.
 - Read-out on {apart["questions"]} questions of {apart["episodes"]} episodes held out: KL to the soft labels

@@ -1,8 +1,10 @@
-"""What each viewer of each scene is asked, and what the outcome table says it should have intended.
+"""What each viewer of a scene is asked, and what the decision tree says it should have intended.
 
-Each safe action has the weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one
-has none. Where IDLE and FASTER come to the same (at the highest speed level) most goes to IDLE. A viewer that
-cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure.
+Of each level of a tree up to `OF_A_LEVEL` decision points are taken, drawn by the layout: so a model sees the
+scenes that its own errors lead to. Each safe action has the weight exp(-delay / 0.25 s), so that a needless
+SLOWER counts little; an unsafe one has none. Where IDLE and FASTER come to the same (at the highest speed
+level) most goes to IDLE. A viewer that cannot tell scenes apart is best served by the mean of their labels,
+so what it cannot see makes it unsure.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +21,7 @@ from harness.training.answers import message
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 SOFTNESS_S = 0.25
+OF_A_LEVEL = 3
 CALM = {"FASTER": 0.3}  # prior weight of an action, 1 if not named
 
 
@@ -42,17 +45,28 @@ class Question:
 
 
 def labels(dataset: Dataset) -> Floats:
-    """Soft labels of every scene, (n, A); uniform where no action is safe."""
-    safe, delay_s = dataset.outcome_arrays()
+    """Soft labels of every decision point, (N, A); uniform where no action is safe."""
+    safe, delay_s = dataset.forest.safe, dataset.forest.delay_s
     prior = np.array([CALM.get(a, 1.0) for a in dataset.actions])
     weight = np.where(safe, prior * np.exp(-np.nan_to_num(delay_s) / SOFTNESS_S), 0.0)
     weight = np.where(safe.any(axis=1, keepdims=True), weight, 1.0)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
-def alone(dataset: Dataset, prompts: Sequence[Prompt]) -> Iterator[Question]:
+def taught(dataset: Dataset) -> list[Scene]:
+    """The scenes that are learnt from, tree by tree."""
+    ids = []
+    for tree in dataset.trees:
+        rng = noise.generator("taught", tree.episode_seed)
+        for level in tree.levels:
+            drawn = sorted(rng.permutation(len(level))[:OF_A_LEVEL].tolist())
+            ids += [level[n].scene for n in drawn]
+    return dataset.scenes(ids)
+
+
+def alone(dataset: Dataset, scenes: Sequence[Scene], prompts: Sequence[Prompt]) -> Iterator[Question]:
     """Every viewer on its own."""
-    for scene, label in zip(dataset.scenes, labels(dataset), strict=True):
+    for scene, label in _labelled(dataset, scenes):
         for viewer, graph in scene.record["graphs"].items():
             for prompt in prompts:
                 sent = prompt.render(graph, dataset.actions, words=dataset.scenario.words)
@@ -70,10 +84,10 @@ def excerpts(
 
 
 def with_messages(
-    dataset: Dataset, prompts: Sequence[Prompt], intents: Mapping[str, Floats]
+    dataset: Dataset, scenes: Sequence[Scene], prompts: Sequence[Prompt], intents: Mapping[str, Floats]
 ) -> Iterator[Question]:
     """The ego with what some of its helpers sent; `intents` are the helpers' read-outs, by key."""
-    for scene, label in zip(dataset.scenes, labels(dataset), strict=True):
+    for scene, label in _labelled(dataset, scenes):
         graphs = scene.record["graphs"]
         ego, *helpers = scene.viewers
         for prompt in prompts:
@@ -90,13 +104,15 @@ def with_messages(
 
 def split(dataset: Dataset, held_out: int) -> tuple[Dataset, Dataset]:
     """All but the last `held_out` episodes, and those."""
-    episodes = sorted({s.record["episode"] for s in dataset.scenes})
-    last = set(episodes[len(episodes) - held_out :])
-    parts: tuple[list[Scene], list[Scene]] = ([], [])
-    for scene in dataset.scenes:
-        parts[scene.record["episode"] in last].append(scene)
-    kept, apart = (replace(dataset, scenes=tuple(scenes)) for scenes in parts)
-    return kept, apart
+    numbers = dataset.episodes
+    return dataset.of_episodes(numbers[: len(numbers) - held_out]), dataset.of_episodes(
+        numbers[len(numbers) - held_out :]
+    )
+
+
+def _labelled(dataset: Dataset, scenes: Sequence[Scene]) -> Iterator[tuple[Scene, Floats]]:
+    of_points = labels(dataset)
+    return ((scene, of_points[dataset.forest.place[scene.id]]) for scene in scenes)
 
 
 def _key(scene: Scene, viewer: str, prompt: Prompt) -> str:

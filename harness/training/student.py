@@ -1,7 +1,6 @@
 """What is learnt from, stage by stage, and the model that learns it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +14,7 @@ from harness.dataset.load import Dataset
 from harness.prompts import readout
 from harness.prompts.versions import Prompt
 from harness.training.answers import answer, evidence
-from harness.training.examples import Question, alone, excerpts, kl_nats, split, with_messages
+from harness.training.examples import Question, alone, excerpts, kl_nats, split, taught, with_messages
 from harness.training.model import END, PAD, chat, new_model, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
@@ -35,9 +34,9 @@ class Student:
         self, dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, work: Path, device: str
     ) -> None:
         self.plan, self.work, self.prompts, self.actions = plan, work, prompts, dataset.actions
-        episodes = len({s.record["episode"] for s in dataset.scenes})
-        self.data, self.held_out = split(dataset, max(1, round(episodes * HELD_OUT)))
-        self.questions = list(alone(self.data, prompts))
+        self.data, self.held_out = split(dataset, max(1, round(len(dataset.episodes) * HELD_OUT)))
+        self.scenes = taught(self.data)
+        self.questions = list(alone(self.data, self.scenes, prompts))
         self.tokenizer = self._tokenizer()
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(self.actions)]
         end, pad = (self.tokenizer.token_to_id(t) for t in (END, PAD))
@@ -76,8 +75,8 @@ class Student:
             UserError: in the scenes that are taken no message reaches the ego.
         """
         most = self.plan.samples["messages"] // (4 * len(self.prompts))
-        data = replace(self.data, scenes=tuple(self.some(self.data.scenes, most)))
-        ids = {scene.id for scene in data.scenes}
+        scenes = self.some(self.scenes, most)
+        ids = {scene.id for scene in scenes}
         spoke = [
             (question.key, sample)
             for question, sample in zip(self.questions, self.asked, strict=True)
@@ -88,7 +87,7 @@ class Student:
             save({"intents": torch.from_numpy(self.read([sample for _, sample in spoke]))}, kept)
         intents = torch.load(kept, weights_only=True)["intents"].numpy()
         said = dict(zip((key for key, _ in spoke), intents, strict=True))
-        heard = list(with_messages(data, self.prompts, said)) if said else []
+        heard = list(with_messages(self.data, scenes, self.prompts, said)) if said else []
         if not heard:
             raise UserError(
                 f"--samples: {self.plan.samples['messages']} sequences of the stage messages take too few "
@@ -134,11 +133,11 @@ class Student:
 
     def held_out_kl(self) -> dict[str, Any]:
         """KL (nats) of the read-out to the soft labels on held-out episodes, beside the mean label's."""
-        questions = list(alone(self.held_out, self.prompts))
+        questions = list(alone(self.held_out, taught(self.held_out), self.prompts))
         labels = np.stack([q.label for q in questions])
         mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
         return {
-            "episodes": len({s.record["episode"] for s in self.held_out.scenes}),
+            "episodes": len(self.held_out.episodes),
             "questions": len(questions),
             "kl_nats": kl_nats(labels, self.read(self.reading(questions))),
             "kl_of_the_mean_nats": kl_nats(labels, mean),

@@ -2,13 +2,14 @@
 
 A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of sight,
 whether there is one and where it comes from. A layout is never on both sides of the cross-validation, and
-only moments of one step are compared, since fewer dangers are still hidden the later it is. Where it does
-better than chance, so can any model: then being alone is not being blind.
+only moments of one step are compared, since fewer dangers are still hidden the later it is, and only answers
+of one fold's model. Where it does better than chance, so can any model: then being alone is not being blind.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class Audit:
         steps: decision points that were compared: those at which at least half of the dangers are hidden.
             Later, an empty road is an observation and no tell.
         auc: of each question, the probability that a layout with it ranks above one without: `danger`, and
-            the sectors it can come from. Intervals are a bootstrap over layouts.
+            the sectors it can come from. Intervals are a bootstrap over layouts, for these models.
         told_by: the numbers that gave it away and the AUC that is lost without each; none unless it tells.
     """
 
@@ -93,16 +94,17 @@ def audit(
     Raises:
         UserError: scikit-learn is missing, or too few of the layouts have a danger, or too few have none.
     """
-    try:
-        import sklearn  # noqa: F401
-    except ImportError:
-        raise UserError(
-            "an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`"
-        ) from None
+    ready()
     seeds = range(seed, seed + layouts)
     moments = _moments(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
     auc, told_by = judge(moments, tuple(scenario.road().sectors))
     return Audit(scenario.name, layouts, seed, tuple(np.unique(moments.step).tolist()), auc, told_by)
+
+
+def ready() -> None:
+    """Raise UserError if scikit-learn is missing."""
+    if find_spec("sklearn") is None:
+        raise UserError("an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`")
 
 
 def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:
@@ -209,10 +211,15 @@ def judge(moments: Moments, sectors: tuple[str, ...]) -> tuple[dict[str, Estimat
             told[np.ix_(asked, np.searchsorted(classes, model.classes_))] = model.predict_proba(table[asked])
         return told
 
+    model_of = np.empty(len(of.layout), dtype=int)
+    for k, (_, asked) in enumerate(folds):
+        model_of[asked] = k
+    alike = of.step * FOLDS + model_of  # scores of two models do not compare
+
     def ranks(question: str, told: Floats) -> "Ranks":
         if question == DANGER:
-            return Ranks.of(moments, 1 - told[:, classes == NONE][:, 0], of.danger != NONE)
-        return Ranks.of(moments, told[:, classes == question][:, 0], of.danger == question)
+            return Ranks.of(of.layout, alike, 1 - told[:, classes == NONE][:, 0], of.danger != NONE)
+        return Ranks.of(of.layout, alike, told[:, classes == question][:, 0], of.danger == question)
 
     told = answers(table)
     counts = {sector: len(np.unique(of.layout[of.danger == sector])) for sector in sectors}
@@ -240,7 +247,7 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Pairs of a layout with what is asked for and one without, over the moments of each step.
+    """Pairs of a layout with what is asked for and one without, over their moments that compare.
 
     Attributes:
         above: (with, without) pairs of moments in which the one with it is ranked higher; a tie is half.
@@ -251,15 +258,16 @@ class Ranks:
     pairs: Floats
 
     @classmethod
-    def of(cls, moments: Moments, score: Floats, there: Bools) -> "Ranks":
-        """The ranks by a score (m,), of layouts where it is there (m,) and where it is not."""
-        have, have_not = np.unique(moments.layout[there]), np.unique(moments.layout[~there])
+    def of(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
+        """Ranks by the score of moments (m,), of layouts where it is there (m,) and where it is not.
+
+        Only moments whose `alike` (m,) is the same are compared.
+        """
+        have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
-        for k in np.unique(moments.step):
-            one, other = (np.flatnonzero((moments.step == k) & side) for side in (there, ~there))
-            at = np.ix_(
-                np.searchsorted(have, moments.layout[one]), np.searchsorted(have_not, moments.layout[other])
-            )
+        for k in np.unique(alike):
+            one, other = (np.flatnonzero((alike == k) & side) for side in (there, ~there))
+            at = np.ix_(np.searchsorted(have, layout[one]), np.searchsorted(have_not, layout[other]))
             apart = score[one][:, None] - score[other]
             np.add.at(above, at, (apart > 0) + 0.5 * (apart == 0))
             np.add.at(pairs, at, 1.0)
@@ -277,7 +285,7 @@ class Ranks:
         one = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)
         other = draws.multinomial(have_not, np.full(have_not, 1 / have_not), RESAMPLES)
         above, pairs = (((one @ of) * other).sum(axis=1) for of in (self.above, self.pairs))
-        low, high = np.quantile(above / pairs, [0.025, 0.975])
+        low, high = np.quantile((above / pairs)[pairs > 0], [0.025, 0.975])
         if low == high:  # all or nothing: layouts that are drawn again cannot differ
             low, high = wilson(self.auc, min(have, have_not))
         return Estimate(self.auc, float(low), float(high), have + have_not, 0)

@@ -1,11 +1,20 @@
 """What a scenario provides. All other code takes one as an argument, and names none."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
+from harness.core.errors import UserError
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
+
+ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
+
+
+def frames(latency_s: float, simulation_hz: int) -> int:
+    """Whole frames that a decision takes."""
+    return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
 @dataclass(frozen=True)
@@ -18,9 +27,18 @@ class Parameters:
         acceleration_mps2: hardest acceleration.
         decisions: decisions an episode.
         decision_period_s: seconds between two decisions.
+        decision_lag_s: seconds from seeing to acting, below the period, in decision trees and of reference
+            drivers: the paper's inference. Until then the ego keeps to its last action.
         simulation_hz: frames a second.
         time_limit_s: an ego that has not reached its goal by then never will.
         delay_allowance_s: how much later than the full-view driver an ego may reach its goal.
+        perfect_knowledge: whether the ego and the helpers know each other's truth instead of beacons.
+        beacon_hz: beacons a second; `harness.world.beacons` has the sources of these dials.
+        beacon_delay_s: from a beacon's pose until receivers have it.
+        beacon_loss: probability that a beacon does not get through to a receiver.
+        beacon_noise_m: standard deviation of a beacon's position on each axis.
+        beacon_noise_mps: standard deviation of a beacon's speed.
+        beacon_noise_rad: standard deviation of a beacon's heading.
     """
 
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
@@ -28,9 +46,51 @@ class Parameters:
     acceleration_mps2: float = 3.0
     decisions: int = 6
     decision_period_s: float = 1.0
+    decision_lag_s: float = 0.145
     simulation_hz: int = 50
     time_limit_s: float = 10.0
     delay_allowance_s: float = 1.0
+    perfect_knowledge: bool = False
+    beacon_hz: float = 10.0
+    beacon_delay_s: float = 0.02
+    beacon_loss: float = 0.08
+    beacon_noise_m: float = 0.2
+    beacon_noise_mps: float = 0.1
+    beacon_noise_rad: float = 0.0035
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
+            "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
+            "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
+            "beacon_loss": (0 <= self.beacon_loss < 1, "a probability from 0, below 1"),
+            **{
+                name: (0 <= getattr(self, name) <= most, f"from 0 to {most}")
+                for name, most in (
+                    ("beacon_noise_m", 100),
+                    ("beacon_noise_mps", 100),
+                    ("beacon_noise_rad", 7),
+                )
+            },
+        }
+        for name, (fits, allowed) in bounds.items():
+            if not fits:
+                raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be {allowed}")
+
+    @property
+    def lag_frames(self) -> int:
+        """`decision_lag_s` in whole frames."""
+        return frames(self.decision_lag_s, self.simulation_hz)
+
+    def due_frame(self, step: int) -> int:
+        """The frame in which a decision is due; after the last one, that of the time limit."""
+        due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
+        return round(due_s * self.simulation_hz)
+
+
+BEACON_DIALS = tuple(
+    field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_"))
+)
 
 
 @dataclass(frozen=True)

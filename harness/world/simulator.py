@@ -22,6 +22,7 @@ from harness.world.state import SIZES_M, VehicleState
 
 NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highway-env finds no collision
 NOBODY_DRAWS = np.random.RandomState(0)  # highway-env wants one, and would seed it by the clock
+DECIMALS = 6  # of a state's metres, radians and m/s
 FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
 
 
@@ -192,9 +193,11 @@ def spawn_of(scenario: Scenario, v: VehicleState) -> Spawn:
 
 
 def state_of(v: ControlledVehicle) -> VehicleState:
-    """A vehicle as the rest of the program knows it."""
+    """A vehicle as the rest of the program knows it, to the micrometre: the last bits are the machine's."""
     s = v.spawn
+    x_m, y_m, heading_rad, speed_mps = (
+        round(float(number), DECIMALS) + 0.0 for number in (*v.position, v.heading, v.speed)
+    )
     return VehicleState(
-        s.id, s.kind, s.part, float(v.position[0]), float(v.position[1]), float(v.heading), float(v.speed),
-        s.approach, s.route, bool(v.crashed),
-    )  # fmt: skip
+        s.id, s.kind, s.part, x_m, y_m, heading_rad, speed_mps, s.approach, s.route, bool(v.crashed)
+    )

@@ -106,6 +106,33 @@ class Building:
 
 
 @dataclass(frozen=True)
+class Beacon:
+    """What a vehicle said of itself, errors included: `harness.world.beacons`.
+
+    Attributes:
+        sender: id of the vehicle.
+        time_s: when it was sent, since the start of the episode; negative before.
+        arrives_s: when receivers have it.
+        x_m: position of the centre, m to the east.
+        y_m: position of the centre, m to the south.
+        heading_rad: from +x towards +y.
+        speed_mps: speed along the heading.
+        target_speed_mps: what the ego's speed controller aims at; None of others.
+        heard_by: ids of the receivers that it gets through to.
+    """
+
+    sender: str
+    time_s: float
+    arrives_s: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    target_speed_mps: float | None
+    heard_by: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class WorldState:
     """Everything that is there, seen or not.
 
@@ -117,6 +144,8 @@ class WorldState:
         target_speed_mps: what the ego's speed controller aims at.
         vehicles: in spawn order, the ego first.
         buildings: what blocks sight besides vehicles.
+        beacons: the last that each receiver has, and those under way, by sender and time; none under perfect
+            knowledge.
     """
 
     scenario: str
@@ -126,6 +155,7 @@ class WorldState:
     target_speed_mps: float
     vehicles: tuple[VehicleState, ...]
     buildings: tuple[Building, ...]
+    beacons: tuple[Beacon, ...] = ()
 
     @property
     def ego(self) -> VehicleState:
@@ -154,4 +184,5 @@ class WorldState:
         fields = dict(data)
         fields["vehicles"] = tuple(VehicleState(**v) for v in data["vehicles"])
         fields["buildings"] = tuple(Building(**b) for b in data["buildings"])
+        fields["beacons"] = tuple(Beacon(**{**b, "heard_by": tuple(b["heard_by"])}) for b in data["beacons"])
         return cls(**fields)

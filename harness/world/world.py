@@ -13,10 +13,11 @@ import numpy as np
 import shapely
 
 from harness.core.arrays import Floats
+from harness.world import beacons
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import NOBODY_DRAWS, new_road, populated, spawn_of, state_of, vehicle_on
-from harness.world.state import WorldState, rectangle
+from harness.world.state import Beacon, WorldState, rectangle
 
 Snapshot = Mapping[str, Any]
 HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
@@ -36,6 +37,7 @@ class World:
         outcome: the outcome so far; its `ended` says whether the episode is decided.
         hard_brakings: how often the ego began to brake harder than HARD_BRAKING_MPS2.
         braking_hard: whether it did so in the last frame.
+        beacons: those that matter from now on (`WorldState.beacons`).
     """
 
     scenario: Scenario
@@ -47,12 +49,16 @@ class World:
     outcome: Outcome = field(default_factory=Outcome)
     hard_brakings: int = 0
     braking_hard: bool = False
+    beacons: tuple[Beacon, ...] = ()
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
         """The start of an episode."""
         layout = scenario.layout(seed, scenario.parameters)
-        return cls(scenario, seed, layout, populated(scenario, layout))
+        world = cls(scenario, seed, layout, populated(scenario, layout))
+        poses = beacons.lead_in(scenario.parameters, np.array(world._poses()))
+        world._broadcast(poses, 1 - len(poses))
+        return world
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -66,7 +72,8 @@ class World:
 
     def branch(self) -> "World":
         """A copy that goes its own way."""
-        shared = (self.scenario, self.layout, self.road.network, NOBODY_DRAWS)  # nobody writes to them
+        # Nobody writes to these.
+        shared = (self.scenario, self.layout, self.road.network, NOBODY_DRAWS, self.beacons)
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> Snapshot:
@@ -94,27 +101,29 @@ class World:
                 for other in vehicles[n + 1 :]:
                     vehicle.handle_collisions(other, 1 / scenario.parameters.simulation_hz)
         layout = replace(layout, buildings=state.buildings)
-        return cls(scenario, state.episode_seed, layout, road, state.step, snapshot["frame"])
+        return cls(
+            scenario, state.episode_seed, layout, road, state.step, snapshot["frame"], beacons=state.beacons
+        )
 
     def state(self) -> WorldState:
         """What is where, now."""
         vehicles = self.road.vehicles
         return WorldState(
             self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
-            tuple(map(state_of, vehicles)), self.layout.buildings,
+            tuple(map(state_of, vehicles)), self.layout.buildings, self.beacons,
         )  # fmt: skip
 
     def act(self, action: str) -> None:
-        """Take an action by name and simulate until the next decision is due.
+        """Decide for an action by name, which acts a lag later, and simulate until the next decision is due.
 
         After the scenario's last decision the action is held until the episode is decided.
         """
         p = self.scenario.parameters
-        self.take(action)
+        self.advance(p.due_frame(self.step) + p.lag_frames)
+        if not self.outcome.ended:
+            self.take(action)
         self.step += 1
-        last = self.step >= p.decisions
-        until_s = p.time_limit_s if last else self.step * p.decision_period_s
-        self.advance(round(until_s * p.simulation_hz))
+        self.advance(p.due_frame(self.step))
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
@@ -137,17 +146,34 @@ class World:
     def advance(self, until_frame: int) -> None:
         """Simulate until so many frames have passed or the episode is decided."""
         vehicles = self.road.vehicles
-        poses, speeds = [], [float(vehicles[0].speed)]
+        frames, first, speed_mps = [], self.frame + 1, float(vehicles[0].speed)
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
-            poses.append([(*v.position.tolist(), float(v.heading)) for v in vehicles])
-            speeds.append(float(vehicles[0].speed))
-        if poses:
-            least_m = least_gap_m(np.array(poses), vehicles, self.outcome.least_gap_m)
+            frames.append(self._poses())
+        if frames:
+            poses = np.array(frames)
+            self._broadcast(poses, first)
+            least_m = least_gap_m(poses[..., :3], vehicles, self.outcome.least_gap_m)
             self.outcome = replace(self.outcome, least_gap_m=least_m)
-            hard = -np.diff(speeds) * self.scenario.parameters.simulation_hz > HARD_BRAKING_MPS2
+            hard = (
+                -np.diff(poses[:, 0, 3], prepend=speed_mps) * self.scenario.parameters.simulation_hz
+                > HARD_BRAKING_MPS2
+            )
             self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
             self.braking_hard = bool(hard[-1])
+
+    def _poses(self) -> list[tuple[float, ...]]:
+        """x, y, heading and speed of each vehicle."""
+        return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in self.road.vehicles]
+
+    def _broadcast(self, poses: Floats, first_frame: int) -> None:
+        """What the ego and the helpers say of themselves in some frames, (F, V, 4)."""
+        radios = [n for n, v in enumerate(self.road.vehicles) if v.spawn.part != "other"]
+        self.beacons = beacons.broadcast(
+            self.scenario.parameters, self.seed, self.beacons,
+            [self.road.vehicles[n].spawn.id for n in radios], float(self.road.vehicles[0].target_speed),
+            poses[:, radios], first_frame,
+        )  # fmt: skip
 
     def _step(self) -> None:
         p, road = self.scenario.parameters, self.road

@@ -70,7 +70,8 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     """Make a run: its manifest says nothing but payload n, its answers and decisions say all in turn."""
     mine, said, dangers = PAYLOADS[n], Attacker(n), {}
     world = FrozenScenes(
-        name=mine, sha256=dataset.sha256, scenes=3, episodes=3, limit=None, delay_allowance_s=1.0,
+        name=mine, sha256=dataset.sha256, nodes=3, episodes=3, limit=None, delay_allowance_s=1.0,
+        decision_lag_s=0.145,
         path=str(dataset.path),
     )  # fmt: skip
     made_up(
@@ -134,9 +135,10 @@ def _answer(row, said, n):
 def _decision(row, danger):
     """One reply in time, one lost, one late."""
     row.update(
-        danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, safe=False,
-        delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7, safe_SLOWER=True, safe_IDLE=True,
-        safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0, delay_s_FASTER=None,
+        danger=danger, action="FASTER", entropy_nats=0.9, own_weight=0.4, latency_ms=150.0, value=True,
+        safe=False, regret=True, delay_s=None, fused_SLOWER=0.1, fused_IDLE=0.2, fused_FASTER=0.7,
+        safe_SLOWER=True, safe_IDLE=True, safe_FASTER=False, delay_s_SLOWER=0.0, delay_s_IDLE=0.0,
+        delay_s_FASTER=None,
     )  # fmt: skip
     for k in range(3):
         sent = {"delivered": k != 1, "on_time": k == 0, "weight": 0.3}

@@ -8,6 +8,7 @@ import csv
 import json
 
 import pytest
+from evaluating import course
 from opening import wait
 from reading import Page, details, packed
 from sample_hostile import PAYLOADS, hostile, prompt_of
@@ -68,7 +69,7 @@ def attacked(request, small, tmp_path_factory):
         n = PAYLOADS.index(run.manifest.name)
         return lambda scene, viewer, heard: prompt_of(n, scene.id, viewer)
 
-    text = render(gather(folders), prompts)
+    text = render(gather(folders, course(small, 1)), prompts)
     (base / "report.html").write_text(text, encoding="utf-8")
     return base / "report.html", text
 

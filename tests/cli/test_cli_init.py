@@ -20,13 +20,14 @@ Harness = Callable[..., Said]
 def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     code, out, err = harness("init", "project")
     assert (code, err) == (0, "")
-    assert out == "made project; next: cd there, `harness eval --prompt mine`; README.md says more\n"
+    assert out.startswith("made project; next: cd there, `harness eval --model swarm-tiny --prompt mine`; ")
     monkeypatch.chdir(tmp_path / "project")
     return tmp_path / "project"
 
 
 @pytest.mark.slow
 def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Path) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     lines = [line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")]
     assert len(lines) == 3
     for line in lines:
@@ -35,7 +36,7 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
             args[args.index("--episodes") + 1] = "1"
         code, _, err = harness(*args, *(["--limit", "1"] if "eval" in args else []))
         assert (program, code, err) == ("harness", 0, "")
-    report = project / "reports/proxy-mine-occluded-intersection-v1"
+    report = project / "reports/swarm-tiny-mine-occluded-intersection-v2"
     assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
     code, out, err = harness("eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json")
     assert (code, err) == (0, "")

@@ -3,12 +3,13 @@
 import json
 import re
 from collections.abc import Callable
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from changing import ends
-from run_on_disk import Row, change, configure
+from run_on_disk import Row, answers_of, change, configure
 
 from harness.report.compare.text import code
 
@@ -101,7 +102,7 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Pat
         ("success_rate < 0 or so", "cannot be read"),
         ("\x1b[31m", "cannot be read"),
         ("", "cannot be read"),
-        ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: at_fault_rate, brier, "),
+        ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: airtime_ms, at_fault_rate, "),
         ("success_rate.middle < 0", "interval in --fail-if 'middle'; known: high, low"),
         ("5g:success_rate < 0", "unknown condition of --fail-if '5g:success_rate < 0' '5g'"),
     ],
@@ -146,11 +147,14 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     assert (code, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
     said = " ".join(out.split())
+    scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
+    n = len(scenes)
     for part in (
         "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 seeds of small", "differ in answer",
-        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1]",
-        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1",
-        "lost: 1 late", "answers: ego strict → failed: 24 of 24", "00000-0/v1, 00000-1/v1, 22 more",
+        "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-69.9, +28.1] 1.000",
+        "success: 0 gained, 2 lost of 8 episodes × seeds; McNemar's exact test over episodes p = 1.000",
+        "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",
+        f"{scenes[0]}/v1, {scenes[1]}/v1, {n - 2} more",
         "FAILED: 6g:late_rate > 0.1 in 6g (+0.25)",
     ):  # fmt: skip
         assert part in said, part
@@ -162,17 +166,40 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
         "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
+        "p": pytest.approx(0.317, abs=1e-3), "p_holm": 1.0,
     }  # fmt: skip
     assert condition["lost"] == {
         "count": 2, "episodes": 1,
         "listed": [{"episode": 1, "seeds": [0, 1], "a": "success", "b": "late"}],
     }  # fmt: skip
     assert condition["test"] == {"method": "mcnemar", "p_value": 1.0, "low": None, "high": None}
+    scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
     [turned] = told["answers"]
     assert turned == {
-        "role": "helper", "a": "strict", "b": "recovered", "count": 24, "requests": ["00000-0/v2"],
+        "role": "helper", "a": "strict", "b": "recovered", "count": len(scenes),
+        "requests": [f"{scenes[0]}/v2"],
     }  # fmt: skip
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
+
+
+def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Path], harness: Harness) -> None:
+    """B takes 50 ms more in even episodes and 50.01 in odd ones: certain, also among some thirty."""
+
+    def slower(row: Row) -> None:
+        row["latency_ms"] = 150.0 + row["episode"] % 2 * 0.01
+
+    change(runs[0], decision=lambda row: row.update(latency_ms=100.0))
+    change(runs[1], decision=slower)
+    told = json.loads(harness("compare", *runs, "--json")[1], parse_constant=pytest.fail)
+    of = [metric for c in told["conditions"] for metric in c["metrics"].values() if metric["p"] is not None]
+    latency = told["conditions"][1]["metrics"]["latency_proxy_ms"]
+    assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * len(of) < 1e-9
+    printed = [harness("compare", *runs, *form)[1] for form in ((), ("--markdown",), ("--html", "page.html"))]
+    for text in (*printed[:2], unescape(Path("page.html").read_text())):
+        said = " ".join(text.split())
+        assert "< 0.001" in said
+        assert f"Holm's method for the {len(of)} differences that have one" in said
+    assert not [line for line in printed[0].splitlines() if line.endswith((" 0.000", "= 0.000"))]
 
 
 HOSTILE = "`<script>alert(1)</script> @everyone ![x](http://x) {{ 7 * 7 }} | ``\n\u202e"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from evaluating import run, spec_of
+from evaluating import run, scenes_of, spec_of
 from misbehaving import completion, serving
 
 from harness.backends import cards
@@ -62,7 +62,9 @@ def case(
             card = cards.load("openai-example")
             assert card.server is not None
             card = replace(card, server=replace(card.server, base_url=there.url))
-            yield Case(open_backend(card, batch_size=3), tuple(requests(spec_of(data), data.scenes[:5]))[:5])
+            yield Case(
+                open_backend(card, batch_size=3), tuple(requests(spec_of(data), scenes_of(data)[:5]))[:5]
+            )
         return
     if model == "llama-cpp":
         if find_spec("llama_cpp") is None:
@@ -70,7 +72,7 @@ def case(
         export(folder / "tiny", folder / "tiny.gguf", "F32")
         model = str(folder / "tiny.gguf")
     spec = spec_of(data, model, answer=answer)
-    asked = list(requests(spec, data.scenes[:5]))
+    asked = list(requests(spec, data.scenes(data.forest.ids[:1])))  # where every walk begins
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
     device = "cpu" if spec.card.engine in WITH_WEIGHTS else None

@@ -1,6 +1,7 @@
 """What holds for every prompt version that lies in prompts/."""
 
 import pytest
+from evaluating import scenes_of
 
 from harness.dataset.load import Dataset
 from harness.prompts import versions as prompts
@@ -9,7 +10,7 @@ from harness.prompts import versions as prompts
 @pytest.mark.parametrize("version", prompts.names())
 def test_it_renders_every_graph_of_the_dataset_the_same_each_time(version: str, small: Dataset) -> None:
     prompt = prompts.load(version)
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         for graph in scene.record["graphs"].values():
             messages = prompt.render(graph, small.actions)
             assert [m["role"] for m in messages] == ["system", "user"]
@@ -21,7 +22,7 @@ def test_it_renders_every_graph_of_the_dataset_the_same_each_time(version: str, 
 def test_it_tells_every_viewer_the_actions_and_the_form_of_the_answer(version: str, small: Dataset) -> None:
     prompt = prompts.load(version)
     assert prompt.helper_answer in ("distribution", "recommendation")
-    for graph in small.scenes[0].record["graphs"].values():
+    for graph in scenes_of(small)[0].record["graphs"].values():
         system = prompt.render(graph, small.actions)[0]["content"]
         form = "distribution" if graph["role"] == "ego" else prompt.helper_answer
         assert ("action_distribution" in system) == (form == "distribution")

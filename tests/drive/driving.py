@@ -11,6 +11,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.evaluate.asking import Asker
+from harness.evaluate.latency import known
 from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import table, walk
@@ -71,11 +72,14 @@ def spec(
 def driven(
     of: Spec, episodes: Sequence[int] = (0,), backend: Backend | None = None, infer_s: float | None = None
 ) -> Driven:
-    """Walk some episodes of the closed loop, every inference taking `infer_s`, or what the card says."""
+    """Walk some episodes of the closed loop, every inference taking `infer_s`, or what it would in a run."""
     assert isinstance(of.source, LiveSource)
-    inference_s = of.card.latency.inference_s if infer_s is None else infer_s
     opened = backend or open_backend(of.card, batch_size=of.batch_size)
-    asker = Asker(of, lambda: opened, Latency("card", "test", inference_s, inference_s, inference_s))
+    latency = known(of.latency, of.card, opened)
+    if infer_s is not None:
+        latency = Latency("card", "test", infer_s, infer_s, infer_s)
+    assert latency is not None, "no test measures"
+    asker = Asker(of, lambda: opened, latency)
     world = LiveWorld(of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
     decisions = table(
         list(chain.from_iterable(walk(world, of.points, asker))), world.columns(), of.actions

@@ -15,11 +15,12 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
-from harness.evaluate.live_world import LiveWorld, frames
+from harness.evaluate.live_world import LiveWorld
 from harness.evaluate.walk import walk
 from harness.runs.decisions import Decisions
 from harness.world import reference as live
 from harness.world.drivers import DRIVERS
+from harness.world.scenario import frames
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.world import World
 
@@ -124,7 +125,7 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
 
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
-def test_a_driver_that_needs_no_time_drives_as_the_reference_does(driver, seed):
+def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
     outcome = live.drive_all(SCENARIO, seed)[driver]
     assert len(episodes) == 6
@@ -188,9 +189,9 @@ def test_the_luck_is_the_frozen_runs(small):
             for n, (episode, seed) in enumerate(zip(due.episode.tolist(), due.seed.tolist(), strict=True)):
                 yield (episode, seed, step), (due.draws.link[n].tolist(), due.draws.jitter[n].tolist())
 
-    first = small.scenes[0].record["episode_seed"]
+    first = small.manifest.seed
     run = spec("cruise", points=(ALONE,), seeds=(3, 4), first_seed=first, episodes=4)
-    frozen = dict(draws(spec_of(small, "proxy", points=(ALONE,)), FrozenWorld(small, (3, 4))))
+    frozen = dict(draws(spec_of(small, "cruise", points=(ALONE,)), FrozenWorld(small, (ALONE,), (3, 4))))
     # A driver asks no helper, so the ego alone is looked at; `ego_alone` is given here to see all four.
     closed = dict(draws(run, LiveWorld(SCENARIO, first, range(4), run.points, run.seeds, ego_alone=False)))
     assert closed.keys() <= frozen.keys()

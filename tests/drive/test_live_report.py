@@ -1,6 +1,7 @@
 """The report page of a real, small live run."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 from driving import FROM_LEFT
@@ -13,9 +14,11 @@ from harness.core.errors import UserError
 from harness.evaluate.replay import scene_of
 from harness.prompts import versions as prompts
 from harness.report.choose import failures, pick
+from harness.report.compare.pair import pair
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
+from harness.runs.records import ClosedLoop
 from harness.studies.stored import Stored
 
 V2 = prompts.load("v2")
@@ -47,6 +50,22 @@ def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
     found = read(driven)
     assert found.decisions.scenes
     assert all(scene_of(found, scene).id == scene for scene in found.decisions.scenes)
+
+
+def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
+    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
+    name = "occluded-intersection:perfect_knowledge=true"
+    run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
+    found = read(tmp_path / "run")
+    assert isinstance(found.manifest.world, ClosedLoop)
+    assert found.manifest.world.scenario["parameters"]["perfect_knowledge"] is True
+    scenes = [scene_of(found, scene) for scene in found.decisions.scenes]
+    assert [scene.id for scene in scenes] == list(found.decisions.scenes)
+    assert all(scene.record["state"]["beacons"] == () for scene in scenes)
+    run(spec, tmp_path / "beacons")
+    paired = pair(tmp_path / "run", tmp_path / "beacons")
+    ours, theirs = (side.settings["scenario.perfect_knowledge"] for side in (paired.a, paired.b))
+    assert (ours, theirs) == ("True", "False")
 
 
 def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
@@ -102,7 +121,8 @@ def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
     assert telling
     for scene, seed in telling.items():
         rows = moments[scene]
-        assert not all(map(fails, rows))
+        of_layout = [e.success for e in found.episodes if e.episode == rows[0]["episode"]]
+        assert not all(map(fails, rows)) or not any(of_layout)
         assert any(fails(row) and row["seed"] == seed for row in rows)
         later = list(moments.values())[list(moments).index(scene) + 1 :]
         for others in (rows for rows in later if rows[0]["episode"] == moments[scene][0]["episode"]):

@@ -23,7 +23,8 @@ def test_any_changed_cell_of_any_golden_is_found(file: Path) -> None:
     for column in comparing.columns(golden):
         n = max(range(len(golden)), key=lambda i: len(golden[i][column]))
         try:
-            other = repr(float(golden[n][column]) + 1e-4)
+            number = float(golden[n][column])
+            other = repr(number + 1e-4 * max(1.0, abs(number)))
         except ValueError:
             other = golden[n][column] + "x"
         now = [{**row, column: other} if i == n else row for i, row in enumerate(golden)]

@@ -4,6 +4,7 @@
 anew, which needs an engine; write the tables anew after that.
 """
 
+import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -93,6 +94,7 @@ TABLES = {
     "fidelity": ("fidelity", "episodes"),
 }
 RUNS = {**FROZEN, **CLOSED, **STUDIES}
+ASKING = ("sweep-tiny", "sweep-ego-prompt")  # walks that lead elsewhere ask for more
 TINY = [name for name, command in {**FROZEN, **CLOSED}.items() if playing.MODEL in command]
 
 Finished = Callable[[str], Path]
@@ -126,6 +128,11 @@ def test_record_completions(tmp_path: Path) -> None:
         command = [part.replace(playing.MODEL, RECORDED) for part in RUNS[name]]
         adapter.typed(*command, "--quiet", "--out", tmp_path / name)
         said += adapter.tables_of(tmp_path / name)["answers"]
+    for name in ASKING:
+        command = [str(tmp_path / part[1:-1]) if part[0] == "{" else part for part in RUNS[name]]
+        adapter.typed(*command, "--quiet", "--out", tmp_path / name)
+    for more in tmp_path.glob("*/more-answers.jsonl"):
+        said += map(json.loads, more.read_text(encoding="utf-8").splitlines())
     playing.store(COMPLETIONS, said)
 
 

@@ -45,11 +45,15 @@ class Fog:
     latency_s: float = 0.01
     loss_per_m: float = 0.01
 
+    def request_s(self, bits: float) -> float:
+        """A message's time on air is not modelled."""
+        return 0.0
+
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Each link has a loss of its own."""
         loss = np.minimum(links.range_m * self.loss_per_m, 1.0)
         delay_s = np.where(links.asked, links.ready_s + self.latency_s, np.inf)
-        return Delivery(link_up(draws.link, loss), delay_s, loss)
+        return Delivery(link_up(draws.link, loss), delay_s, loss, np.full_like(loss, np.nan))
 
 
 class Cautious:

@@ -8,7 +8,7 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
-    """Two episodes, 12 decisions: a danger from the right, and one from the left."""
+    """Two episodes."""
     out = tmp_path_factory.mktemp("report") / "two"
     build(SCENARIO, out, episodes=2, seed=5, workers=1, progress=lambda done: None)
     return load(out)

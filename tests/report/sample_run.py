@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import chain
 
 import msgspec
-from evaluating import says, spec_of
+from evaluating import all_scenes, says, spec_of
 
 from harness.backends.base import Completion
 from harness.evaluate.asking import Asker, answer_of, requests
@@ -23,12 +23,13 @@ SEEDS = (0, 1, 2)
 def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer, points=None, **stated):
     """Write a run. `change` may replace any answer; `stated` are further fields of run.json."""
     spec = spec_of(dataset, seeds=SEEDS, latency="paper", **({"points": points} if points else {}))
-    asked = list(requests(spec, dataset.scenes))
+    asked = list(requests(spec, all_scenes(dataset)))
     answers = [change(answer_of(request, _completion(request))) for request in asked]
     asker = Asker(spec, _nobody, PAPER, answers={answer.id: answer for answer in answers})
-    world = FrozenWorld(dataset, SEEDS)
+    world = FrozenWorld(dataset, spec.points, SEEDS)
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
     decisions = table(decided, world.columns(), dataset.actions)
+    answers = [answer for answer in answers if answer.scene in decisions.scenes]
     grid = Grid(tuple(point.name for point in spec.points), SEEDS, dataset.episodes)
     episodes = counted(grid, decisions, world.episodes())
     manifest = {

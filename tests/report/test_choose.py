@@ -26,6 +26,7 @@ def run_of(out, episodes):
         actions, safe, _, avoidable = points[row["scene"]]
         place = conditions.index(row["condition"])
         row |= {"action": actions[place], "safe": safe[place], "safe_SLOWER": avoidable, "safe_IDLE": False}
+        row |= {"value": avoidable, "regret": not safe[place] if avoidable else None}
 
     def answer(row):
         row["verdict"] = points[row["scene"]][2]

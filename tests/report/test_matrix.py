@@ -1,18 +1,31 @@
 """Prompts and models side by side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+from markupsafe import escape
 from run_on_disk import answers_of, rows_of
 from sample_run import write_run
 
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import load
 from harness.report import matrix, statistics
 from harness.report.charts import statuses
+from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
 
 
+def marked(*ended):
+    [marks] = matrix.marked([[{(e, 0): x for e, x in enumerate(of)} for of in ended]])
+    return marks
+
+
 def marks(*ended):
-    return [mark for mark, _ in matrix._marks([{(e, 0): x for e, x in enumerate(of)} for of in ended])]
+    return [mark for mark, _ in marked(*ended)]
 
 
 def test_the_best_is_marked_and_who_cannot_be_told_from_it():
@@ -25,16 +38,51 @@ def test_where_seeds_differ_the_interval_over_episodes_decides():
     luck = np.random.default_rng(0)
     one = {(e, s): float(luck.random() < 0.9) for e in range(60) for s in range(3)}
     other = {(e, s): float(luck.random() < 0.5) for e in range(60) for s in range(3)}
-    (first, _), (second, behind) = matrix._marks([one, other])
+    [[(first, _), (second, behind)]] = matrix.marked([[one, other]])
     assert (first, second) == (matrix.BEST, matrix.WORSE)
-    assert behind.test.method == "interval"
-    assert behind.difference < behind.test.high < 0
-    assert behind.episodes == 60
+    assert behind.change.value < behind.change.high < 0
+    assert (behind.change.n, behind.p_value < 0.001) == (60, True)
+
+
+def test_a_run_of_easier_episodes_alone_is_not_the_best():
+    """Its 19 of 20 are 95 %, against 120 of 200; on these 20 the other succeeds in every one."""
+    long, short = [1.0] * 120 + [0.0] * 80, [1.0] * 19 + [0.0]
+    (first, _), (second, behind) = marked(long, short)
+    assert (first, second) == (matrix.BEST, matrix.CLOSE)
+    assert (behind.change.value, behind.change.n) == (pytest.approx(-0.05), 20)
+    assert marks(short, long) == [matrix.CLOSE, matrix.BEST], "whatever the order"
+
+
+def test_where_each_run_is_behind_another_none_is_the_best():
+    """The first beats the second on 40 episodes; the third, of 4, beats the first and loses to the second."""
+    first = [0.0, 0.0, 1.0, 0.0] + [1.0] * 36
+    second = [1.0, 1.0, 1.0, 1.0] + [0.0] * 36
+    third = [1.0, 1.0, 1.0, 0.0]
+    assert marked(first, second, third) == [("", None)] * 3
 
 
 def test_runs_without_episodes_in_common_are_not_marked():
     one, other = {(e, 0): 1.0 for e in range(5)}, {(e, 0): 0.0 for e in range(5, 10)}
-    assert matrix._marks([one, other]) == [(matrix.BEST, None), ("", None)]
+    assert matrix.marked([[one, other]]) == [[("", None), ("", None)]]
+    assert matrix.marked([[one, {}]]) == [[("", None), ("", None)]], "made under another condition"
+
+
+def test_holm_counts_every_pair_under_every_condition():
+    """Eight of 18 successes lost in 20 episodes, none gained: real alone and among 6 pairs, not among 12.
+
+    Of 4 runs under 2 conditions there are 12 pairs: the first counts 12 times, and so do the next, equal ones
+    at least.
+    """
+    best, worse = ({(e, 0): float(first <= e < 18) for e in range(20)} for first in (0, 8))
+    [[_, (mark, alone)]] = matrix.marked([[best, worse]])
+    assert mark == matrix.WORSE
+    assert alone.change.high < 0
+    [[_, *others]] = matrix.marked([[best, worse, worse, worse]])
+    assert [mark for mark, _ in others] == [matrix.WORSE] * 3
+    assert [behind.p_value for _, behind in others] == pytest.approx([6 * alone.p_value] * 3)
+    for _, *others in matrix.marked([[best, worse, worse, worse]] * 2):
+        assert [mark for mark, _ in others] == [matrix.CLOSE] * 3
+        assert [behind.p_value for _, behind in others] == pytest.approx([12 * alone.p_value] * 3)
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +104,29 @@ def test_a_run_has_a_line_under_each_condition_and_a_place_in_each_grid(both):
         ]  # fmt: skip
 
 
+def test_the_headline_names_the_best_or_says_that_there_is_none(both):
+    lines = matrix.lines(both)
+    assert matrix.headline(lines).startswith("Best under single-local: ")
+    bare = [replace(line, mark="", behind=None) for line in lines]
+    assert "6g: none, as each is behind another run" in matrix.headline(bare)
+
+
+def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
+    points, seeds = tuple(POINTS.values()), (0, 1, 2)
+    paths = [
+        evaluate(spec_of(load(small_path, limit), points=points, seeds=seeds), tmp_path / f"{limit}").out
+        for limit in (4, 2)
+    ]
+    runs = gather(paths)
+    assert matrix.uneven(gather([run])) is None
+    assert matrix.uneven(runs).startswith("The runs have not the same episodes × seeds (")
+    assert "4 × 3" in matrix.uneven(runs)
+    assert "2 × 3" in matrix.uneven(runs)
+    page = render(runs)
+    assert "on 2 shared" in page
+    assert escape(matrix.uneven(runs)) in page
+
+
 def test_runs_of_one_name_are_told_apart(run, dataset, tmp_path):
     again = write_run(tmp_path / "again", dataset)
     assert gather([run, again]).names == (
@@ -71,10 +142,10 @@ def test_runs_of_one_name_are_told_apart(run, dataset, tmp_path):
 
 def test_every_decision_and_reply_is_counted_once(run, dataset):
     found = read(run)
-    rows = rows_of(run)
-    safe, _ = dataset.outcome_arrays()
-    assert len(rows) == len(dataset.scenes) * 9
-    judged = int(safe.any(axis=1).sum()) * 9
+    rows, forest = rows_of(run), dataset.forest
+    assert len(rows) == sum(episode.decisions for episode in found.episodes)
+    judged = sum(bool(forest.value[forest.place[row["scene"]]]) for row in rows)
+    assert judged > 0
     assert sum(row["n"] for row in statistics.reliability(found)) == judged
     assert sum(row["n"] for row in statistics.errors(found)) == judged
     replies = statistics.replies(found)
@@ -82,7 +153,7 @@ def test_every_decision_and_reply_is_counted_once(run, dataset):
     arrived = sum(row[f"delivered_{place}"] is True for row in rows for place in (1, 2, 3))
     assert sum(row["count"] for row in statistics.arrivals(found)) == arrived > 0
     answers = answers_of(run)
-    assert len(answers) == sum(len(scene.viewers) for scene in dataset.scenes)
+    assert len(answers) == sum(len(scene.viewers) for scene in dataset.scenes(list(found.decisions.scenes)))
     assert sum(row["count"] for row in statistics.statuses(found)) == len(answers)
     read_out = [a for a in answers if a.role == "ego" and a.intent]
     assert sum(row["count"] for row in statistics.entropies(found)) == len(read_out)

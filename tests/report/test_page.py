@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import typer
-from evaluating import spec_of
+from evaluating import scenes_of, spec_of
 from msgspec import structs
 from reading import Page, details, packed
 from run_on_disk import answers_of, change, configure, rows_of
@@ -31,9 +31,10 @@ from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import answer_times, headline, latency_source
 from harness.runs.folder import csv_text, read
-from harness.runs.records import Latency, Score, Times
+from harness.runs.records import Episode, Latency, Score, Times
 
 V2 = prompts.load("v2")
+ENDED = {"single-local": 34, "v2x": 35, "6g": 47}  # successes of 50
 
 
 def told(viewer_says):
@@ -89,7 +90,8 @@ def messages_in(row):
 
 def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, dataset):
     every = by_scene(run)
-    assert list(opened) == list(every) == [scene.id for scene in dataset.scenes]
+    assert list(opened) == list(every)
+    assert set(every) <= set(dataset.forest.ids)
     for scene, (rows, answers) in every.items():
         detail = opened[scene]
         [found] = detail["runs"]
@@ -106,8 +108,9 @@ def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, 
             )
             for row in rows
         }
-        assert [o["safe"] for o in detail["outcomes"]] == [
-            rows[0][f"safe_{action}"] for action in dataset.actions
+        assert [(o["safe"], o["delay_s"]) for o in detail["outcomes"]] == [
+            (rows[0][f"safe_{action}"], (delay_s := rows[0][f"delay_s_{action}"]) and round(delay_s, 3))
+            for action in dataset.actions
         ]
         assert set(detail["world"]["viewers"]) == set(answers)
 
@@ -118,13 +121,15 @@ def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, t
     keys = [(c, s) for c in of["conditions"] for s in of["seeds"]]
     for n, (rows, answers) in enumerate(by_scene(run).values()):
         made = {(row["condition"], row["seed"]): row for row in rows}
-        avoidable = any(rows[0][f"safe_{action}"] for action in dataset.actions)
         for k, key in enumerate(keys):
             at = n * len(keys) + k
+            if key not in made:
+                assert of["acted"][at] == of["ended"][at] == "-"
+                continue
             assert index["actions"][int(of["acted"][at])] == made[key]["action"]
             assert of["asked"][at] == str(int(made[key]["triggered"]))
-            good = not avoidable or made[key]["safe"]
-            assert of["ended"][at] in ("sdn" if good else "u")
+            assert (of["ended"][at] == "n") == (not made[key]["value"])
+            assert (of["ended"][at] == "u") == bool(made[key]["regret"])
         statuses = {s for k, s in enumerate(index["statuses"]) if of["statuses"][n] & 1 << k}
         assert statuses == {a.status for a in answers.values()}
 
@@ -155,7 +160,7 @@ def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, 
     said = {"label_mass": 0.25, "retries": 2, "cached": True}
 
     def as_read_out(answer):
-        scene = next(scene for scene in dataset.scenes if scene.id == answer.scene)
+        [scene] = dataset.scenes([answer.scene])
         shown = V2.render(scene.record["graphs"][answer.viewer], dataset.actions)
         return structs.replace(answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said)
 
@@ -225,7 +230,10 @@ def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_pat
     assert "brave · v2" in found
     assert found.count("★ best") >= 3
     every = details(text)
-    assert all(len([r for r in d["runs"] if r]) == 2 for d in every.values())
+    came = [by_scene(of) for of in (run, brave)]
+    assert len(every) < sum(map(len, came)), "some scenes are of both"
+    for scene, detail in every.items():
+        assert [told is not None for told in detail["runs"]] == [scene in of for of in came]
 
 
 def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tmp_path):
@@ -253,19 +261,26 @@ def test_characters_that_show_nothing_or_turn_the_line_around_are_spelt_out():
 
 
 def test_a_lone_surrogate_in_an_answer_is_replaced_before_it_is_written(dataset):
-    [request] = list(requests(spec_of(dataset), dataset.scenes[:1]))[:1]
+    [request] = list(requests(spec_of(dataset), scenes_of(dataset)[:1]))[:1]
     answer = answer_of(request, Completion(request.id, "I\ud800", None, None, "stop", None, 1))
     assert answer.raw == "I?"
 
 
-def scored(run, tmp_path, *scores):
-    """The run with another summary."""
+def scored(run, tmp_path, *scores, ended=None):
+    """The run with another summary, and in each condition so many successes of 50 episodes."""
     found = [
         Score(condition, metric, value, low, high, 2, 0, "episodes")
         for condition, metric, value, low, high in scores
     ]
     copy = copied(run, tmp_path)
-    (copy / "summary.csv").write_text(csv_text(Score, found, read(run).manifest.variant))
+    variant = read(run).manifest.variant
+    (copy / "summary.csv").write_text(csv_text(Score, found, variant))
+    if ended:
+        [*some] = {(e.condition, e.seed): e for e in read(run).episodes}.values()
+        episodes = [
+            structs.replace(e, episode=n, success=n < ended[e.condition]) for e in some for n in range(50)
+        ]
+        (copy / "episodes.csv").write_text(csv_text(Episode, episodes, variant))
     return read(copy)
 
 
@@ -277,6 +292,7 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ("6g", "success_rate", 0.94, 0.88, 0.97),
         ("6g", "latency_proxy_ms", 151.4, 151.0, 151.8),
         ("6g", "success_gain_over_single-local", 0.26, 0.17, 0.35),
+        ended=ENDED,
     )
     assert headline(found) == (
         "With rule-of-thumb, 6g clears 94.0 % (95 % interval 88.0 to 97.0 %) of the episodes of two "
@@ -292,6 +308,7 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_p
         ("single-local", "success_rate", 0.68, 0.58, 0.76),
         ("v2x", "success_rate", 0.70, 0.60, 0.78),
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
+        ended=ENDED,
     )
     assert headline(found).endswith("a gap of 2.0 points (-3.0 to 7.0 points), which may be chance.")
 
@@ -388,7 +405,7 @@ def set_in_first(name, value):
     """Changes a column of the first decision."""
 
     def decision(row):
-        if (row["scene"], row["condition"], row["seed"]) == ("00000-0", "v2x", 0):
+        if (row["episode"], row["step"], row["condition"], row["seed"]) == (0, 0, "v2x", 0):
             row[name] = value
 
     return decision
@@ -417,7 +434,7 @@ def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
     ("decision", "message"),
     [
         (
-            lambda row: row.update(scene="x") if row["scene"] == "00000-0" else None,
+            lambda row: row.update(scene="x") if (row["episode"], row["step"]) == (0, 0) else None,
             "decisions.parquet has scene 'x', which its dataset has not; make the run again",
         ),
         (set_in_first("condition", "v3x"), "decisions.parquet is broken .unknown condition 'v3x'"),

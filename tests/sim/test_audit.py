@@ -11,17 +11,16 @@ import pytest
 from harness.core.errors import UserError
 from harness.world.audit import Moments, Ranks, audit, judge, numbers
 from harness.world.perception.graph import scene_graph
-from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters
+from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
 from harness.world.world import World
 
 pytest.importorskip("sklearn", reason="needs the audit extra")
 
 
-def moments(numbers, danger, step=None):
-    n = len(danger)
-    names = tuple(f"number {k}" for k in range(numbers.shape[1]))
-    step = np.zeros(n, dtype=int) if step is None else step
-    return Moments(np.arange(n), step, np.array(danger), names, numbers)
+def moments(numbers, danger):
+    """One moment a layout."""
+    n, names = len(danger), tuple(f"number {k}" for k in range(numbers.shape[1]))
+    return Moments(np.arange(n), np.zeros(n, dtype=int), np.array(danger), names, numbers)
 
 
 def quiet(done):
@@ -32,35 +31,31 @@ def quiet(done):
 
 
 def test_an_auc_is_the_share_of_pairs_in_their_order_and_a_tie_is_half():
-    of = moments(np.zeros((5, 1)), ["left", "left", "", "", ""])
-    ranks = Ranks.of(of, np.array([0.9, 0.4, 0.4, 0.1, 0.95]), of.danger != "")
+    score, there = np.array([0.9, 0.4, 0.4, 0.1, 0.95]), np.array([True, True, False, False, False])
+    ranks = Ranks.of(np.arange(5), np.zeros(5, dtype=int), score, there)
     assert ranks.auc == pytest.approx((2 + 1.5) / 6)
     assert ranks.estimate().n == 5
 
 
-def test_only_moments_of_one_step_are_compared():
+def test_only_moments_that_are_alike_are_compared():
     """Late moments rank high whatever is hidden: that fewer dangers are left then is no tell."""
-    of = moments(np.zeros((4, 1)), ["left", "", "left", ""], np.array([0, 0, 1, 1]))
-    assert Ranks.of(of, np.array([0.2, 0.1, 0.8, 0.9]), of.danger != "").auc == 0.5
+    score, there = np.array([0.2, 0.1, 0.8, 0.9]), np.array([True, False, True, False])
+    assert Ranks.of(np.arange(4), np.array([0, 0, 1, 1]), score, there).auc == 0.5
 
 
 def test_no_interval_has_zero_width():
-    of = moments(np.zeros((20, 1)), ["left", ""] * 10)
-    found = Ranks.of(of, (of.danger != "").astype(float), of.danger != "").estimate()
+    there = np.array([True, False] * 10)
+    found = Ranks.of(np.arange(20), np.zeros(20, dtype=int), there.astype(float), there).estimate()
     assert (found.value, found.high) == (1.0, 1.0)
     assert found.low == pytest.approx(10 / (10 + 1.96**2), abs=1e-4)  # Wilson, 10 of 10
 
 
 def test_layouts_are_drawn_whole():
     """Ten moments that are copies of one say no more than it does."""
-    rng = np.random.default_rng(0)
-    danger, score = np.array(["left", ""] * 20), rng.random(40)
-    once = Ranks.of(moments(np.zeros((40, 1)), danger), score, danger != "").estimate()
-    copies = Moments(
-        np.repeat(np.arange(40), 10), np.tile(np.arange(10), 40), np.repeat(danger, 10), ("x",),
-        np.zeros((400, 1)),
-    )  # fmt: skip
-    often = Ranks.of(copies, np.repeat(score, 10), copies.danger != "").estimate()
+    layout, there, score = np.arange(40), np.arange(40) % 2 == 0, np.random.default_rng(0).random(40)
+    once = Ranks.of(layout, np.zeros(40, dtype=int), score, there).estimate()
+    copies = (np.repeat(of, 10) for of in (layout, score, there))
+    often = Ranks.of(next(copies), np.tile(np.arange(10), 40), *copies).estimate()
     assert (often.low, often.high) == pytest.approx((once.low, once.high))
 
 
@@ -101,10 +96,19 @@ def test_what_is_known_only_where_there_is_danger_tells_too(known):
 # -- scenarios --------------------------------------------------------------------------------------
 
 
+def telling(seed, parameters):
+    """As the scenario once was: where a danger comes from a side, the truck in sight is farther away."""
+    found = layout(seed, parameters)
+    moved = [
+        replace(s, arc_m=s.arc_m - 45.0) if s.kind == "truck" and found.danger else s for s in found.spawns
+    ]
+    return replace(found, spawns=tuple(moved))
+
+
 @pytest.mark.slow
 def test_a_truck_that_is_elsewhere_where_there_is_danger_is_found():
-    dials = Parameters(danger_share=0.5, sector_shares=(0.5, 0.5, 0.0), truck_share=1.0)
-    found = audit(replace(SCENARIO, parameters=dials), 40, 0, quiet)
+    dials = Parameters(danger_share=0.5, sector_shares=(0.5, 0.5, 0.0))
+    found = audit(replace(SCENARIO, layout=telling, parameters=dials), 40, 0, quiet)
     assert found.tells
     assert found.auc["danger"].value > 0.95
     assert found.auc["danger"].low > 0.75

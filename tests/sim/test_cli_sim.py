@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from zipfile import ZipFile
 
 import jsonschema
 import pytest
@@ -24,7 +25,7 @@ def test_every_parameter_is_shown_with_value_and_meaning(harness):
     shown = json.loads(harness("scenario", "show", NAME, "--json")[1])
     assert shown["actions"] == ["SLOWER", "IDLE", "FASTER"]
     assert shown["parameters"]["time_limit_s"]["value"] == 10.0
-    assert shown["parameters"]["corner_m"]["value"] == [8.0, 18.0]
+    assert shown["parameters"]["corner_m"]["value"] == [8.0, 15.0]
     assert all(p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values())
 
 
@@ -59,45 +60,57 @@ def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     code, out, _ = harness(
         "dataset", "build", NAME, "--episodes", 2, "--seed", 179, "--workers", 1, "--out", out_folder
     )
-    assert (code, "2 episodes, 12 decision points" in out) == (0, True)
+    nodes = json.loads((out_folder / "manifest.json").read_text())["nodes"]
+    assert (code, f": 2 layouts, {nodes} decision points, in " in out) == (0, True)
     code, out, _ = harness("dataset", "check", out_folder)
-    assert (code, out.splitlines()[0]) == (0, "two-v1 is sound: 2 episodes, 12 decision points, 4 files")
+    assert (code, out.splitlines()[0]) == (0, f"two-v1 is sound: 2 layouts, {nodes} decision points")
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")
     ranked = json.loads(out)
     assert (code, ranked["episodes"], ranked["ranks_agree"]) == (0, 2, True)
-    cruise = ranked["drivers"]["cruise"]
-    assert cruise["frozen"]["value"] == cruise["live"]["value"] == 0.5
-    assert (cruise["difference_points"]["value"], cruise["agreement"]["value"]) == (0.0, 1.0)
+    success = {driver: of["frozen"]["value"] for driver, of in ranked["drivers"].items()}
+    assert (success["brake"], success["full-view"]) == (0.0, 1.0)
+    for of in ranked["drivers"].values():
+        assert of["frozen"]["value"] == of["live"]["value"]
+        assert (of["difference_points"]["value"], of["agreement"]["value"]) == (0.0, 1.0)
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1)
-    assert "n = 2 episodes; ranks agree: yes" in out
+    assert "n = 2 episodes; frozen and in closed loop the 4 drivers have the same order" in out
+    assert "so few are no rank correlation" in out
     assert max(map(len, out.splitlines())) <= 80
 
 
 def test_a_damaged_dataset_is_told_line_by_line_with_exit_code_1(harness, small_folder, tmp_path):
     damaged = shutil.copytree(small_folder, tmp_path / "damaged")
-    with (damaged / "scenes.jsonl").open("ab") as f:
-        f.write(b'{"scene": "00006-0"}\n{"sce')
+    with ZipFile(damaged / "layouts.zip") as file:
+        entries = {name: file.read(name) for name in file.namelist()}
+    entries["00001/2.jsonl"] += b'{"sce'
+    entries["00004/tree.json"] = entries["00004/tree.json"].replace(b"IDLE", b"IDEL", 1)
+    del entries["00005/0.jsonl"]
+    with ZipFile(damaged / "layouts.zip", "w") as file:
+        for name, data in entries.items():
+            file.writestr(name, data)
+    (damaged / "README.md").unlink()
     code, out, err = harness("dataset", "check", damaged)
     lines = out.splitlines()
     assert (code, err) == (1, "")
-    assert lines[0] == "scenes.jsonl: changed, its sha256 is not the manifest's"
-    assert lines[1] == "scenes.jsonl line 37: record has no episode; add it"
-    assert lines[-2:] == [
-        "scenes.jsonl line 38: cut off",
-        "scenes.jsonl: 38 decision points, the manifest says 36",
+    assert lines[:3] == [
+        "README.md: missing",
+        "layouts.zip 00001/2.jsonl: changed, its sha256 is not the one that was pinned",
+        "layouts.zip 00004/tree.json: changed, its sha256 is not the one that was pinned",
     ]
+    assert lines[3].startswith("layouts.zip 00005/0.jsonl: cannot be read (")
+    assert len(lines) == 4
     code, out, _ = harness("dataset", "check", damaged, "--json")
     assert (code, json.loads(out)["problems"]) == (1, lines)
 
 
-def test_ranking_refuses_a_dataset_of_other_parameters(harness, small_folder, tmp_path):
+def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
     other = shutil.copytree(small_folder, tmp_path / "other")
     manifest = json.loads((other / "manifest.json").read_text())
-    manifest["parameters"]["time_limit_s"] = 11.0
+    manifest["actions"] = ["STOP", "IDLE", "FASTER"]
     (other / "manifest.json").write_text(json.dumps(manifest))
     code, out, err = harness("dataset", "rank", other)
     assert (code, out) == (2, "")
-    assert "was built with other parameters than are driven here" in err
+    assert "00000/tree.json: a reference driver's action is not one of the manifest's" in err
 
 
 @pytest.mark.parametrize(
@@ -118,7 +131,7 @@ def test_ranking_refuses_a_dataset_of_other_parameters(harness, small_folder, tm
         ("dataset rank SMALL --workers 0", "--workers 0 is out of range"),
         ("dataset show SMALL 00099-0 --out OUT.svg", "unknown scene '00099-0'"),
         ("dataset show SMALL 00000-0 --out OUT.gif", "end it in .svg or .png"),
-        ("dataset show SMALL 00000-0 --viewer v9 --out OUT.svg", "unknown viewer of scene 00000-0 'v9'"),
+        ("dataset show SMALL 00000-0 --viewer v9 --out OUT.svg", "unknown viewer of scene 00000-0-"),
         ("dataset show EMPTY 00000-0 --out OUT.svg", "is no dataset"),
     ],
 )
@@ -143,7 +156,7 @@ def test_a_scene_is_drawn_whole(harness, small_folder, tmp_path):
     pytest.importorskip("harness.report.drawing")
     for suffix, start in {"svg": b"<?xml", "png": b"\x89PNG"}.items():
         picture = tmp_path / f"scene.{suffix}"
-        code, out, _ = harness("dataset", "show", small_folder, "00000-2", "--viewer", "v2", "--out", picture)
+        code, out, _ = harness("dataset", "show", small_folder, "00000-0", "--viewer", "v2", "--out", picture)
         assert (code, out) == (0, f"wrote {picture}\n")
         assert picture.read_bytes().startswith(start)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.png", "scene.svg"]

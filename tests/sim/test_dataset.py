@@ -8,14 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from zipfile import ZipFile
 
-import numpy as np
 import pytest
+from evaluating import scenes_of
 
 from harness.core.errors import UserError
-from harness.core.files import canonical_json, sha256_file
+from harness.core.files import canonical_json, sha256_bytes
+from harness.dataset import verify
 from harness.dataset.build import build
-from harness.dataset.freeze import Behaviour, freeze
 from harness.dataset.load import find, load
 from harness.dataset.verify import check
 from harness.world.perception.graph import scene_graph
@@ -40,12 +42,12 @@ def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_a
     command = [sys.executable, "-m", "harness", "dataset", "build", "occluded-intersection"]
     command += ["--episodes", "6", "--seed", str(FIRST_SEED), "--workers", "2", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True) as process:
-        while process.poll() is None and len(list(out.glob(".building/0*.jsonl"))) < 2:
+        while process.poll() is None and len(list(out.glob(".building/0*.zip"))) < 2:
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
     assert not (out / "manifest.json").exists()
-    finished = len(list(out.glob(".building/0*.jsonl")))
+    finished = len(list(out.glob(".building/0*.zip")))
     progress = []
     build(SCENARIO, out, 6, FIRST_SEED, 2, progress.append)
     assert (progress[0], sum(progress)) == (finished, 6)
@@ -79,15 +81,22 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
 # What is in it.
 
 
-def test_a_built_dataset_is_sound_and_has_all_its_decision_points(small, small_folder):
+def test_a_built_dataset_is_sound_and_has_every_course(small, small_folder):
     assert check(small_folder) == []
-    assert (small.manifest.episodes, small.manifest.decisions, len(small.scenes)) == (6, 36, 36)
-    assert [s.id for s in small.scenes[:7]] == [f"00000-{n}" for n in range(6)] + ["00001-0"]
-    assert {s.record["episode_seed"] for s in small.scenes} == set(range(FIRST_SEED, FIRST_SEED + 6))
+    forest = small.forest
+    assert small.manifest.episodes == 6
+    assert small.manifest.nodes == len(forest.ids)
+    assert [tree.episode_seed for tree in small.trees] == list(range(FIRST_SEED, FIRST_SEED + 6))
+    # Three target speeds, so at most three new decision points a decision point; far fewer are new.
+    for tree in small.trees:
+        sizes = [len(level) for level in tree.levels]
+        assert len(sizes) == SCENARIO.parameters.decisions
+        assert sizes[0] == 1
+        assert sum(sizes) < 130
 
 
 def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
-    for scene in small.scenes[::5]:
+    for scene in scenes_of(small)[::9]:
         assert scene.viewers == ("v1", "v2", "v3", "v4")
         for viewer in scene.viewers:
             graph = scene_graph(SCENARIO, scene.state, viewer)
@@ -95,91 +104,71 @@ def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
 
 
 def test_no_graph_says_minus_zero(small):
-    for scene in small.scenes:
+    for scene in scenes_of(small):
         assert re.search(r"-0\.0(?!\d)", canonical_json(scene.record["graphs"])) is None
 
 
-def test_outcomes_in_a_record_are_what_its_thawed_state_comes_to(small):
-    for scene in (small.scenes[2], small.scenes[27], small.scenes[34]):
-        for action in small.actions:
+def test_poses_are_kept_to_the_micrometre_so_that_other_machines_write_the_same(small):
+    for scene in scenes_of(small)[::9]:
+        for v in scene.record["state"]["vehicles"]:
+            for number in (v["x_m"], v["y_m"], v["heading_rad"], v["speed_mps"]):
+                assert number == round(number, 6)
+
+
+def test_an_edge_leads_where_the_thawed_world_goes(small):
+    """Thawed to the micrometre, so positions agree to a millimetre, and ends to the frame."""
+    forest = small.forest
+    for n in range(0, len(forest.ids), 37):
+        [scene] = small.scenes([forest.ids[n]])
+        for place, action in enumerate(small.actions):
             world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
             world.act(action)
+            child = int(forest.child[n, place])
+            if child < 0:
+                end = forest.end(int(forest.edge[n, place]))
+                assert (world.outcome.result, world.outcome.time_s) == (end.result, end.time_s)
+                assert (world.outcome.partner, world.outcome.fault) == (end.partner, end.fault)
+                continue
+            [there] = small.scenes([forest.ids[child]])
+            for mine, its in zip(world.state().vehicles, there.state.vehicles, strict=True):
+                assert (mine.x_m, mine.y_m) == pytest.approx((its.x_m, its.y_m), abs=1e-3)
+                assert mine.speed_mps == pytest.approx(its.speed_mps, abs=1e-3)
+
+
+def test_what_becomes_of_an_action_with_the_full_view_driver_is_what_it_drives(small):
+    forest = small.forest
+    for n in forest.visited(forest.drivers["cruise"]).tolist()[::5]:
+        [scene] = small.scenes([forest.ids[n]])
+        for place, action in enumerate(small.actions):
+            world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
+            world.act(action)
+            end = forest.end(int(forest.then_full_view[n, place]))
             outcome = finish(world, "full-view")
-            row = scene.record["outcomes"][action]
-            assert (outcome.result, outcome.time_s, outcome.partner, outcome.fault) == (
-                row["result"], row["time_s"], row["partner"], row["fault"],
-            )  # fmt: skip
+            assert (outcome.result, outcome.time_s) == (end.result, end.time_s)
 
 
-def test_the_outcome_table_of_a_known_episode(small):
-    """Seed 181: a danger from the right that a cruising ego would hit 4.8 s after the start."""
-    tables = [s.record["outcomes"] for s in small.scenes if s.record["episode_seed"] == 181]
-    results = [{a: table[a]["result"] for a in small.actions} for table in tables]
-    harmless = dict.fromkeys(small.actions, "cleared")
-    assert results == [
-        harmless,
-        harmless,
-        harmless,  # there is still a second to wait and see
-        {"SLOWER": "cleared", "IDLE": "collision", "FASTER": "collision"},
-        {"SLOWER": "cleared", "IDLE": "cleared", "FASTER": "collision"},  # not yet behind the danger
-        {"SLOWER": "time_out", "IDLE": "cleared", "FASTER": "cleared"},  # nobody speeds up after the last one
-    ]
-    hit = tables[3]["IDLE"]
-    assert (hit["time_s"], hit["partner"], hit["fault"]) == (
-        5.0,
-        small.scenes[18].record["danger"]["vehicle"],
-        "ego",
-    )
-
-
-def test_delays_are_against_the_best_safe_action_and_nan_where_unsafe(small):
-    safe, delay_s = small.outcome_arrays()
-    assert safe.shape == delay_s.shape == (36, 3)
-    assert np.array_equal(np.isnan(delay_s), ~safe)
-    best = np.nanmin(delay_s[safe.any(axis=1)], axis=1)
-    assert (best == 0.0).all()
-    harmless = [
-        n for n, s in enumerate(small.scenes) if s.record["episode_seed"] == 179 and s.record["step"] == 0
-    ]
-    slower, idle, _ = delay_s[harmless[0]]
-    assert idle == 0.0
-    assert 0.3 < slower < 1.0  # one needless SLOWER is within the allowance
-
-
-def test_the_guard_acts_only_where_the_behaviour_would_have_ended_the_episode(small):
-    for scene in small.scenes:
-        record = scene.record
-        safe = [a for a in small.actions if record["outcomes"][a]["result"] == "cleared"]
-        assert record["behaviour"]["action"] in (safe or small.actions)
-        if record["behaviour"]["reason"] == "guard":
-            quickest = min(safe, key=lambda a: record["outcomes"][a]["time_s"])
-            assert record["behaviour"]["action"] == quickest
-
-
-def test_one_driver_leads_until_the_guard_acts_and_then_full_view_does(small):
-    for episode in range(6):
-        reasons = [s.record["behaviour"]["reason"] for s in small.scenes if s.record["episode"] == episode]
-        guarded = reasons.index("guard") if "guard" in reasons else len(reasons)
-        assert {*reasons[:guarded]} - {"random"} in ({"cruise"}, {"local-view"}, set())
-        assert {*reasons[guarded:]} <= {"guard", "random", "full-view"}
-
-
-@pytest.mark.parametrize(
-    ("behaviour", "reasons"),
-    [
-        (Behaviour(cruise_share=1.0, random_share=0.0), {"cruise"}),
-        (Behaviour(cruise_share=0.0, random_share=0.0), {"local-view"}),
-        (Behaviour(cruise_share=1.0, random_share=1.0), {"random", "guard"}),
-    ],
-)
-def test_a_share_of_one_is_always_and_of_none_is_never(behaviour, reasons):
-    records = freeze(SCENARIO, 179, 0, behaviour)  # no danger: there the guard only stops a late SLOWER
-    assert {record["behaviour"]["reason"] for record in records} <= reasons
-    assert records[0]["behaviour"]["reason"] in reasons - {"guard"}
+def test_actions_that_come_to_the_same_are_one_edge(small):
+    """At the highest speed level FASTER changes nothing."""
+    first = small.trees[0].levels[0][0]
+    assert [edge.actions for edge in first.edges] == [["SLOWER"], ["IDLE", "FASTER"]]
 
 
 def test_the_first_episodes_can_be_loaded_alone(small_folder):
-    assert [s.id for s in load(small_folder, limit=1).scenes] == [f"00000-{n}" for n in range(6)]
+    few = load(small_folder, limit=1)
+    assert few.episodes == (0,)
+    assert {name[:5] for name in few.forest.ids} == {"00000"}
+
+
+def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
+    p = replace(SCENARIO.parameters, decision_lag_s=0.0)
+    at_once = replace(SCENARIO, parameters=p)
+    build(at_once, tmp_path / "at-once", 1, FIRST_SEED, 1, lambda done: None)
+    data = load(tmp_path / "at-once")
+    assert data.scenario.parameters.lag_frames == 0
+    assert data.scenario.parameters == p
+    assert small.scenario.parameters.lag_frames == 8  # 145 ms in frames of 20 ms
+    assert data.trees[0].levels[0][0].scene == small.trees[0].levels[0][0].scene
+    assert {b.scene for b in data.trees[0].levels[1]} != {b.scene for b in small.trees[0].levels[1]}
 
 
 # Damage.
@@ -190,34 +179,64 @@ def copy(small_folder, tmp_path):
     return shutil.copytree(small_folder, tmp_path / "copy")
 
 
-def reseal(folder, **changes):
-    """Make the manifest agree with the files again, as someone who means harm would."""
+def rewrite(folder, name, change):
+    """Replace a file in layouts.zip by what `change` makes of its bytes."""
+    with ZipFile(folder / "layouts.zip") as file:
+        entries = {each: file.read(each) for each in file.namelist()}
+    made = change(entries[name])
+    entries[name] = made
+    if made is None:
+        del entries[name]
+    with ZipFile(folder / "layouts.zip", "w") as file:
+        for each, data in entries.items():
+            file.writestr(each, data)
+    return entries
+
+
+def reseal(folder, entries, **changes):
+    """Make manifest and trees agree with the files again, as someone who means harm would."""
     manifest = json.loads((folder / "manifest.json").read_text())
-    manifest["files"]["scenes.jsonl"] = sha256_file(folder / "scenes.jsonl")
+    for episode in range(manifest["episodes"]):
+        tree = json.loads(entries[f"{episode:05d}/tree.json"])
+        if isinstance(tree, dict) and isinstance(tree.get("levels"), list):
+            levels = [f"{episode:05d}/{step}.jsonl" for step in range(len(tree["levels"]))]
+            tree["scenes_sha256"] = [sha256_bytes(entries[name]) for name in levels if name in entries]
+            entries[f"{episode:05d}/tree.json"] = json.dumps(tree).encode()
+        manifest["trees_sha256"][episode] = sha256_bytes(entries[f"{episode:05d}/tree.json"])
+    with ZipFile(folder / "layouts.zip", "w") as file:
+        for each, data in entries.items():
+            file.writestr(each, data)
     (folder / "manifest.json").write_text(json.dumps({**manifest, **changes}))
 
 
 def edit(folder, line, change):
-    """Replace a line of scenes.jsonl (from 1) by what `change` makes of its record, and seal it again."""
-    lines = (folder / "scenes.jsonl").read_bytes().splitlines(keepends=True)
-    record = json.loads(lines[line - 1])
-    changed = change(record)
-    lines[line - 1] = changed if isinstance(changed, bytes) else (json.dumps(record) + "\n").encode()
-    (folder / "scenes.jsonl").write_bytes(b"".join(lines))
-    reseal(folder)
+    """Replace a scene of the second layout's level 2 (from 1) by what `change` makes of it, and seal it."""
+
+    def of_lines(data):
+        lines = data.splitlines(keepends=True)
+        record = json.loads(lines[line - 1])
+        changed = change(record)
+        lines[line - 1] = changed if isinstance(changed, bytes) else (json.dumps(record) + "\n").encode()
+        return b"".join(lines)
+
+    reseal(folder, rewrite(folder, "00001/2.jsonl", of_lines))
+
+
+def use(folder):
+    """Load, and read every scene."""
+    data = load(folder)
+    data.scenes(data.forest.ids)
 
 
 def test_a_changed_byte_is_found_and_refused(copy):
-    data = bytearray((copy / "scenes.jsonl").read_bytes())
-    place = data.index(b'"speed_mps":14.0') + len(b'"speed_mps":1')
-    data[place] = ord("5")
-    (copy / "scenes.jsonl").write_bytes(bytes(data))
-    assert check(copy) == ["scenes.jsonl: changed, its sha256 is not the manifest's"]
-    with pytest.raises(UserError, match=r"scenes\.jsonl: changed"):
-        load(copy)
+    rewrite(copy, "00001/2.jsonl", lambda data: data.replace(b'"speed_mps":14.0', b'"speed_mps":15.0', 1))
+    changed = "layouts.zip 00001/2.jsonl: changed, its sha256 is not the one that was pinned"
+    assert check(copy) == [changed]
+    with pytest.raises(UserError, match=re.escape(changed)):
+        use(copy)
 
 
-@pytest.mark.parametrize("name", ["scenes.jsonl", "README.md", "scene.schema.json", "manifest.schema.json"])
+@pytest.mark.parametrize("name", ["README.md", "scene.schema.json", "manifest.schema.json"])
 def test_a_missing_file_is_found_and_refused(copy, name):
     (copy / name).unlink()
     assert check(copy) == [f"{name}: missing"]
@@ -225,27 +244,48 @@ def test_a_missing_file_is_found_and_refused(copy, name):
         load(copy)
 
 
-def test_a_last_line_cut_off_is_found_with_its_number(copy):
-    data = (copy / "scenes.jsonl").read_bytes()
-    (copy / "scenes.jsonl").write_bytes(data[:-400])
-    assert check(copy) == [
-        "scenes.jsonl: changed, its sha256 is not the manifest's", "scenes.jsonl line 36: cut off",
-    ]  # fmt: skip
-    reseal(copy)
-    with pytest.raises(UserError, match="line 36: cut off"):
+@pytest.mark.parametrize(
+    ("content", "why"), [(None, "No such file"), (b"", "not a zip file"), (b"PK\x03\x04" + bytes(99), "zip")]
+)
+def test_layouts_that_are_missing_or_no_archive_are_refused(copy, content, why):
+    if content is None:
+        (copy / "layouts.zip").unlink()
+    else:
+        (copy / "layouts.zip").write_bytes(content)
+    [problem] = check(copy)
+    assert re.search(f"layouts.zip: cannot be read .*{why}", problem)
+    with pytest.raises(UserError, match="cannot be read"):
         load(copy)
 
 
-def test_a_line_taken_out_is_found(copy):
-    lines = (copy / "scenes.jsonl").read_bytes().splitlines(keepends=True)
-    (copy / "scenes.jsonl").write_bytes(b"".join(lines[:9] + lines[10:]))
-    reseal(copy)
-    assert check(copy) == [
-        "scenes.jsonl line 10: scene 00001-4 does not follow the line before",
-        "scenes.jsonl: 35 decision points, the manifest says 36",
-    ]
-    with pytest.raises(UserError, match="line 10"):
+def test_an_archive_cut_off_is_refused(copy):
+    data = (copy / "layouts.zip").read_bytes()
+    (copy / "layouts.zip").write_bytes(data[:-400])
+    with pytest.raises(UserError, match="cannot be read"):
         load(copy)
+
+
+def test_a_member_that_is_missing_is_found_and_refused(copy):
+    rewrite(copy, "00001/2.jsonl", lambda data: None)
+    [problem] = check(copy)
+    assert problem.startswith("layouts.zip 00001/2.jsonl: cannot be read (")
+    with pytest.raises(UserError, match="There is no item"):
+        use(copy)
+
+
+def test_a_level_that_claims_gigabytes_is_not_unpacked(copy, monkeypatch):
+    monkeypatch.setattr(verify, "LARGEST_ENTRY", 10_000)
+    assert any("too large" in problem for problem in check(copy))
+    with pytest.raises(UserError, match="too large"):
+        use(copy)
+
+
+def test_a_scene_taken_out_is_found(copy):
+    entries = rewrite(copy, "00001/2.jsonl", lambda data: b"".join(data.splitlines(keepends=True)[1:]))
+    reseal(copy, entries)
+    assert check(copy) == ["layouts.zip 00001/2.jsonl: 4 scenes, the tree has 5"]
+    with pytest.raises(UserError, match="4 scenes, the tree has 5"):
+        use(copy)
 
 
 def at(*keys, value):
@@ -278,7 +318,7 @@ HOSTILE = {
     "an integer of five thousand digits": lambda record: b'{"episode":' + b"9" * 5000 + b"}\n",
     "not a number": at("state", "ego_speed", value=1.0),
     "NaN": at("state", "time_s", value=float("nan")),
-    "infinity": at("outcomes", "IDLE", "time_s", value=float("inf")),
+    "infinity": at("state", "time_s", value=float("inf")),
     "a number out of this world": at("state", "vehicles", 0, "x_m", value=1e300),
     "a huge integer": at("episode", value=10**400),
     "a float for an integer": at("snapshot", "sections", 0, value=1.0),
@@ -286,7 +326,7 @@ HOSTILE = {
     "a text for a number": at("distance_m", "v1", value="12"),
     "a list for an object": at("graphs", value=[]),
     "no vehicles": at("state", "vehicles", value=[]),
-    "a missing field": drop("outcomes", "SLOWER"),
+    "a missing field": drop("snapshot", "frame"),
     "an unknown field": at("state", "hidden", value=1),
     "an unknown kind of vehicle": at("state", "vehicles", 0, "kind", value="tank"),
     "an id with markup": at("state", "vehicles", 0, "id", value="<script>"),
@@ -299,9 +339,9 @@ HOSTILE = {
     "a danger that is not there": at("danger", "vehicle", value="v9"),
     "a section too few": at("snapshot", "sections", value=[0]),
     "a section too far": at("snapshot", "sections", 0, value=3),
-    "another step": at("state", "step", value=2),
-    "another seed": at("state", "episode_seed", value=180),
-    "another scene's id": at("scene", value="00003-3"),
+    "another step": at("state", "step", value=3),
+    "another seed": at("state", "episode_seed", value=181),
+    "another scene's id": at("scene", value="00003-3-0123456789ab"),
     "a node that is not there": at("graphs", "v1", "nodes", 0, "id", value="v8"),
     "a conflict on a path that merges": at(
         "graphs", "v1", "conflicts", value=[{
@@ -313,28 +353,88 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_record_that_is_not_what_it_should_be_is_named_by_line_and_never_used(copy, what):
-    edit(copy, 5, HOSTILE[what])
+def test_a_scene_that_is_not_what_it_should_be_is_named_and_never_used(copy, what):
+    edit(copy, 3, HOSTILE[what])
     problems = check(copy)
     assert problems
-    assert all(problem.startswith(("scenes.jsonl line 5", "scenes.jsonl line 6")) for problem in problems)
-    assert problems[0].startswith("scenes.jsonl line 5")
+    name = load(copy).trees[1].levels[2][2].scene
+    where = f"layouts.zip scene {name}"
+    assert all(problem.startswith(where) for problem in problems)
     assert all(len(problem) < 300 and problem.isprintable() for problem in problems)
-    with pytest.raises(UserError, match=r"scenes\.jsonl line 5"):
+    with pytest.raises(UserError, match=re.escape(where)):
+        use(copy)
+
+
+def set_tree(*keys, value):
+    def change(tree):
+        for key in keys[:-1]:
+            tree = tree[key]
+        tree[keys[-1]] = value
+
+    return change
+
+
+HOSTILE_TREES = {
+    "another episode": set_tree("episode", value=2),
+    "another seed": set_tree("episode_seed", value=5),
+    "an edge to nowhere": set_tree("levels", 0, 0, "edges", 0, "to", value=99),
+    "an edge that neither leads on nor ends": set_tree("levels", 0, 0, "edges", 0, "to", value=None),
+    "an edge that leads on after the last level": set_tree("levels", 5, 0, "edges", 0, "to", value=0),
+    "a negative place": set_tree("levels", 0, 0, "edges", 0, "to", value=-1),
+    "an action that is not one": set_tree("levels", 0, 0, "edges", 0, "actions", value=["JUMP"]),
+    "an action twice": set_tree("levels", 0, 0, "edges", 0, "actions", value=["IDLE"]),
+    "no edges": set_tree("levels", 0, 0, "edges", value=[]),
+    "no levels": set_tree("levels", value=[]),
+    "a driver that jumps": set_tree("levels", 0, 0, "drivers", "full-view", value="JUMP"),
+    "no drivers": set_tree("levels", 0, 0, "drivers", value={}),
+    "an id with a path": set_tree("levels", 0, 0, "scene", value="../../etc"),
+    "an id of another step": set_tree("levels", 0, 0, "scene", value="00001-3-0123456789ab"),
+    "an unknown end": set_tree("levels", 5, 0, "edges", 0, "end", "result", value="won"),
+    "a time out of this world": set_tree("levels", 5, 0, "edges", 0, "end", "time_s", value=1e300),
+    "an unknown field": set_tree("more", value=1),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE_TREES)
+def test_a_tree_that_is_not_what_it_should_be_is_refused(copy, what):
+    def change(data):
+        tree = json.loads(data)
+        HOSTILE_TREES[what](tree)
+        return json.dumps(tree).encode()
+
+    entries = rewrite(copy, "00001/tree.json", change)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["trees_sha256"][1] = sha256_bytes(entries["00001/tree.json"])
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    [problem] = check(copy)
+    assert problem.startswith("layouts.zip 00001/tree.json: ")
+    assert len(problem) < 300
+    assert problem.isprintable()
+    with pytest.raises(UserError, match=r"00001/tree\.json"):
+        load(copy)
+
+
+@pytest.mark.parametrize("text", [b"", b"[", b"[" * 100_000, b"null", b"[]", b"9" * 5000, b"\xff"])
+def test_a_tree_that_cannot_be_read_is_refused(copy, text):
+    rewrite(copy, "00001/tree.json", lambda data: text)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["trees_sha256"][1] = sha256_bytes(text)
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"00001/tree\.json"):
         load(copy)
 
 
 HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
-    "a path upwards": {"files": {"../../etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
-    "an absolute path": {"files": {"/etc/passwd": "0" * 64, "scenes.jsonl": "0" * 64}},
-    "a folder": {"files": {"..": "0" * 64, "scenes.jsonl": "0" * 64}},
-    "no digest for the scenes": {"files": {}},
-    "a digest that is none": {"files": {"scenes.jsonl": "unknown"}},
+    "a path upwards": {"files": {"../../etc/passwd": "0" * 64}},
+    "an absolute path": {"files": {"/etc/passwd": "0" * 64}},
+    "a folder": {"files": {"..": "0" * 64}},
+    "a digest too few": {"trees_sha256": ["0" * 64]},
+    "a digest that is none": {"trees_sha256": ["unknown"] * 6},
     "a name that is a path": {"name": "../elsewhere"},
     "a huge integer": {"episodes": 10**400},
     "no episodes": {"episodes": 0},
     "episodes as text": {"episodes": "6"},
-    "another format": {"format": "swarmdrive-dataset/2"},
+    "another format": {"format": "swarmdrive-dataset/1"},
     "one action": {"actions": ["IDLE"]},
     "actions that are no names": {"actions": [["IDLE"], {}]},
     "an allowance that is a text": {"parameters": {"delay_allowance_s": "1"}},
@@ -362,9 +462,11 @@ def test_a_manifest_that_cannot_be_read_is_refused(copy, text):
         load(copy)
 
 
-def test_more_episodes_stated_than_there_are_is_found(copy):
-    reseal(copy, episodes=7)
-    assert check(copy) == ["scenes.jsonl: 6 episodes, the manifest says 7"]
+def test_more_decision_points_stated_than_there_are_is_found(copy):
+    manifest = json.loads((copy / "manifest.json").read_text())
+    (copy / "manifest.json").write_text(json.dumps({**manifest, "nodes": manifest["nodes"] + 1}))
+    n = manifest["nodes"]
+    assert check(copy) == [f"layouts.zip: {n} decision points, the manifest says {n + 1}"]
 
 
 def test_a_folder_that_is_no_dataset_and_a_name_that_is_unknown_are_refused(tmp_path):
@@ -375,7 +477,10 @@ def test_a_folder_that_is_no_dataset_and_a_name_that_is_unknown_are_refused(tmp_
             find(name)
 
 
-def test_an_unknown_scene_is_refused_with_the_nearest(small):
-    with pytest.raises(UserError, match="unknown scene '00005-9'"):
-        small.scene("00005-9")
-    assert small.scene("00005-5").record["step"] == 5
+def test_a_scene_is_found_by_the_beginning_of_its_id_if_that_is_one_scenes_alone(small):
+    assert small.scene("00005-0").record["step"] == 0
+    name = small.trees[5].levels[3][1].scene
+    assert small.scene(name).id == small.scene(name[:-4]).id == name
+    for unclear in ("00005-9", "00005-3", ""):
+        with pytest.raises(UserError, match=f"unknown scene '{unclear}'"):
+            small.scene(unclear)

@@ -14,7 +14,7 @@ def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():
 
 
 def test_who_clears_too_long_after_the_full_view_driver_is_late():
-    outcomes = drive_all(SCENARIO, 6)
+    outcomes = drive_all(SCENARIO, 13)
     assert outcomes["local-view"].result == "late"
     assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
 

@@ -63,7 +63,8 @@ def test_where_every_way_ends_in_a_collision_it_takes_the_one_with_the_widest_ga
 @pytest.mark.parametrize("first", ACTIONS)
 @pytest.mark.parametrize("second", ACTIONS)
 def test_its_model_of_motion_follows_the_simulator(first, second):
-    world = World.start(SCENARIO, 0)
+    """Where a decision acts at once: the model has no lag."""
+    world = World.start(replace(SCENARIO, parameters=replace(P, decision_lag_s=0.0)), 0)
     start = world.state().ego.y_m
     (travelled,) = rollouts([(first, second)], 14.0, 14.0, P.decisions, P)
     for seconds, action in enumerate((first, second, "FASTER"), 1):

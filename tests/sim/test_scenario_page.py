@@ -21,9 +21,9 @@ def test_the_pages_table_has_every_parameter_with_its_value():
 
 
 def test_the_page_counts_the_shipped_episodes_with_a_danger():
-    dangers = {scene.record["episode"]: scene.record["danger"] for scene in load(find(DATASET)).scenes}
-    dangerous = sum(danger["sector"] is not None for danger in dangers.values())
-    assert f"`danger_share`; {dangerous} of the {len(dangers)} shipped" in " ".join(PAGE.split())
+    trees = load(find(DATASET)).trees
+    dangerous = sum(tree.danger.sector is not None for tree in trees)
+    assert f"`danger_share`; {dangerous} of the {len(trees)} shipped" in " ".join(PAGE.split())
 
 
 def test_the_page_names_the_actions():

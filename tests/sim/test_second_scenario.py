@@ -6,6 +6,7 @@ import pickle
 from dataclasses import replace
 
 import pytest
+from evaluating import scenes_of
 from one_way_crossing import SCENARIO
 
 from harness.core.errors import UserError
@@ -85,8 +86,9 @@ def test_both_vehicles_see_its_danger_in_its_sector():
 
 def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
     assert check(folder) == []
-    assert (frozen.scenario, frozen.actions, len(frozen.scenes)) == (SCENARIO, SCENARIO.actions, 8)
-    assert {s.record["danger"]["sector"] for s in frozen.scenes} == {"west", None}
+    assert (frozen.scenario, frozen.actions) == (SCENARIO, SCENARIO.actions)
+    assert [len(tree.levels) for tree in frozen.trees] == [4, 4]
+    assert {s.record["danger"]["sector"] for s in scenes_of(frozen)} == {"west", None}
     build(SCENARIO, tmp_path / "one-way", 2, MEETING, 1, lambda done: None)
     assert (tmp_path / "one-way/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
 
@@ -99,7 +101,7 @@ def test_a_dataset_of_a_scenario_that_is_not_here_is_refused_in_a_line(folder, t
 
 
 def test_prompts_list_its_actions_and_say_its_words(frozen, tmp_path):
-    graph = frozen.scenes[1].record["graphs"]["v2"]
+    graph = scenes_of(frozen)[1].record["graphs"]["v2"]
     [system, user] = versions.load("v2").render(graph, frozen.actions, words=frozen.scenario.words)
     assert '"LANE_RIGHT":p' in system["content"]
     assert "v3 west:" in user["content"]
@@ -118,7 +120,7 @@ def test_prompts_list_its_actions_and_say_its_words(frozen, tmp_path):
 
 def test_it_is_drawn(frozen):
     picture = io.BytesIO()
-    draw(frozen.scenes[1], picture, "svg", "v2")
+    draw(scenes_of(frozen)[1], picture, "svg", "v2")
     assert picture.getvalue().startswith(b"<?xml")
 
 

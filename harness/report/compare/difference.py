@@ -1,17 +1,18 @@
 """What changed from one run to another: metrics, episodes, answers and settings."""
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
+from harness.core.multiplicity import holm, p_of_bootstrap
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.report.compare import percentiles
 from harness.report.compare.pair import Pair
-from harness.runs.metrics import SUCCESS, difference, metrics_of
+from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,16 @@ class Difference:
         b: mean of B over the same.
         change: B - A, paired by episode and seed, with a 95 % interval over episodes
             (`harness.runs.metrics.difference`); of a latency percentile, a bootstrap's.
+        p_value: of no difference, of this one alone, by its interval; None where there is none.
+        p_corrected: by Holm's method (Holm 1979) for all differences of the comparison.
     """
 
     metric: str
     a: float
     b: float
     change: Estimate
+    p_value: float | None = None
+    p_corrected: float | None = None
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,22 @@ def compare(pair: Pair) -> Comparison:
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
-        conditions=tuple(_in_condition(pair, name) for name in pair.conditions),
+        conditions=_corrected([_in_condition(pair, name) for name in pair.conditions]),
         answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
         answers_in_both=dict(Counter(a[request].role for request in both)),
     )
+
+
+def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
+    """The same, each difference with its p-value as it counts among all of them."""
+    p_values = [d.p_value for c in conditions for d in c.differences if d.p_value is not None]
+    among = iter(holm(p_values))
+    return tuple(
+        replace(c, differences=tuple(
+            d if d.p_value is None else replace(d, p_corrected=next(among)) for d in c.differences
+        ))
+        for c in conditions
+    )  # fmt: skip
 
 
 def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
@@ -142,11 +159,14 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         for metric in metrics_of(pair.a.run.world)
     ]
     differences += [
-        Difference(f"latency_p{percent}_ms", before, after, change)
+        Difference(
+            f"latency_p{percent}_ms", before, after, change,
+            p_of_bootstrap(change.value, change.low, change.high),
+        )
         for percent, before, after, change in percentiles.differences(
             pair.latencies(pair.a, condition), pair.latencies(pair.b, condition), len(pair.episodes)
         )
-    ]
+    ]  # fmt: skip
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
     return InCondition(
         condition=condition,
@@ -160,7 +180,7 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
 def _difference(metric: str, a: Floats, b: Floats) -> Difference:
     unknown = np.isnan(a) | np.isnan(b)
     before, after = (float(known_mean(known_mean(np.where(unknown, np.nan, x), 1), 0)) for x in (a, b))
-    return Difference(metric, before, after, difference(metric, b, a))
+    return Difference(metric, before, after, difference(metric, b, a), p_value(metric, b, a))
 
 
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:

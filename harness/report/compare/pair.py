@@ -18,6 +18,7 @@ from harness.report.words import facts
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.records import Episode, FrozenScenes
+from harness.world.scenario import BEACON_DIALS
 
 SETTINGS = ("model", "prompt", "answer", "thinking", "dtype", "latency", "identity", "versions")
 
@@ -38,9 +39,13 @@ class Side:
 
     @property
     def scenes(self) -> Any:
-        """What pins its scenes: the dataset's digest, or the scenario and the first layout seed."""
+        """What pins its scenes: the dataset's digest, or the scenario's layouts, of whatever beacons."""
         world = self.run.manifest.world
-        return world.sha256 if isinstance(world, FrozenScenes) else (world.scenario, world.first_seed)
+        if isinstance(world, FrozenScenes):
+            return world.sha256
+        name, parameters = world.scenario["name"].partition(":")[0], world.scenario["parameters"]
+        dials = {key: value for key, value in parameters.items() if key not in BEACON_DIALS}
+        return name, dials, world.first_seed
 
     @property
     def on(self) -> str:
@@ -129,6 +134,9 @@ def pair(a: Path, b: Path) -> Pair:
 def _side(run: Run) -> Side:
     stated = msgspec.json.decode(msgspec.json.encode(run.manifest))
     named = {key: stated[key] for key in SETTINGS}
+    if run.world == "closed-loop":
+        parameters = stated["world"]["scenario"]["parameters"]
+        named["scenario"] = {key: parameters[key] for key in BEACON_DIALS if key in parameters}
     # Through the class, which gives a setting that the run does not know the value it had then.
     points = [asdict(OperatingPoint.from_dict(condition)) for condition in stated["conditions"]]
     named["condition"] = {point["name"]: point for point in points}

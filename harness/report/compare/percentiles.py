@@ -42,9 +42,9 @@ def differences(
     for percent, x, y in zip(PERCENTILES, before, after, strict=True):
         change = y - x
         sampled = change[1:][~np.isnan(change[1:])]
-        # Resamples that all say the same tell nothing of other episodes.
-        some = n > 1 and bool(np.ptp(sampled))
-        low, high = np.percentile(sampled, (2.5, 97.5)) if some else (math.nan, math.nan)
+        low, high = np.percentile(sampled, (2.5, 97.5)) if n > 1 else (math.nan, math.nan)
+        if low == high:  # resamples that nearly all say the same tell nothing of other episodes
+            low = high = math.nan
         estimate = Estimate(float(change[0]), float(low), float(high), n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate
 

@@ -28,6 +28,7 @@ def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
     pair = comparison.pair
     yield from (f"{name}: {side}" for name, side in words.sides(pair))
+    yield from words.caveats(pair)
     yield f"paired: {words.paired(pair)}"
     yield words.differing(comparison)
     yield from (f"  {setting}" for setting in words.settings(comparison))
@@ -36,11 +37,12 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
         if len(label) > 25:
             yield label
             label = ""
-        yield f"{label:<26}{'A':>11}{'B':>11}{'B - A':>10} {'[95 % interval]':>21}"
+        yield f"{label:<26}{'A':>9}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>8}"
         for one in map(words.line, c.differences):
-            yield f"{one.metric:<26}{one.a:>11}{one.b:>11}{one.change:>10} {one.interval:>21}"
+            yield f"{one.metric:<26}{one.a:>9}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>8}"
         yield words.success(c, pair)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
+    yield words.many(comparison)
     if not comparison.answers:
         yield "answers: none changed its verdict"
     for turned, requests in words.answers_flipped(comparison, most):
@@ -56,11 +58,13 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     said = [f"### {failed} of {len(verdicts)} gates failed" if verdicts else "### Comparison of two runs", ""]
     said += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
     said += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
+    said += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
     said += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
         said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         said += [""]
+    said += [f"{words.many(comparison)}.", ""]
     said += ["<details><summary>Answers and settings</summary>", ""]
     said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
     said += [] if comparison.answers else ["- no answer changed its verdict"]
@@ -70,10 +74,10 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 
 def _table(c: InCondition) -> list[str]:
     rows = [
-        f"| {one.metric} | {one.a} | {one.b} | {one.change} | {one.interval} |"
+        f"| {one.metric} | {one.a} | {one.b} | {one.change} | {one.interval} | {one.p} |"
         for one in map(words.line, c.differences)
     ]
-    return ["| metric | A | B | B - A | 95 % interval |", "|---|--:|--:|--:|--:|", *rows]
+    return ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|", *rows]
 
 
 def code(text: str) -> str:
@@ -90,6 +94,7 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
     return {
         "a": {"run": str(pair.a.run.path), "settings": dict(pair.a.settings)},
         "b": {"run": str(pair.b.run.path), "settings": dict(pair.b.settings)},
+        "caveats": words.caveats(pair),
         "scenes": pair.a.on,
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
@@ -114,6 +119,7 @@ def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
         d.metric: {
             "a": d.a, "b": d.b, "difference": d.change.value, "low": _number(d.change.low),
             "high": _number(d.change.high), "n": d.change.n, "n_excluded": d.change.n_excluded,
+            "p": d.p_value, "p_holm": d.p_corrected,
         }
         for d in c.differences
     }  # fmt: skip

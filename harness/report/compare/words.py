@@ -4,21 +4,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
+from harness.core.multiplicity import LEVEL
+from harness.report.caveats import no_prompt, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
+from harness.report.words import p_value
 from harness.runs.metrics import unit
 
 
 @dataclass(frozen=True)
 class Line:
-    """A difference as text: the metric with its unit, both means, B - A and its interval."""
+    """A difference as text: the metric with its unit, both means, B - A, its interval and Holm's p."""
 
     metric: str
     a: str
     b: str
     change: str
     interval: str
+    p: str
 
 
 def line(d: Difference) -> Line:
@@ -33,6 +37,7 @@ def line(d: Difference) -> Line:
     return Line(
         f"{d.metric}{' %' if suffix == ' %' else ''}", f"{d.a * factor:.{digits}f}",
         f"{d.b * factor:.{digits}f}", signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
+        "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
     )  # fmt: skip
 
 
@@ -45,6 +50,15 @@ def who(side: Side) -> str:
 def sides(pair: Pair) -> list[tuple[str, str]]:
     """`A` and `B`, each with its folder and who answered."""
     return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+
+
+def caveats(pair: Pair) -> list[str]:
+    """What must be said of the runs before their numbers, with the run's letter where it is of one."""
+    sides = (("A", pair.a.run), ("B", pair.b.run))
+    return [
+        *(f"{name}: {said}" for name, run in sides for said in unread(run.scores)),
+        *no_prompt(run.manifest for _, run in sides),
+    ]
 
 
 def paired(pair: Pair) -> str:
@@ -74,9 +88,21 @@ def success(c: InCondition, pair: Pair) -> str:
     if c.test is None:
         return said
     if c.test.p_value is not None:
-        return f"{said}; McNemar's exact test over episodes p = {c.test.p_value:.3g}"
+        return f"{said}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
     ends = " to ".join(f"{100 * (end or 0.0):+.1f}" for end in (c.test.low, c.test.high))
     return f"{said}; 95 % interval over episodes {ends} points"
+
+
+def many(comparison: Comparison) -> str:
+    """How many differences were tested, how p counts that, and how many hold."""
+    p_values = [p for c in comparison.conditions for d in c.differences if (p := d.p_corrected) is not None]
+    held = sum(p <= LEVEL for p in p_values)
+    return (
+        "p goes with the interval (1 less the level at which that would just touch 0) and is corrected by "
+        f"Holm's method for the {len(p_values)} differences that have one: one or more of them is below "
+        f"{LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the tests "
+        "of success and gates are of one difference each, not corrected"
+    )
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:

@@ -8,12 +8,13 @@ function outcomes(actions) {
     o.action,
     [h("span", { class: o.safe ? "good" : "bad" }, o.safe ? "✓ safe" : "✗ unsafe"), h("small", {}, outcome(o))],
     o.delay_s == null ? "–" : `${o.delay_s.toFixed(2)} s`,
-    `${number(o.least_gap_m, 1)} m`,
+    `${number(o.time_s, 2)} s`,
   ]);
   return [
     h("h3", {}, "What each action leads to"),
-    table("outcomes", ["action", "outcome", "delay", "least gap"], rows),
-    h("p", { class: "quiet" }, "Each action once, then the full-view driver. Delay is against the best safe action."),
+    table("outcomes", ["action", "outcome", "delay", "at"], rows),
+    h("p", { class: "quiet" }, "Safe: success is still possible. The outcome is that of the full-view driver, who takes "
+      + "the rest. Delay is by how much the action puts off the earliest success."),
   ];
 }
 

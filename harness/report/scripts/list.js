@@ -48,7 +48,7 @@ class List {
       several && choice("run", "run", about.names.map((name, n) => [String(n), name]), "0", change),
       choice("seed", "seed", same(index.runs.flatMap((run) => run.seeds)), null, change),
       filter("condition", "condition", same(index.runs.flatMap((run) => run.conditions))),
-      filter("outcome", "outcome", [...outcomes, ["first", "where an episode begins to fail"]]),
+      filter("outcome", "outcome", [...outcomes, ...(live ? [["first", "where an episode begins to fail"]] : [])]),
       filter("danger", "danger", same(index.scenes.map(([, , , danger]) => danger ?? "none"))),
       filter("answers", "status", same(index.statuses.filter((_, n) => met & (1 << n)))),
       filter("differ", "differ", [

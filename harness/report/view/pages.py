@@ -11,7 +11,7 @@ from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.report.page import environment, render
 from harness.report.runs import gather
-from harness.runs.listing import Listed, runs
+from harness.runs.listing import UNREAD, Listed, runs
 
 RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
@@ -48,7 +48,7 @@ def listed(folder: Path, words: str, order: str) -> str:
     }
     return _page(
         "list.html.j2", folder=str(folder), every=len(every), runs=shown, words=words, order=order,
-        links=links, kinds=RUNS,
+        links=links, kinds=RUNS, unread=UNREAD,
     )  # fmt: skip
 
 

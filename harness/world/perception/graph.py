@@ -2,8 +2,8 @@
 
 Relative positions are in the viewer's frame: metres forward and to the left, headings in degrees
 counter-clockwise from the viewer's. Lane roles, sectors and conflicts are named from the *ego's* seat
-for every viewer, since helpers judge what the ego should do; a helper knows the ego's position and speed from
-the request, not from its sensors.
+for every viewer, since helpers judge what the ego should do; a helper knows the ego's position and speeds
+from the last beacon that it heard, not from its sensors.
 """
 
 from dataclasses import replace
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.world.beacons import known, last_heard
 from harness.world.perception.rays import blocked_by, sweep
 from harness.world.perception.sensors import Detection, detect
 from harness.world.road import Path, Road
@@ -48,7 +49,8 @@ def truth_graph(scenario: Scenario, state: WorldState) -> Graph:
 def _graph(
     road: Road, state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]
 ) -> Graph:
-    ego, zone = state.ego, road.zone_m
+    ego, zone = known(state, state.ego.id, viewer.id), road.zone_m
+    beacon = last_heard(state, ego.id, viewer.id)
     ego_arc = road.ego_path.project(ego.x_m, ego.y_m)[0]
     own = road.paths[viewer.approach, viewer.route]
     nodes, conflicts = [], []
@@ -71,7 +73,8 @@ def _graph(
         "ego": {
             "id": ego.id,
             "speed_mps": _tenths(ego.speed_mps),
-            "target_speed_mps": state.target_speed_mps,
+            "target_speed_mps": beacon.target_speed_mps if beacon else state.target_speed_mps,
+            "age_s": round(state.time_s - beacon.time_s, 2) if beacon else 0.0,
             "zone_m": _tenths(road.zone_arc_m - ego_arc),
             **_relative(viewer, ego.x_m, ego.y_m),
         },

@@ -7,9 +7,10 @@ from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
 from pkgutil import iter_modules
+from typing import Any
 
-from harness.core.errors import unknown
-from harness.world.scenario import Parameters, Scenario
+from harness.core.errors import UserError, printable, unknown
+from harness.world.scenario import BEACON_DIALS, Parameters, Scenario
 
 GROUP = "swarmdrive.scenarios"
 DEFAULT = "occluded-intersection"  # where none is named
@@ -20,8 +21,33 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({*_files(), *entry_points(group=GROUP).names}))
 
 
-def get(name: str) -> Scenario:
-    """The scenario of that name. Raises UserError if there is none."""
+def get(text: str) -> Scenario:
+    """The scenario of that name, or one with other beacons: `occluded-intersection:perfect_knowledge=true`.
+
+    Raises UserError if there is none, or no such setting, or a value is not allowed.
+    """
+    name, colon, settings = text.partition(":")
+    scenario = _named(name)
+    if not colon:
+        return scenario
+    changed: dict[str, Any] = dict(_setting(name, part) for part in settings.split(","))
+    return replace(scenario, parameters=replace(scenario.parameters, **changed))
+
+
+def _setting(scenario: str, text: str) -> tuple[str, bool | float]:
+    key, _, value = text.partition("=")
+    if key not in BEACON_DIALS:
+        example = f"; as in {scenario}:perfect_knowledge=true"
+        raise unknown(f"setting of scenario {scenario}", key, BEACON_DIALS, example)
+    if key == "perfect_knowledge" and value in ("true", "false"):
+        return key, value == "true"
+    try:
+        return key, float(value)
+    except ValueError:
+        raise UserError(f"scenario {scenario}: {key} is {printable(value)!r}; give a number") from None
+
+
+def _named(name: str) -> Scenario:
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario

@@ -1,10 +1,13 @@
 """Scenario `occluded-intersection`: who stands where at the start of an episode.
 
 The ego comes from the south at 14 m/s and goes straight. Buildings on the four corners hide the crossing
-road. At most one vehicle is dangerous: timed to meet a cruising ego at the conflict point, from the left,
-from the right, or oncoming and turning left across the ego's path right behind a truck that hides it.
-Three helpers have just left the junction on the three other arms and see what comes towards it there.
-Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
+road, and a truck that comes towards the ego hides what follows it. At most one vehicle is dangerous: timed to
+meet a cruising ego at the conflict point, from the left, from the right, or oncoming and turning left across
+the ego's path right behind the truck. Three helpers have just left the junction on the three other arms and
+see what comes towards it there. Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
+
+What the ego can see before it is too late (buildings, helpers, the truck, a car that passes later) is drawn
+without knowing of the danger. Where the two would touch, the danger gives way: it comes later.
 """
 
 from collections.abc import Sequence
@@ -17,10 +20,12 @@ from harness.core import noise
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
-from harness.world.state import Building, Kind
+from harness.world.state import SIZES_M, Building, Kind
 
 NAME = "occluded-intersection"
 BUILDING_END_M = 70.0  # outer walls, from the centre lines
+ROUTES = {"left": "straight", "right": "straight", "oncoming": "left"}  # of what comes from a sector
+SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that crosses behind it
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,15 @@ class Parameters(Common):
         cleared_m: arc length behind the junction's exit at which the ego's centre has cleared it.
         danger_share: probability that an episode holds a danger.
         sector_shares: probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33).
-        danger_offset_s: when the danger reaches the conflict point, after a cruising ego would.
-        crossing_speed_mps: speed of a danger from the left or right.
-        turning_speed_mps: speed of an oncoming danger, and of the truck in front of it.
+        danger_offset_s: when a danger from a side reaches the conflict point, after a cruising ego would; as
+            soon as the truck has passed, if that is later.
+        crossing_speed_mps: speed of a car from a side, dangerous or not.
+        truck_offset_s: when the truck passes where an oncoming danger would meet the ego, after a cruising
+            ego would.
+        truck_speed_mps: speed of the truck, and of an oncoming car, dangerous or not.
+        follow_m: from the truck's centre to that of an oncoming danger behind it.
         corner_m: distance of a building's walls from the centre lines.
-        truck_share: probability of an oncoming truck where it is not part of the danger.
-        late_share: probability of a harmless car that crosses long after.
-        late_speed_mps: its speed.
+        late_share: probability of a harmless car that comes as a danger would, from any sector, but later.
         late_offset_s: when that car reaches the conflict point, after a cruising ego would.
         helper_start_m: how far behind the junction helpers are at the start.
         helper_speed_mps: speed at which they leave.
@@ -53,14 +60,14 @@ class Parameters(Common):
     cleared_m: float = 2.5
     danger_share: float = 0.75
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
-    danger_offset_s: tuple[float, float] = (-0.4, 1.2)
-    crossing_speed_mps: tuple[float, float] = (9.0, 13.0)
-    turning_speed_mps: tuple[float, float] = (7.5, 8.5)
-    corner_m: tuple[float, float] = (8.0, 18.0)
-    truck_share: float = 0.5
+    danger_offset_s: tuple[float, float] = (-0.4, 0.9)
+    crossing_speed_mps: tuple[float, float] = (8.5, 12.5)
+    truck_offset_s: tuple[float, float] = (-2.3, -1.9)
+    truck_speed_mps: tuple[float, float] = (7.5, 8.5)
+    follow_m: tuple[float, float] = (10.5, 13.0)
+    corner_m: tuple[float, float] = (8.0, 15.0)
     late_share: float = 0.4
-    late_speed_mps: tuple[float, float] = (7.0, 9.0)
-    late_offset_s: tuple[float, float] = (5.0, 8.0)
+    late_offset_s: tuple[float, float] = (4.0, 7.0)
     helper_start_m: tuple[float, float] = (2.0, 8.0)
     helper_speed_mps: tuple[float, float] = (4.0, 7.0)
 
@@ -83,30 +90,32 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     start = between("ego_start", p.ego_start_m)
     # The centroid of the conflict zone lies 1.46 m before the ego's farthest conflict point.
     ego_arc = crossings["right", "straight"].ego_arc_m - 1.46 - start
-    offset = between("danger_offset", p.danger_offset_s)
 
-    def timed(approach: str, route: str, speed: float, late: float) -> float:
-        """Arc length from which a vehicle is at the conflict point `late` s after a cruising ego."""
-        at = crossings[approach, route]
+    def timed(approach: str, speed: float, late: float) -> float:
+        """Arc length from which a vehicle is at its conflict point `late` s after a cruising ego."""
+        at = crossings[approach, ROUTES[approach]]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
-    turning = between("turning_speed", p.turning_speed_mps)
-    turner_arc = timed("oncoming", "left", turning, offset if danger == "oncoming" else 0.0)
-    others: dict[str, tuple[Kind, str, str, float, float]] = {}
-    if danger in ("left", "right"):
-        speed = between("crossing_speed", p.crossing_speed_mps)
-        others["danger"] = ("car", danger, "straight", timed(danger, "straight", speed, offset), speed)
+    truck_speed = between("truck_speed", p.truck_speed_mps)
+    truck_arc = timed("oncoming", truck_speed, between("truck_offset", p.truck_offset_s))
+    others: dict[str, tuple[Kind, str, str, float, float]] = {
+        "truck": ("truck", "oncoming", "straight", truck_arc, truck_speed)
+    }
     if danger == "oncoming":
-        others["danger"] = ("car", "oncoming", "left", turner_arc, turning)
-    if danger == "oncoming" or draw("truck") < p.truck_share:
-        # A crossing danger would meet a truck that is early: there it comes far enough behind.
-        behind = 45.0 if danger in ("left", "right") else 0.0
-        others["truck"] = ("truck", "oncoming", "straight", turner_arc + 10.5 - behind, turning)
+        arc = truck_arc - between("follow", p.follow_m)
+        others["danger"] = ("car", danger, ROUTES[danger], arc, truck_speed)
+    elif danger:
+        speed = between("crossing_speed", p.crossing_speed_mps)
+        ego_s = (crossings[danger, ROUTES[danger]].ego_arc_m - ego_arc) / p.ego_speed_mps
+        soonest, latest = p.danger_offset_s
+        soonest = max(soonest, behind_truck_s(danger, speed, truck_arc, truck_speed) - ego_s)
+        offset = between("danger_offset", (soonest, max(soonest, latest)))
+        others["danger"] = ("car", danger, ROUTES[danger], timed(danger, speed, offset), speed)
     if draw("late") < p.late_share:
-        arm = ("left", "right")[int(draw("late_arm") < 0.5)]
-        speed = between("late_speed", p.late_speed_mps)
-        arc = timed(arm, "straight", speed, between("late_offset", p.late_offset_s))
-        others["late"] = ("car", arm, "straight", arc, speed)
+        arm = SECTORS[int(draw("late_sector") * len(SECTORS))]
+        speed = between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
+        arc = timed(arm, speed, between("late_offset", p.late_offset_s))
+        others["late"] = ("car", arm, ROUTES[arm], arc, speed)
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
@@ -131,6 +140,24 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         ys = sorted((south * between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
         buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
     return Layout(tuple(spawns), tuple(buildings), danger, ids["danger"] if danger else None)
+
+
+def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:
+    """When a car from a side is at its conflict point, at the soonest, if it passes behind the truck.
+
+    Seconds from the start. Their ways cross at a right angle and both keep their speed, so they touch if both
+    are on the crossing at once.
+    """
+    at, truck, car = (
+        road().crossings[approach, "straight"],
+        road().paths["oncoming", "straight"],
+        road().paths[approach, "straight"],
+    )
+    where = truck.points[0, 0], at.y_m
+    truck_s = (truck.project(*where)[0] - truck_arc_m) / truck_mps
+    (car_length, car_width), (truck_length, truck_width) = SIZES_M["car"], SIZES_M["truck"]
+    apart_s = (car_length + truck_width) / 2 / speed_mps + (truck_length + car_width) / 2 / truck_mps
+    return truck_s + apart_s + SPARE_S + (at.other_arc_m - car.project(*where)[0]) / speed_mps
 
 
 def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:

@@ -1,0 +1,61 @@
+"""A dataset many times over, for benchmarks: every copy has other episodes, and other prompts."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from msgspec import structs
+
+from harness.dataset.load import Dataset, Scene
+from harness.dataset.schema import Branching, Tree
+
+
+@dataclass(frozen=True)
+class Copies(Dataset):
+    """Copies of a dataset. The ego's distance to the zone, which every prompt states, differs by a decimetre.
+
+    Attributes:
+        original: the dataset.
+    """
+
+    original: Dataset | None = field(default=None, compare=False)
+
+    def scenes(self, ids: Sequence[str]) -> list[Scene]:
+        """The scenes of decision points, made anew, so that nothing is remembered."""
+        return [self._copied(name) for name in ids]
+
+    def _copied(self, name: str) -> Scene:
+        assert self.original is not None
+        apart = len(self.original.trees)
+        again = int(name[:5]) // apart
+        [scene] = self.original.scenes([shifted(name, -again * apart)])
+        record: dict[str, Any] = copy.deepcopy(scene.record)
+        record |= {"scene": name, "episode": int(name[:5])}
+        record["episode_seed"] += again * apart
+        for graph in record["graphs"].values():
+            graph["ego"]["zone_m"] = round(graph["ego"]["zone_m"] + again / 10, 1)
+        return Scene(record)
+
+
+def copies(dataset: Dataset, n: int) -> Copies:
+    """The dataset n times."""
+    apart = len(dataset.trees)
+    trees = tuple(_tree(tree, again * apart) for again in range(n) for tree in dataset.trees)
+    return Copies(dataset.path, dataset.manifest, dataset.sha256, trees, dataset.trusted, original=dataset)
+
+
+def _tree(tree: Tree, by: int) -> Tree:
+    def moved(point: Branching) -> Branching:
+        return structs.replace(point, scene=shifted(point.scene, by))
+
+    return structs.replace(
+        tree, episode=tree.episode + by, episode_seed=tree.episode_seed + by,
+        levels=[list(map(moved, level)) for level in tree.levels],
+    )  # fmt: skip
+
+
+def shifted(scene: str, by: int) -> str:
+    """A scene's id in an episode that much further."""
+    episode, _, rest = scene.partition("-")
+    return f"{int(episode) + by:05d}-{rest}"

@@ -1,0 +1,47 @@
+"""What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from harness.backends.registry import find
+from harness.core.errors import printable
+from harness.runs.listing import UNREAD
+from harness.runs.metrics import ALL
+from harness.runs.records import Manifest, Score
+
+# By role: whose answers, and what takes their place.
+_FAILED = {
+    "ego": ("the ego's", "it drives by the fallback, and success says little of the model"),
+    "helper": ("the helpers'", "they send no message"),
+    "merge": ("the fusion calls'", "the ego keeps the policy it had without them"),
+}
+
+
+def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
+    """Sentences for a run's headline; none for a language model whose answers could be read."""
+    return [*unread(scores), *no_prompt([manifest])]
+
+
+def unread(scores: Sequence[Score]) -> Iterator[str]:
+    """Whose answers could not be read, half of them or more, and what takes their place."""
+    failed = {s.metric: s for s in scores if s.condition == ALL}
+    for role, (whose, instead) in _FAILED.items():
+        score = failed.get(f"failed_rate_{role}")
+        if score is not None and score.value is not None and score.value >= UNREAD:
+            share = "None" if score.value == 1 else f"Only {100 * (1 - score.value):.1f} %"
+            yield f"{share} of {whose} {score.n} answers could be read: {instead}."
+
+
+def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
+    """One sentence about the runs whose model reads no prompt; empty where there are none."""
+    rules = [
+        manifest.variant for manifest in manifests
+        if (engine := find(str(manifest.model.get("engine")))) and not engine.capabilities.language_model
+    ]  # fmt: skip
+    models = list(dict.fromkeys(printable(rule.model, 30) for rule in rules))
+    versions = " or ".join(dict.fromkeys(printable(rule.prompt, 20) for rule in rules))
+    if not models:
+        return []
+    if len(models) == 1:
+        return [f"{models[0]} reads no prompt: it decides by the scene graph, whatever {versions} says."]
+    names = f"{', '.join(models[:-1])} and {models[-1]}"
+    return [f"{names} read no prompt: they decide by the scene graph, whatever {versions} says."]

@@ -1,0 +1,116 @@
+"""What is said before a run's numbers: its answers could not be read, or its model reads no prompt."""
+
+import json
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+from msgspec.structs import replace
+
+from harness.coordination.operating_point import POINTS
+from harness.dataset.load import Dataset
+from harness.evaluate.run import Evaluated
+from harness.report.caveats import caveats, no_prompt
+from harness.runs.records import Manifest, Score
+
+Said = tuple[int, str, str]
+NO_PROMPT = "proxy reads no prompt: it decides by the scene graph, whatever v2 says."
+UNREAD = "None of the ego's 24 answers could be read: it drives by the fallback"
+CARD = """engine = "proxy"
+description = "nothing it says can be read"
+[latency]
+source = "card"
+basis = "declared"
+inference_s = 0.1
+[failures]
+nan = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    points = (POINTS["single-local"], POINTS["6g"])
+    return evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path_factory.mktemp("sound") / "run")
+
+
+def with_engine(done: Evaluated, engine: str) -> Manifest:
+    return replace(done.manifest, model={**done.manifest.model, "engine": engine})
+
+
+def share(metric: str, value: float) -> Score:
+    return Score("all", metric, value, None, None, 1440, 0, "answers")
+
+
+def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
+    language_model = with_engine(done, "llama-cpp")
+
+    def told(*scores: Score) -> list[str]:
+        return caveats(language_model, scores)
+
+    assert told() == []
+    assert told(share("failed_rate_ego", 0.49)) == []
+    assert told(share("failed_rate_ego", 0.5)) == [
+        "Only 50.0 % of the ego's 1440 answers could be read: it drives by the fallback, and success says "
+        "little of the model."
+    ]
+    assert [line.split(":")[0] for line in told(
+        share("failed_rate_ego", 1.0), share("failed_rate_helper", 1.0), share("failed_rate_merge", 0.984)
+    )] == [
+        "None of the ego's 1440 answers could be read", "None of the helpers' 1440 answers could be read",
+        "Only 1.6 % of the fusion calls' 1440 answers could be read",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ["proxy", "driver"])
+def test_a_rule_reads_no_prompt_and_says_so(done: Evaluated, engine: str) -> None:
+    assert caveats(with_engine(done, engine), done.scores) == [NO_PROMPT]
+
+
+def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
+    def under(prompt: str, model: str = "proxy") -> Manifest:
+        manifest = done.manifest
+        names = {"model": {**manifest.model, "name": model}, "prompt": {**manifest.prompt, "version": prompt}}
+        return replace(manifest, **names)
+
+    assert no_prompt([under("v1"), under("v2")]) == [NO_PROMPT.replace("v2", "v1 or v2")]
+    assert no_prompt([under("v2", "cruise"), under("v2", "brake"), done.manifest]) == [
+        "cruise, brake and proxy read no prompt: they decide by the scene graph, whatever v2 says."
+    ]
+    assert no_prompt([with_engine(done, "llama-cpp"), done.manifest]) == [NO_PROMPT]
+
+
+def test_an_engine_that_is_not_here_is_not_judged(done: Evaluated) -> None:
+    assert caveats(with_engine(done, "elsewhere"), done.scores) == []
+
+
+def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
+    small_path: Path, harness: Callable[..., Said]
+) -> None:
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    Path("models/mute.toml").write_text(CARD)
+    options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g")
+    code, out, err = harness("eval", "--model", "mute", *options, "--out", "reports/mute")
+    assert (code, err) == (0, "")
+    said = " ".join(out.split())
+    assert said.index(UNREAD) < said.index("condition")
+    assert "mute reads no prompt: it decides by the scene graph, whatever v2 says." in said
+    assert "None of the helpers' 72 answers could be read: they send no message." in said
+    page = unescape(Path("reports/mute/report.html").read_text())
+    assert page.index(UNREAD) < page.index("With mute, 6g clears")
+    assert "none of the ego's answers could be read: it drives by the fallback" in harness("ls")[1]
+    sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
+    code, out, err = harness("eval", "--model", "proxy", *options, *sound)
+    assert json.loads(out)["caveats"] == [NO_PROMPT.replace("v2", "v1")]
+    assert "answers could be read" not in unescape(Path("reports/sound/report.html").read_text())
+    both = ("reports/mute", "reports/sound")
+    assert f"A: {UNREAD}" in " ".join(harness("compare", *both)[1].split())
+    assert f"A: {UNREAD}" in harness("compare", *both, "--markdown")[1]
+    assert json.loads(harness("compare", *both, "--json")[1])["caveats"][0].startswith(f"A: {UNREAD}")
+    assert harness("compare", *both, "--html", "both.html")[0] == 0
+    assert f"A: {UNREAD}" in unescape(Path("both.html").read_text())
+    assert harness("report", *both, "--out", "matrix.html")[0] == 0
+    assert f": {UNREAD}" in unescape(Path("matrix.html").read_text())
