@@ -143,7 +143,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "short", context_tokens=750)
+    return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "short", context_tokens=680)
 
 
 def test_a_way_that_a_model_cannot_answer_in_is_said_and_the_others_are_timed(

@@ -10,6 +10,7 @@ import pytest
 from evaluating import decisions, figure, run, spec_of
 from run_on_disk import answers_of
 
+from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.run import Evaluated
@@ -36,23 +37,16 @@ def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
 
 
 def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
-    """Hidden: some action crashes into a vehicle that the ego does not see. Clear: nothing is hidden, and
-    no action crashes."""
-    hidden, clear = [], []
+    """Hidden: the ego does not see the danger, and a sector of its view is occluded."""
     said = [d for d in decisions(done.out, "single-local") if d.seed == 0]  # nothing of it depends on luck
-    forest = shipped.forest
+    hidden = []
     for scene, decision in zip(shipped.scenes([d.scene for d in said]), said, strict=True):
-        graph = scene.record["graphs"][scene.state.ego.id]
-        ends = forest.then_full_view[forest.place[scene.id]].tolist()
-        crashes = [forest.end(edge).result == "collision" for edge in ends]
-        seen = scene.record["danger"]["vehicle"] in {node["id"] for node in graph["nodes"]}
-        if scene.record["danger"]["vehicle"] and any(crashes) and not seen:
+        graph, danger = scene.record["graphs"][scene.state.ego.id], scene.record["danger"]["vehicle"]
+        seen = danger in {node["id"] for node in graph["nodes"]}
+        if danger and not seen and any(sector["occluded"] for sector in graph["sectors"]):
             hidden.append(decision.entropy_nats)
-        elif not any(crashes) and not any(sector["occluded"] for sector in graph["sectors"]):
-            clear.append(decision.entropy_nats)
-    assert len(hidden) >= 10
-    assert len(clear) >= 20
-    assert np.mean(hidden) > np.mean(clear) + 0.05
+    assert len(hidden) >= 50
+    assert np.mean(hidden) > POINTS["6g"].tau_nats, "so that it asks for help"
 
 
 def test_its_helpers_messages_help(done: Evaluated) -> None:

@@ -283,13 +283,6 @@ class Manifest(Closed, frozen=True):
     files: dict[FileName, Sha256]
     trees_sha256: list[Sha256]
 
-    def number(self, parameter: str) -> float:
-        """A scenario parameter that is one number."""
-        value = self.parameters[parameter]
-        if isinstance(value, list):
-            raise TypeError(f"{parameter} is a list")
-        return value
-
 
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
