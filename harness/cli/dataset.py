@@ -112,36 +112,32 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: option
 
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     data = load.load(load.find(dataset))
-    from harness.studies.rank import rank, ranks_agree
+    from harness.studies.rank import rank
 
     episodes = data.manifest.episodes
     with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
         standings = rank(data, workers, progress)
-    agree = ranks_agree(standings)
     if as_json:
-        echo_json(_as_mapping(data.name, episodes, agree, standings))
+        echo_json(_as_mapping(data.name, episodes, standings))
     else:
-        _table(episodes, agree, standings)
+        _table(episodes, standings)
 
 
-def _as_mapping(name: str, episodes: int, agree: bool, standings: dict[str, "Standing"]) -> dict[str, Any]:
+def _as_mapping(name: str, episodes: int, standings: dict[str, "Standing"]) -> dict[str, Any]:
     drivers = {
         driver: {k: as_mapping(getattr(s, k)) for k in ("frozen", "live", "difference_points", "agreement")}
         for driver, s in standings.items()
     }
-    return {"dataset": name, "episodes": episodes, "ranks_agree": agree, "drivers": drivers}
+    return {"dataset": name, "episodes": episodes, "drivers": drivers}
 
 
-def _table(episodes: int, agree: bool, standings: dict[str, "Standing"]) -> None:
+def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
     heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
     rows = []
     for driver, s in standings.items():
         agreement = f"{100 * s.agreement.value:.0f}"
         rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
-    order = "the same order" if agree else "another order"
     text = console()
-    text.print(
-        f"n = {episodes} episodes; frozen and in closed loop the {len(standings)} drivers have {order}"
-    )
+    text.print(f"n = {episodes} episodes; same: how many of them end alike, frozen and driven")
     text.print("so few are no rank correlation: that these scenes rank models takes runs, `harness fidelity`")

@@ -6,7 +6,7 @@ target speed are one edge. So the tree of six decisions has some hundred decisio
 is an episode that is decided.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,18 +26,20 @@ Record = dict[str, Any]
 
 def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branching]], list[list[Record]]]:
     """The decision tree of a layout, and the scene of each of its decision points, both level by level."""
-    world = World.start(scenario, seed)
-    level = {scene_id(episode, world.state()): world}
+    level = [World.start(scenario, seed)]
     branchings, scenes = [], []
     while level:
         following: dict[str, World] = {}
-        records = [_record(world, episode) for world in level.values()]
+        records, points = [], []
+        for world in level:
+            state = world.state()
+            record = _record(world, state, episode)
+            drivers = _drivers(scenario, state, record["graphs"][state.ego.id])
+            points.append(Branching(record["scene"], drivers, list(_edges(world, episode, following))))
+            records.append(record)
         scenes.append(records)
-        branchings.append([
-            Branching(record["scene"], _drivers(world, record), list(_edges(world, episode, following)))
-            for world, record in zip(level.values(), records, strict=True)
-        ])  # fmt: skip
-        level = following
+        branchings.append(points)
+        level = list(following.values())
     return branchings, scenes
 
 
@@ -67,15 +69,13 @@ def _edges(world: World, episode: int, following: dict[str, World]) -> Iterator[
         yield Edge(actions, to, end, gap_m, branch.hard_brakings, outcome.other_crashes)
 
 
-def _drivers(world: World, record: Record) -> dict[str, str]:
-    """What each reference driver does at a decision point."""
-    state = world.state()
-    seen, truth = record["graphs"][state.ego.id], truth_graph(world.scenario, state)
-    return {driver: choose(world.scenario, driver, seen, truth) for driver in DRIVERS}
+def _drivers(scenario: Scenario, state: WorldState, seen: Mapping[str, Any]) -> dict[str, str]:
+    """What each reference driver does at a decision point; `seen` is the ego's scene graph."""
+    truth = truth_graph(scenario, state)
+    return {driver: choose(scenario, driver, seen, truth) for driver in DRIVERS}
 
 
-def _record(world: World, episode: int) -> Record:
-    state = world.state()
+def _record(world: World, state: WorldState, episode: int) -> Record:
     return {
         **moment(world, state, episode, (state.ego, *state.helpers)),
         "road": world.scenario.road().facts,

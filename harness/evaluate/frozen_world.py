@@ -61,17 +61,14 @@ class _Walks:
     Attributes:
         at: the decision point of each, among the forest's; -1 once the episode is decided.
         last: the edge taken last.
-        least_gap_m: so far.
-        hard_brakings: so far.
-        other_crashes: so far.
+        edges: those taken, an array a step; -1 where the episode was decided.
         dropped: walks that are left out.
     """
 
     def __init__(self, seeds: int, root: Ints) -> None:
         shape = seeds, len(root)
         self.at, self.last = np.tile(root, (seeds, 1)), np.full(shape, -1)
-        self.least_gap_m = np.full(shape, np.inf)
-        self.hard_brakings, self.other_crashes = np.zeros(shape, dtype=int), np.zeros(shape, dtype=int)
+        self.edges: list[Ints] = []
         self.dropped = np.zeros(shape, dtype=bool)
 
 
@@ -84,11 +81,7 @@ class FrozenWorld:
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
         self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
-        self._columns: list[dict[str, Any]] = []
-        edges = self._forest.edges
-        self._gap_m = np.array([edge.least_gap_m for edge in edges])
-        self._hard_brakings = np.array([edge.hard_brakings for edge in edges])
-        self._other_crashes = np.array([edge.other_crashes for edge in edges])
+        self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
 
     def observe(self) -> Sequence[Scene]:
         """Every decision point to which some walk has come."""
@@ -119,31 +112,30 @@ class FrozenWorld:
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Take the edge of each action."""
-        forest, p = self._forest, self._dataset.scenario.parameters
         for part in decided:
             walks, action = self._walks[part.point.name], part.result.action
-            place = np.nonzero(walks.at >= 0)
-            at = walks.at[place]
-            edge = forest.edge[at, action]
-            walks.last[place] = edge
-            walks.least_gap_m[place] = np.minimum(walks.least_gap_m[place], self._gap_m[edge])
-            walks.hard_brakings[place] += self._hard_brakings[edge]
-            walks.other_crashes[place] += self._other_crashes[edge]
-            walks.at[place] = forest.child[at, action]
-            latency_s = part.result.latency_s
-            off_lag = [frames(each, p.simulation_hz) != p.lag_frames for each in np.nan_to_num(latency_s)]
-            self._columns.append({
-                "value": forest.value[at], "safe": forest.safe[at, action],
-                "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
-                "delay_s": forest.delay_s[at, action],
-                "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
-                **by_action("safe", forest.safe[at], forest.actions),
-                **by_action("delay_s", forest.delay_s[at], forest.actions),
-            })  # fmt: skip
+            going = walks.at >= 0
+            at = walks.at[going]
+            taken = np.full_like(walks.at, -1)
+            taken[going] = self._forest.edge[at, action]
+            walks.edges.append(taken)
+            walks.last[going] = taken[going]
+            walks.at[going] = self._forest.child[at, action]
+            self._decided.append((at, action, part.result.latency_s))
 
     def columns(self) -> dict[str, Any]:
         """What each decision was worth, and every other action, in the order of decisions."""
-        return {name: np.concatenate([each[name] for each in self._columns]) for name in self._columns[0]}
+        at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
+        forest, p = self._forest, self._dataset.scenario.parameters
+        off_lag = [frames(each, p.simulation_hz) != p.lag_frames for each in np.nan_to_num(latency_s)]
+        return {
+            "value": forest.value[at], "safe": forest.safe[at, action],
+            "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
+            "delay_s": forest.delay_s[at, action],
+            "off_lag": np.where(np.isnan(latency_s), np.nan, off_lag),
+            **by_action("safe", forest.safe[at], forest.actions),
+            **by_action("delay_s", forest.delay_s[at], forest.actions),
+        }  # fmt: skip
 
     @property
     def numbers(self) -> Ints:
@@ -169,6 +161,7 @@ class FrozenWorld:
     def _episode(self, condition: str, walks: _Walks, place: tuple[int, ...]) -> Episode:
         seed, tree = place
         forest, last = self._forest, int(walks.last[place])
+        edges = [forest.edges[taken[place]] for taken in walks.edges if taken[place] >= 0]
         end, reference_s = forest.end(last), float(forest.reference_s[tree])
         cleared = end.result == "cleared"
         success = bool(forest.succeeds(np.array(last), np.array(tree)))
@@ -178,6 +171,7 @@ class FrozenWorld:
             failure="" if success else "late" if cleared else end.result,
             delay_s=round(end.time_s - reference_s, 3) if cleared and np.isfinite(reference_s) else None,
             time_s=end.time_s, partner=end.partner, striker=end.striker, fault=end.fault,
-            least_gap_m=float(walks.least_gap_m[place]), hard_brakings=int(walks.hard_brakings[place]),
-            other_crashes=int(walks.other_crashes[place]),
+            least_gap_m=min(edge.least_gap_m for edge in edges),
+            hard_brakings=sum(edge.hard_brakings for edge in edges),
+            other_crashes=sum(edge.other_crashes for edge in edges),
         )  # fmt: skip

@@ -12,6 +12,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.walk import Ask, World, columns, walk
+from harness.runs.decisions import DECIMALS
 from harness.runs.metrics import (
     METRICS,
     PERCENTILES,
@@ -81,13 +82,15 @@ class Source(Protocol):
 def walk_through(
     world: World[Any], point: OperatingPoint, ask: Ask[Any], seeds: Sequence[int], episodes: Ints
 ) -> tuple[dict[str, Floats], Ints]:
-    """The `columns` and `places` of a world's decisions; `episodes` (E,) ascending."""
+    """The `columns` and `places` of a world's decisions, rounded as rows are; `episodes` (E,) ascending."""
     decided = list(chain.from_iterable(walk(world, [point], ask)))
     parts = [columns(part) for part in decided]
     of_seed = {seed: place for place, seed in enumerate(seeds)}
     row = np.array([of_seed[seed] for part in decided for seed in part.due.seed.tolist()])
     column = np.searchsorted(episodes, np.concatenate([part.due.episode for part in decided]))
     joint = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name in joint.keys() & DECIMALS.keys():
+        joint[name] = joint[name].round(DECIMALS[name])
     return joint, row * len(episodes) + column
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 
@@ -40,14 +39,6 @@ def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dic
         driver: _standing(dataset.forest.driver_success(driver), np.array([o[driver].success for o in live]))
         for driver in DRIVERS
     }
-
-
-def ranks_agree(standings: dict[str, Standing]) -> bool:
-    """Whether no pair of drivers stands one way frozen and the other way live; a tie goes with either."""
-    return all(
-        (a.frozen.value - b.frozen.value) * (a.live.value - b.live.value) >= 0
-        for a, b in combinations(standings.values(), 2)
-    )
 
 
 def _standing(frozen: Bools, live: Bools) -> Standing:

@@ -66,14 +66,14 @@ def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     assert (code, out.splitlines()[0]) == (0, f"two-v1 is sound: 2 layouts, {nodes} decision points")
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")
     ranked = json.loads(out)
-    assert (code, ranked["episodes"], ranked["ranks_agree"]) == (0, 2, True)
+    assert (code, ranked["episodes"]) == (0, 2)
     success = {driver: of["frozen"]["value"] for driver, of in ranked["drivers"].items()}
     assert (success["brake"], success["full-view"]) == (0.0, 1.0)
     for of in ranked["drivers"].values():
         assert of["frozen"]["value"] == of["live"]["value"]
         assert (of["difference_points"]["value"], of["agreement"]["value"]) == (0.0, 1.0)
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1)
-    assert "n = 2 episodes; frozen and in closed loop the 4 drivers have the same order" in out
+    assert "n = 2 episodes; same: how many of them end alike" in out
     assert "so few are no rank correlation" in out
     assert max(map(len, out.splitlines())) <= 80
 

@@ -365,33 +365,24 @@ def test_a_scene_that_is_not_what_it_should_be_is_named_and_never_used(copy, wha
         use(copy)
 
 
-def set_tree(*keys, value):
-    def change(tree):
-        for key in keys[:-1]:
-            tree = tree[key]
-        tree[keys[-1]] = value
-
-    return change
-
-
 HOSTILE_TREES = {
-    "another episode": set_tree("episode", value=2),
-    "another seed": set_tree("episode_seed", value=5),
-    "an edge to nowhere": set_tree("levels", 0, 0, "edges", 0, "to", value=99),
-    "an edge that neither leads on nor ends": set_tree("levels", 0, 0, "edges", 0, "to", value=None),
-    "an edge that leads on after the last level": set_tree("levels", 5, 0, "edges", 0, "to", value=0),
-    "a negative place": set_tree("levels", 0, 0, "edges", 0, "to", value=-1),
-    "an action that is not one": set_tree("levels", 0, 0, "edges", 0, "actions", value=["JUMP"]),
-    "an action twice": set_tree("levels", 0, 0, "edges", 0, "actions", value=["IDLE"]),
-    "no edges": set_tree("levels", 0, 0, "edges", value=[]),
-    "no levels": set_tree("levels", value=[]),
-    "a driver that jumps": set_tree("levels", 0, 0, "drivers", "full-view", value="JUMP"),
-    "no drivers": set_tree("levels", 0, 0, "drivers", value={}),
-    "an id with a path": set_tree("levels", 0, 0, "scene", value="../../etc"),
-    "an id of another step": set_tree("levels", 0, 0, "scene", value="00001-3-0123456789ab"),
-    "an unknown end": set_tree("levels", 5, 0, "edges", 0, "end", "result", value="won"),
-    "a time out of this world": set_tree("levels", 5, 0, "edges", 0, "end", "time_s", value=1e300),
-    "an unknown field": set_tree("more", value=1),
+    "another episode": at("episode", value=2),
+    "another seed": at("episode_seed", value=5),
+    "an edge to nowhere": at("levels", 0, 0, "edges", 0, "to", value=99),
+    "an edge that neither leads on nor ends": at("levels", 0, 0, "edges", 0, "to", value=None),
+    "an edge that leads on after the last level": at("levels", 5, 0, "edges", 0, "to", value=0),
+    "a negative place": at("levels", 0, 0, "edges", 0, "to", value=-1),
+    "an action that is not one": at("levels", 0, 0, "edges", 0, "actions", value=["JUMP"]),
+    "an action twice": at("levels", 0, 0, "edges", 0, "actions", value=["IDLE"]),
+    "no edges": at("levels", 0, 0, "edges", value=[]),
+    "no levels": at("levels", value=[]),
+    "a driver that jumps": at("levels", 0, 0, "drivers", "full-view", value="JUMP"),
+    "no drivers": at("levels", 0, 0, "drivers", value={}),
+    "an id with a path": at("levels", 0, 0, "scene", value="../../etc"),
+    "an id of another step": at("levels", 0, 0, "scene", value="00001-3-0123456789ab"),
+    "an unknown end": at("levels", 5, 0, "edges", 0, "end", "result", value="won"),
+    "a time out of this world": at("levels", 5, 0, "edges", 0, "end", "time_s", value=1e300),
+    "an unknown field": at("more", value=1),
 }
 
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from harness.core.statistics import Estimate
 from harness.dataset.forest import Forest
 from harness.dataset.load import Dataset
 from harness.dataset.schema import Branching, Danger, Edge, End, Tree
-from harness.studies.rank import Standing, ranks_agree
 
 STOP, GO = ACTIONS = ("STOP", "GO")
 
@@ -112,20 +110,3 @@ def test_no_driver_beats_the_best_policy(small: Dataset) -> None:
     for driver in small.forest.drivers:
         assert (small.forest.driver_success(driver) <= best).all()
     assert small.forest.driver_success("full-view").mean() > small.forest.driver_success("cruise").mean()
-
-
-def standing(frozen, live):
-    nothing = Estimate(0.0, 0.0, 0.0, 1, 0)
-    return Standing(Estimate(frozen, 0, 1, 9, 0), Estimate(live, 0, 1, 9, 0), nothing, nothing)
-
-
-@pytest.mark.parametrize(
-    ("shares", "agree"),
-    [
-        ([(0.9, 0.8), (0.5, 0.4), (0.0, 0.0)], True),
-        ([(0.9, 0.8), (0.5, 0.85)], False),
-        ([(0.9, 0.8), (0.9, 0.5)], True),
-    ],
-)
-def test_ranks_agree_unless_some_pair_stands_the_other_way(shares, agree):
-    assert ranks_agree({str(n): standing(*pair) for n, pair in enumerate(shares)}) is agree
