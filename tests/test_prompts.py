@@ -265,16 +265,20 @@ def test_every_version_here_is_released() -> None:
 
 
 def test_a_version_says_whether_reasons_come_first_and_v1_was_released_before_it_could(copied: Path) -> None:
-    assert {name: prompts.load(name).reasons_first for name in ("v1", "v2")} == {"v1": True, "v2": False}
+    asked = {name: prompts.load(name).reasons_first for name in ("v1", "v2", "paper")}
+    assert asked == {"v1": ("ego", "helper"), "v2": (), "paper": ("ego",)}
     shutil.copytree(copied / "v2", copied / "v9")
     toml = copied / "v9/prompt.toml"
-    toml.write_text(toml.read_text(encoding="utf-8") + "reasons_first = true\n", encoding="utf-8")
-    assert prompts.load("v9", copied).reasons_first
+    toml.write_text(toml.read_text(encoding="utf-8") + 'reasons_first = ["helper"]\n', encoding="utf-8")
+    assert prompts.load("v9", copied).reasons_first == ("helper",)
 
 
-@pytest.mark.parametrize(("version", "status"), [("v1", "strict"), ("v2", "recovered")])
+@pytest.mark.parametrize(
+    ("version", "of_ego", "of_helper"),
+    [("v1", "strict", "strict"), ("v2", "recovered", "recovered"), ("paper", "strict", "recovered")],
+)
 def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
-    version: str, status: str, small: Dataset
+    version: str, of_ego: str, of_helper: str, small: Dataset
 ) -> None:
     """What the v1 templates ask for, word by word, from the ego and from a helper, also in a fusion call."""
     spec = spec_of(small, prompt=version)
@@ -291,9 +295,10 @@ def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
     fused = fusion_request(spec, scene, told, scene.viewers[1:])
     told["merge"] = answer_of(fused, Completion(fused.id, ego, None, None, "stop", None, 1))
     assert {(a.role, a.status) for a in told.values()} == {
-        ("ego", status), ("helper", status), ("merge", status),
+        ("ego", of_ego), ("helper", of_helper), ("merge", of_ego),
     }  # fmt: skip
-    assert {a.repairs for a in told.values()} == {() if status == "strict" else ("prose_around",)}
+    for answer in told.values():
+        assert answer.repairs == (() if answer.status == "strict" else ("prose_around",))
 
 
 @pytest.mark.parametrize("version", ["v9", "v1.1", "über 'v'"])

@@ -27,8 +27,8 @@ Graph = Mapping[str, Any]
 ROLES = ("ego", "helper")
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
-# Digests of versions that ask for reasons first and were released before prompt.toml could say so.
-REASONS_FIRST = frozenset({"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8"})  # v1
+# Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
+REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
 LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
 
 
@@ -61,7 +61,7 @@ class Prompt:
         max_answer_tokens: most tokens an answer may have, by role.
         changed: what is new in it.
         known_failures: what it is known to provoke.
-        reasons_first: whether it asks for reasons before the answer, which are then no fault of the answer.
+        reasons_first: roles asked for reasons before the answer, which are then no fault of the answer.
         texts: template text by role.
     """
 
@@ -76,7 +76,7 @@ class Prompt:
     changed: str
     known_failures: str
     texts: Mapping[str, str]
-    reasons_first: bool = False
+    reasons_first: tuple[Literal["ego", "helper"], ...] = ()
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -189,7 +189,7 @@ def load(version: str, where: Path | None = None) -> Prompt:
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     templates = {role: texts[f"{role}.j2"] for role in ROLES}
-    table = {"reasons_first": sha256 in REASONS_FIRST, **table}
+    table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **table}
     return convert(
         table, Prompt, what, version=version, sha256=sha256, released=version in released, texts=templates
     )
