@@ -116,6 +116,29 @@ def test_memory_goes_with_the_episode_and_the_seed(
     assert len(courses) > 3, "courses that are all alike would not show the memory"
 
 
+def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dataset) -> None:
+    """Helpers of episode e are sure of action e, so an episode that goes FASTER into a collision is over.
+
+    First 0 hears IDLE of 1, 1 hears FASTER of 2 and 2 SLOWER of 0; then 2 and 0 are left, and hear each other:
+    0 collides. Whoever is alone keeps its own (.5, .3, .2).
+    """
+    lines = {f"{scene.id}/{scene.viewers[0]}": EGO for scene in all_scenes(played)}
+    for scene in all_scenes(played):
+        intent = sure(played.actions[scene.record["episode"]], "helper")
+        lines |= {f"{scene.id}/{viewer}": intent for viewer in scene.viewers[1:]}
+    control = replace(POOLED, name="control", messages="shuffled")
+    told = walked(spec_of(played, points=(control,), seeds=(0, 1)), Scripted(lines))
+    braking, keeping, faster = (tuple(p) for p in np.array([0.125, 0.075, 0.05]) + 0.75 * np.eye(3))
+    expected = {
+        (0, 0): keeping, (0, 1): faster, (0, 2): braking,
+        (1, 0): faster, (1, 2): braking,
+        (2, 2): (0.5, 0.3, 0.2),
+    }  # fmt: skip
+    for seed in (0, 1):
+        fused = {(d.step, d.episode): d.fused for d in told.records("control") if d.seed == seed}
+        assert fused == {place: pytest.approx(policy) for place, policy in expected.items()}
+
+
 def by_hand(heard: list[int]) -> list[np.ndarray]:
     """The policies where so many helpers are heard at each step; an ego that hears nobody keeps its own."""
     own, memory, policies = np.array([0.5, 0.3, 0.2]), None, []

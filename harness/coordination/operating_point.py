@@ -10,6 +10,7 @@ from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 
 FALLBACKS = ("uniform", "brake")
+MESSAGES = ("own", "shuffled")
 OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
 _LARGEST = sys.float_info.max
 
@@ -39,6 +40,8 @@ class OperatingPoint:
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
         roadside_edge: replies travel over a roadside edge node as well (`channel.Radio`).
         on_demand: a helper infers when it is asked, and not in parallel with the ego.
+        messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
+            (`shuffled`). A gain of cooperation is gone then, unless it is no gain of what messages say.
     """
 
     name: str
@@ -58,6 +61,7 @@ class OperatingPoint:
     helper_rounds: bool = False
     roadside_edge: bool = False
     on_demand: bool = False
+    messages: str = "own"
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -66,6 +70,8 @@ class OperatingPoint:
             raise unknown("channel profile", str(self.profile), CHANNELS, "; leave it out to disable V2V")
         if self.fallback not in FALLBACKS:
             raise unknown("fallback", str(self.fallback), FALLBACKS)
+        if self.messages not in MESSAGES:
+            raise unknown("messages", str(self.messages), MESSAGES)
         if str(self.consensus) not in RULES and self.consensus != EGO_PROMPT:
             raise unknown("consensus", str(self.consensus), names())
         self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
@@ -86,6 +92,8 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+        if self.messages != "own" and self.consensus == EGO_PROMPT:
+            raise self._wrong("messages", f"own where consensus is {EGO_PROMPT}")
         self.channel()
 
     @classmethod

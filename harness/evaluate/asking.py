@@ -49,7 +49,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
                 form=spec.prompt.helper_answer,
                 answer=spec.answer,
                 thinking=spec.thinking,
-                reasons_first=spec.prompt.reasons_first,
+                reasons_first=role in spec.prompt.reasons_first,
                 view=graph,
                 truth=truth,
                 scenario=spec.scenario,
@@ -75,7 +75,7 @@ def fusion_request(
         form=spec.prompt.helper_answer,
         answer=spec.answer,
         thinking=spec.thinking,
-        reasons_first=spec.prompt.reasons_first,
+        reasons_first="ego" in spec.prompt.reasons_first,
     )
 
 
@@ -171,7 +171,22 @@ class Asker:
     def laid_out(self, moments: Sequence[Scene]) -> Intents:
         """The answers that are there as arrays; NaN for one that is not, or that failed."""
         answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
-        return self._laid_out(moments, answers)
+        width, actions = max(map(len, answers)), len(self.spec.actions)
+        p = np.full((len(moments), width, actions), np.nan)
+        distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
+        bits = np.zeros((len(moments), width - 1))
+        for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
+            at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
+            for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
+                distance[i, j] = scene.record["distance_m"][viewer]
+                if answer and answer.intent is not None:
+                    p[i, j] = answer.intent
+                if j:
+                    reach[i, j - 1] = scene.record["range_m"][viewer]
+                    bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
+            row += [None] * (width - len(row))
+        valid = ~np.isnan(p[:, 1:]).any(axis=-1)
+        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, inference_s(self.latency, answers))
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages."""
@@ -196,24 +211,6 @@ class Asker:
         asked = [request for request in requests if request.id not in self._given]
         self._more(len(asked))
         self.ask(asked)
-
-    def _laid_out(self, moments: Sequence[Scene], answers: list[list[Answer | None]]) -> Intents:
-        width, actions = max(map(len, answers)), len(self.spec.actions)
-        p = np.full((len(moments), width, actions), np.nan)
-        distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
-        bits = np.zeros((len(moments), width - 1))
-        for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
-            at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
-            for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
-                distance[i, j] = scene.record["distance_m"][viewer]
-                if answer and answer.intent is not None:
-                    p[i, j] = answer.intent
-                if j:
-                    reach[i, j - 1] = scene.record["range_m"][viewer]
-                    bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
-            row += [None] * (width - len(row))
-        valid = ~np.isnan(p[:, 1:]).any(axis=-1)
-        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, inference_s(self.latency, answers))
 
 
 def _heard(moments: Sequence[Scene], codes: Ints) -> Iterator[tuple[Scene, list[str]]]:

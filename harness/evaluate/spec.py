@@ -133,6 +133,11 @@ class Spec:
             )
         self._check_latency()
         for point in self.points:
+            if point.messages != "own" and self.source.kind != "frozen":
+                raise UserError(
+                    f"condition {printable(point.name)}: messages={point.messages} is for frozen scenes; "
+                    "use harness eval"
+                )
             if point.asks_again and (not can.language_model or self.answer == "readout"):
                 raise UserError(
                     f"condition {printable(point.name)}: "

@@ -5,7 +5,7 @@ their moments come from and in where an action leads, and in nothing else. A mom
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -21,7 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import codes_of
-from harness.runs.decisions import DECIMALS, Decisions, Labels, by_action, by_message
+from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 Moment = TypeVar("Moment")
 AskedMoment = TypeVar("AskedMoment", contravariant=True)
@@ -102,12 +102,32 @@ def walk(
         for point, each in due.items():
             call = calls(each.at) if calls and point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, intents.take(each.at), each.draws, fusion)
+            result = coordinate(point, _heard(point, intents, each), each.draws, fusion)
             decided.append(Decided(point, moments, each, result))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
         yield decided
         world.step(decided)
+
+
+def _heard(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
+    """What the vehicles of each decision intend; `shuffled`, its helpers say what those of another layout do.
+
+    That is the next layout in which the same seed has a decision at this step; an ego without one hears
+    nobody. Who is asked, how far it is and how long it takes stay.
+    """
+    own = intents.take(due.at)
+    if point.messages == "own":
+        return own
+    order = np.lexsort((due.episode, due.seed))
+    following = np.roll(order, -1)
+    starts = np.flatnonzero(np.diff(due.seed[order], prepend=due.seed[order[0]] - 1))
+    following[np.roll(starts, -1) - 1] = order[starts]  # the last of a seed hears its first
+    other = np.empty_like(order)
+    other[order] = following
+    said, alone = own.take(other), other == np.arange(len(other))
+    valid = said.valid & ~alone[:, None]
+    return replace(own, helpers=said.helpers, valid=valid, payload_bits=said.payload_bits)
 
 
 class _Memory:
@@ -165,10 +185,10 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:
-    """Numbers of decisions (n,) by name, with the decimals that are kept, NaN where unknown."""
+    """Numbers of decisions (n,) by name, NaN where unknown."""
     c, point = decided.result, decided.point
     anybody = c.on_time.any(axis=-1)
-    numbers = {
+    return {
         "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
         "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
         "own_failed": c.own_failed,
@@ -179,9 +199,6 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
         "fusion_failed": np.where(anybody & point.asks_again, c.fusion_failed, np.nan),
         "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
     }  # fmt: skip
-    return {
-        name: values.round(DECIMALS[name]) if name in DECIMALS else values for name, values in numbers.items()
-    }
 
 
 def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:

@@ -21,7 +21,7 @@ from harness.training.answers import message
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 SOFTNESS_S = 0.25
-OF_A_LEVEL = 3
+OF_A_LEVEL = 6
 CALM = {"FASTER": 0.3}  # prior weight of an action, 1 if not named
 
 
