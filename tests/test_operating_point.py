@@ -116,7 +116,10 @@ def test_a_change_of_a_point_is_called_by_its_text():
         ("6g:loss=0.1,loss=0.2", "loss is given twice"),
         ("6g:consensus=vote", "unknown consensus 'vote'"),
         ("6g:messages=none", "unknown messages 'none'"),
-        ("6g:consensus=ego-prompt,messages=shuffled", "messages is 'shuffled'; it must be own where consensus"),
+        (
+            "6g:consensus=ego-prompt,messages=shuffled",
+            "messages is 'shuffled'; it must be own where consensus",
+        ),
     ],
 )
 def test_a_change_that_is_not_allowed_is_one_line(text, says):

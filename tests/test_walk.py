@@ -119,8 +119,8 @@ def test_memory_goes_with_the_episode_and_the_seed(
 def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dataset) -> None:
     """Helpers of episode e are sure of action e, so an episode that goes FASTER into a collision is over.
 
-    First 0 hears IDLE of 1, 1 hears FASTER of 2 and 2 SLOWER of 0; then 2 and 0 are left, and hear each other:
-    0 collides. Whoever is alone keeps its own (.5, .3, .2).
+    First 0 hears IDLE of 1, 1 hears FASTER of 2 and 2 SLOWER of 0; then 2 and 0 are left, and hear each
+    other: 0 collides. Whoever is alone keeps its own (.5, .3, .2).
     """
     lines = {f"{scene.id}/{scene.viewers[0]}": EGO for scene in all_scenes(played)}
     for scene in all_scenes(played):

@@ -46,7 +46,7 @@ def build(
 
     begun_s = time.monotonic()
     with bar(f"freezing {name}", episodes) as progress:
-        manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit)
+        manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit, progress.more)
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "
         f"{time.monotonic() - begun_s:.0f} s"

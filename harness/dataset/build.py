@@ -36,9 +36,10 @@ from harness.dataset.schema import (
     tree_schema,
 )
 from harness.dataset.verify import level_name, tree_name
+from harness.world import scenarios
 from harness.world.audit import Audit, audit, ready
 from harness.world.reference import drive_all
-from harness.world.scenario import Scenario
+from harness.world.scenario import BEACON_DIALS, Scenario
 
 WORK = ".building"
 LEAST_AUDITED = 100  # layouts; of fewer an audit says little
@@ -46,7 +47,7 @@ LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
 def build(
     scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None],
-    audits: bool = True,
+    audits: bool = True, more: Callable[[int], None] = lambda count: None,
 ) -> dict[str, Any]:  # fmt: skip
     """Build a dataset in `out`.
 
@@ -56,8 +57,9 @@ def build(
         episodes: how many; episode e has layout seed `seed + e`.
         seed: first layout seed.
         workers: processes.
-        progress: called with the number of episodes just finished.
+        progress: called with the number of layouts just finished.
         audits: whether the layouts are audited for tells, from `LEAST_AUDITED` on.
+        more: called with the number of layouts that are still to be audited then.
 
     Returns:
         The manifest.
@@ -70,7 +72,9 @@ def build(
     if audits:
         ready()
     config = {
-        **settings(scenario),
+        "scenario": scenario.name,
+        "actions": list(scenario.actions),
+        "parameters": json.loads(canonical_json(asdict(scenario.parameters))),
         "episodes": episodes,
         "seed": seed,
         "purpose": purpose(seed, episodes),
@@ -93,9 +97,13 @@ def build(
     texts = _join(work, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
-    found = audit(scenario, episodes, seed, lambda done: None, workers) if audits else None
+    found = None
+    if audits:
+        more(episodes)
+        found = audit(scenario, episodes, seed, progress, workers)
+    command = _command(scenario, episodes, seed, audits)
     files = {
-        "README.md": _readme(out.absolute().name, config, forest, found).encode(),
+        "README.md": _readme(out.absolute().name, command, config, forest, found).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
         "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
@@ -113,12 +121,6 @@ def build(
     write_whole(out / "manifest.json", _pretty(manifest))
     shutil.rmtree(work)
     return manifest
-
-
-def settings(scenario: Scenario) -> dict[str, Any]:
-    """What decides how an episode goes, as JSON has it: scenario, actions, parameters."""
-    parameters: dict[str, Any] = json.loads(canonical_json(asdict(scenario.parameters)))
-    return {"scenario": scenario.name, "actions": list(scenario.actions), "parameters": parameters}
 
 
 def _begin(out: Path, config: dict[str, Any]) -> Path:
@@ -198,7 +200,20 @@ def _pretty(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _readme(name: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
+def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
+    """What builds the same again."""
+    usual, p = scenarios.get(scenario.name).parameters, scenario.parameters
+    dials = [
+        f"{dial}={canonical_json(getattr(p, dial))}"
+        for dial in BEACON_DIALS if getattr(p, dial) != getattr(usual, dial)
+    ]  # fmt: skip
+    name = f"{scenario.name}:{','.join(dials)}" if dials else scenario.name
+    lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != usual.decision_lag_s else ""
+    unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
+    return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
+
+
+def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
         f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
@@ -216,7 +231,7 @@ def _readme(name: str, config: dict[str, Any], forest: Forest, found: Audit | No
 
 Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:
 {nodes} decision points, {nodes / seeds:.0f} a layout.
-Built by `harness dataset build {config["scenario"]} --episodes {seeds} --seed {config["seed"]}`.
+Built by `{command}`.
 
 A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
 built every reference driver drove every layout in closed loop too, and ended as in the trees.
