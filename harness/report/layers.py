@@ -22,7 +22,7 @@ RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
 RUN = "run"  # name of the parameter that chooses one of several runs
 NUMBER: Spec = {"type": "quantitative"}
 BASE: Spec = {
-    "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+    "$schema": "https://vega.github.io/schema/vega-lite/v5.json",
     "width": "container",
 }
 
