@@ -19,7 +19,7 @@ from typing import Any
 from markupsafe import Markup
 
 # In the order in which they need each other.
-SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")
+SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "episodes", "main")
 FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
