@@ -100,7 +100,7 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert "mute reads no prompt: it decides by the scene graph, whatever v2 says." in said
     assert "None of the helpers' 72 answers could be read: they send no message." in said
     page = unescape(Path("reports/mute/report.html").read_text())
-    assert page.index(UNREAD) < page.index("With mute, 6g clears")
+    assert page.index(UNREAD) < page.index("With 6g mute clears")
     assert "none of the ego's answers could be read: it drives by the fallback" in harness("ls")[1]
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)

@@ -4,10 +4,13 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from harness.backends.registry import find
 from harness.core.errors import printable
+from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
 from harness.runs.records import Manifest, Score
 
+FEW = 100  # episodes; with fewer a page warns of wide intervals
+OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns
 # By role: whose answers, and what takes their place.
 _FAILED = {
     "ego": ("the ego's", "it drives by the fallback, and success says little of the model"),
@@ -29,6 +32,23 @@ def unread(scores: Sequence[Score]) -> Iterator[str]:
         if score is not None and score.value is not None and score.value >= UNREAD:
             share = "None" if score.value == 1 else f"Only {100 * (1 - score.value):.1f} %"
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
+
+
+def of_run(run: Run) -> Iterator[str]:
+    """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
+    n = len(run.grid.episodes)
+    if n < FEW:
+        yield f"Only {n} episodes: a rate's interval may reach {98 / n**0.5:.0f} points to either side."
+    retries = sum(answer.retries for answer in run.answers)
+    if run.manifest.engine_errors or retries:
+        errors = run.manifest.engine_errors
+        yield f"The engine stumbled: {errors} requests ended in an error, {retries} attempts were repeated."
+    off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
+    if off:
+        yield (
+            f"With {', '.join(off)} most decisions take longer than these frozen scenes allow for: driving "
+            "may end otherwise (harness fidelity)."
+        )
 
 
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:

@@ -1,8 +1,9 @@
 """The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from harness.report.drawing.colours import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing import colours
+from harness.report.drawing.colours import BAD, GOOD, GREY, LATE, PALE, ROLES
 from harness.report.layers import (
     BASE,
     NUMBER,
@@ -11,7 +12,7 @@ from harness.report.layers import (
     Spec,
     band,
     colour,
-    colours_of,
+    condition_colours,
     interval,
     layered,
     names_axis,
@@ -24,35 +25,71 @@ from harness.report.layers import (
 )
 
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
+# Kinds of failure are shades of one colour.
 VERDICTS = {
-    "strict": [BLUE],
-    "recovered": [SKY],
-    "failed": [VERMILLION, ORANGE, PURPLE, "#8C510A", "#F0E442", "#B2A1C7", "#999999"],
+    "strict": [GOOD],
+    "recovered": [LATE],
+    "failed": [BAD, "#E2685A", "#9C2416", "#F0988D", "#6E160B", "#F7C4BD"],
 }
-REPLIES = {"on time": BLUE, "late": ORANGE, "lost": VERMILLION}
+REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
 TIMES = {
-    "inference": SKY, "reply on time": BLUE, "reply late": ORANGE, "reply lost": VERMILLION, "fusion": PURPLE,
-    "decision": GREEN,
+    "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD, "fusion": ROLES["merge"],
+    "decision": GREY,
 }  # fmt: skip
+# The paper's table of operating points: ms and success rate.
+PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.941)}
 
 
-def success_latency(rows: Rows, references: Mapping[str, float]) -> Spec:
-    """Success over latency, a point a run and condition; reference drivers are lines."""
-    condition = colours_of(rows, "condition")
+def success_latency(rows: Rows, references: Mapping[str, float], window_ms: Sequence[float]) -> Spec:
+    """Success over latency, a point a run and condition, and the paper's; reference drivers are lines."""
+    condition = condition_colours(rows)
+    condition["legend"] = {**condition["legend"], "title": None}
     shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition")
+    shape["legend"] = {**shape["legend"], "title": None}
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", "success rate")
     present = {key for row in rows for key, value in row.items() if value is not None}
     along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
     along_y = {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}}
     ends = {"low": along_y, "latency_low": along_x}
     return layered(
-        band(*REACTION_MS, "reaction window, 150 to 250 ms"),
+        band(*REACTION_MS, "reaction window of the paper, 150 to 250 ms", named=True),
         _references(references, y),
+        *rules_at("latency_ms", window_ms, "decision window"),
+        *_paper(dict.fromkeys(str(row["condition"]) for row in rows), x, y),
         *(interval(**along, color=condition) for end, along in ends.items() if end in present),
-        point(90, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)),
+        point(110, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)),
         rows=rows,
-        height=320,
+        height=300,
     )
+
+
+def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
+    """What the paper reports for its own operating points, as a ring with its name."""
+    values = [
+        {"paper": f"paper: {name}", "latency_ms": PAPER[name][0], "success": PAPER[name][1]}
+        for name in conditions if name in PAPER
+    ]  # fmt: skip
+    if not values:
+        return []
+    ring = {"type": "point", "shape": "circle", "filled": False, "size": 60, "color": "currentColor"}
+    text = {
+        "type": "text",
+        "align": "left",
+        "dx": 7,
+        "color": "currentColor",
+        "opacity": 0.8,
+        "fontSize": 10.5,
+    }
+    said = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
+    return [
+        {
+            "data": {"values": values},
+            "layer": [
+                {"mark": ring, "encoding": {"x": x, "y": y, **said}},
+                {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
+            ],
+        }
+    ]
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
@@ -120,19 +157,20 @@ def arrivals(rows: Rows, window_ms: Sequence[float], width: float) -> Spec:
     return _bars(rows, "arrival_ms", title, "replies", width, series="condition", rules=window_ms)
 
 
-def policies() -> Spec:
+def policies(actions: Sequence[str]) -> Spec:
     """One decision's distributions around fusion; the page fills in `values`: who, what, action, p."""
+    scale = {"domain": list(actions), "range": list(colours.actions(actions).values())}
     return {
         **BASE,
         "data": {"name": "values", "values": []},
-        "mark": {"type": "bar", "height": {"band": 0.8}},
+        "mark": {"type": "bar", "height": {"band": 0.8}, "stroke": GREY, "strokeWidth": 0.7},
         "encoding": {
             "y": names_axis("who"),
             "yOffset": {"field": "action", "sort": None},
             "x": {**x_axis("p", "probability"), "scale": {"domain": [0, 1]}},
             "color": {
-                "field": "action", "type": "nominal", "sort": None,
-                "scale": {"range": [VERMILLION, BLUE, GREEN]}, "legend": {"orient": "top", "title": None},
+                "field": "action", "type": "nominal", "sort": None, "scale": scale,
+                "legend": {"orient": "top", "title": None},
             },
             "tooltip": [{"field": f} for f in ("who", "what", "action", "p")],
         },
@@ -192,7 +230,7 @@ def _shares(
     rows: Rows, field: str, title: str, what: str, diagonal: bool = False, rules: Sequence[float] = ()
 ) -> Spec:
     x, y = x_axis(field, title), share_axis("share", what)
-    condition, shape = colours_of(rows, "condition"), shapes_of(rows, "condition")
+    condition, shape = condition_colours(rows), shapes_of(rows, "condition")
     if not diagonal:
         y["scale"] = {"zero": True, "nice": True}
     layers: list[Spec] = [
@@ -212,15 +250,18 @@ def _bars(
     series: str = "", rules: Sequence[float] = (), within: tuple[float, float] | None = None,
 ) -> Spec:  # fmt: skip
     bars = [{**row, "to": row[field] + width} for row in rows]
+    met = {row[series] for row in rows} if series else set()
     encoding: Spec = {
         "x": {**x_axis(field, title), "bin": {"binned": True, "step": width}},
         "x2": {"field": "to"},
         "y": {"field": "count", **NUMBER, "title": what, "stack": None},
         "tooltip": tooltip(rows),
     }
-    mark: Spec = {"type": "bar", "opacity": 0.75, "color": BLUE}
-    if series:
-        encoding["color"] = colours_of(rows, series)
+    mark: Spec = {"type": "bar", "opacity": 0.75, "color": ROLES["ego"]}
+    if series == "role":
+        encoding["color"] = colour("role", {role: c for role, c in ROLES.items() if role in met})
+    elif series:
+        encoding["color"] = condition_colours(rows)
     layers: list[Spec] = [{"mark": mark, "encoding": encoding}]
     if within:
         layers.insert(0, band(*within, f"budget, {within[0]} to {within[1]} tokens"))

@@ -1,4 +1,4 @@
-"""Which decision points of a run tell most: where episodes begin to fail, others of note, an even sample."""
+"""Which decision points of a driven run tell most: where episodes begin to fail, others of note, an even sample."""
 
 from collections.abc import Sequence
 
@@ -8,26 +8,10 @@ from harness.runs.folder import Run
 
 
 def failures(run: Run) -> dict[str, int]:
-    """Decision points at which an episode begins to fail, and the seed with which it does."""
-    return _unsafe(run) if run.world == "frozen" else _wrecks(run)
+    """Decision points at which a driven layout begins to fail, and the seed with which it does.
 
-
-def _unsafe(run: Run) -> dict[str, int]:
-    """The decision that lost each episode of the run's first seed, under the first condition that lost it."""
-    d, seed = run.decisions, run.manifest.seeds[0]
-    bad = d.flags("regret") & (d.whole("seed") == seed)
-    episode = d.whole("episode")
-    first: dict[int, str] = {}
-    for scene, rows in d.scenes.items():
-        if bad[rows.start : rows.stop].any():
-            first.setdefault(int(episode[rows.start]), scene)
-    return dict.fromkeys(first.values(), seed)
-
-
-def _wrecks(run: Run) -> dict[str, int]:
-    """The last decision point that a layout's failed episodes share with one that did not fail.
-
-    Where all episodes of a layout fail, it is the last decision point of the first of them.
+    It is the last that a layout's failed episodes share with one that did not fail; where all of them fail,
+    the last of the first.
     """
     d = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])[run.grid.places(d)]

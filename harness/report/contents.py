@@ -11,6 +11,17 @@ from harness.runs.folder import Run
 EXAMPLES = 3  # of each status of answers
 
 
+def size(runs: Runs) -> str:
+    """How much was run, of what: said once for all numbers."""
+    first = runs.runs[0]
+    episodes, seeds = (sorted({len(of) for of in each}) for each in (
+        [run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs],
+    ))  # fmt: skip
+    told = " or ".join(map(str, episodes)), " or ".join(map(str, seeds))
+    driven = " driven in closed loop" if runs.live else ""
+    return f"{told[0]} episodes × {told[1]} seeds of {first.source}{driven}; 95 % intervals over episodes"
+
+
 def summary(run: Run) -> list[dict[str, Any]]:
     """A run's summary: a metric a line, with its value in each condition."""
     return [

@@ -71,7 +71,7 @@ class Decisions:
                 places[scene] = int(episode[rows.start]), int(step[rows.start]), danger[rows.start]
         order = sorted(places.items(), key=lambda item: (*item[1][:2], item[0]))
         self.ids = [scene for scene, _ in order]
-        failed = [failures(run) for run in runs.runs]
+        failed = [failures(run) if runs.live else {} for run in runs.runs]
         self._ends = [_ends(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self.index = {

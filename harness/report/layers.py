@@ -1,28 +1,33 @@
 """What Vega-Lite specifications are made of: scales, marks and layers that the report's charts share.
 
-Colours are those of Okabe and Ito, which the colour-blind tell apart, and shape or place says the same again.
-What is drawn in `currentColor` is light on dark and dark on light.
+Colours are those of the palette (`drawing/colours.py`), and shape or place says the same again. What is drawn
+in `currentColor` is light on dark and dark on light.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from harness.report.drawing.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from harness.report.drawing import colours
+from harness.report.drawing.colours import GREY
 
 Spec = dict[str, Any]
 Rows = Sequence[Mapping[str, Any]]
 
-SERIES = [BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY]
 # Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
 TAKEN = {
     "__proto__", "constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable", "toLocaleString",
     "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
 }  # fmt: skip
 RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
+NAME: Spec = {
+    "type": "text", "align": "left", "dx": 4, "dy": -8, "color": "currentColor", "opacity": 0.8,
+    "fontSize": 10.5,
+}  # fmt: skip
+FOOT: Spec = {"y": {"value": "height"}}
 RUN = "run"  # name of the parameter that chooses one of several runs
 NUMBER: Spec = {"type": "quantitative"}
 BASE: Spec = {
-    "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+    "$schema": "https://vega.github.io/schema/vega-lite/v5.json",
     "width": "container",
 }
 
@@ -69,14 +74,15 @@ def colour(field: str, colours: Mapping[str, str]) -> Spec:
     }  # fmt: skip
 
 
-def colours_of(rows: Rows, field: str) -> Spec:
-    """A colour for each value of a field, in the order in which they come."""
-    shapes = shapes_of(rows, field)
-    return {**shapes, "scale": {**shapes["scale"], "range": SERIES}}
+def condition_colours(rows: Rows) -> Spec:
+    """The colour of each row's condition."""
+    shapes = shapes_of(rows, "condition")
+    found = colours.conditions(shapes["scale"]["domain"])
+    return {**shapes, "scale": {**shapes["scale"], "range": list(found.values())}}
 
 
 def shapes_of(rows: Rows, field: str) -> Spec:
-    """A shape where `colours_of` has a colour; of one field, both have one legend."""
+    """A shape where `condition_colours` has a colour; of one field, both have one legend."""
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
     return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
 
@@ -104,19 +110,31 @@ def interval(**encoding: Spec) -> Spec:
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
 
-def band(start: float, end: float, what: str) -> Spec:
-    """A shaded range of x."""
-    return {
-        "data": {"values": [{"from": start, "to": end, "what": what}]},
-        "mark": {"type": "rect", "color": GREY, "opacity": 0.18},
-        "encoding": {
-            "x": {"field": "from", **NUMBER}, "x2": {"field": "to"}, "tooltip": {"field": "what"},
-        },
-    }  # fmt: skip
+def band(start: float, end: float, what: str, named: bool = False) -> Spec:
+    """A shaded range of x, named at its top or by its tooltip alone."""
+    x: Spec = {"x": {"field": "from", **NUMBER}}
+    shade: Spec = {
+        "mark": {"type": "rect", "color": GREY, "opacity": 0.14},
+        "encoding": {**x, "x2": {"field": "to"}, "tooltip": {"field": "what"}},
+    }
+    return (
+        {
+            "data": {"values": [{"from": start, "to": end, "what": what}]},
+            "layer": [shade, {"mark": NAME, "encoding": {**x, **FOOT, "text": {"field": "what"}}}],
+        }
+        if named
+        else {"data": {"values": [{"from": start, "to": end, "what": what}]}, **shade}
+    )
 
 
-def rules_at(field: str, at: Sequence[float]) -> list[Spec]:
-    """Vertical lines."""
-    values = [{field: value} for value in at]
-    line = {"mark": RULE, "encoding": {"x": {"field": field, **NUMBER}}}
-    return [{"data": {"values": values}, **line}] if values else []
+def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
+    """Vertical lines, named at their top where `what` they are is given, in ms."""
+    values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]
+    x: Spec = {"x": {"field": field, **NUMBER}}
+    line: Spec = {"mark": RULE, "encoding": x}
+    if not values:
+        return []
+    if not what:
+        return [{"data": {"values": values}, **line}]
+    name = {"mark": {**NAME, "dy": -24}, "encoding": {**x, **FOOT, "text": {"field": "what"}}}
+    return [{"data": {"values": values}, "layer": [line, name]}]

@@ -1,44 +1,34 @@
 """What a page carries besides its text: packed data, pictures, the charting library, and what lets it run.
 
-Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which vl-convert
-brings along. It is compressed in the page as everything large is; scripts are let run by their digest alone.
+Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which the package
+django-js-lib-vega-embed carries as its authors built it. It is compressed in the page as everything large is;
+scripts are let run by their digest alone.
 """
 
 import base64
 import gzip
 import hashlib
 import json
+import re
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import metadata, version
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from harness.core import kept
-from harness.core.files import sha256_bytes
-
 # In the order in which they need each other.
-SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "main")
+SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "episodes", "main")
 FOLDER = Path(__file__).parent / "scripts"
-# Digests of the bundles of versions of vl-convert: making one takes a second, and no other script is taken
-# from a cache that anyone may have written to.
-BUNDLES = {"1.9.0.post1": "373b1f84072b31010f15ceb787be6b415c53936411aae267c8c2b2b6ccde46e7"}
+PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
+BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
 
 
 @cache
 def vega() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script that leaves `vegaEmbed` behind."""
-    expected = BUNDLES.get(version("vl-convert-python"))
-    name = f"vega-{expected}.js"
-    bundle = kept.recall(name) if expected else None
-    if bundle is None or sha256_bytes(bundle) != expected:
-        import vl_convert
-
-        bundle = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;").encode()
-        if sha256_bytes(bundle) == expected:
-            kept.keep(name, bundle)
-    return f"(()=>{{{bundle.decode()}}})();"
+    return (files("js_lib_vega_embed") / BUNDLE).read_text(encoding="utf-8")
 
 
 @cache
@@ -50,13 +40,9 @@ def script() -> Markup:
 
 def licence() -> str:
     """Which libraries the page carries; their licences are in templates/licences.txt."""
-    import vl_convert
-
-    return (
-        f"Charts are drawn by Vega {vl_convert.get_vega_version()}, Vega-Lite "
-        f"{vl_convert.get_vegalite_versions()[-1]} and Vega-Embed, which lie in this file as vl-convert "
-        f"{version('vl-convert-python')} bundles them"
-    )
+    carried = re.findall(r"^- (Vega.*): ([\d.]+)$", str(metadata(PACKAGE)), re.MULTILINE)
+    named = ", ".join(f"{name} {number}" for name, number in carried)
+    return f"Charts are drawn by {named}, which lie in this file as {PACKAGE} {version(PACKAGE)} has them"
 
 
 def packed(value: Any) -> Markup:

@@ -20,6 +20,7 @@ from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.decisions import Decisions, Prompts, prompts_of
+from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
@@ -72,21 +73,27 @@ def render(
     lines = matrix.lines(runs)
     charts = list(panels(runs))
     decisions = Decisions(runs, prompts)
+    alone = len(runs.names) == 1
+    unread, others = (
+        [said if alone else f"{name}: {said}" for name, run in zip(runs.names, runs.runs, strict=True)
+         for said in of(run)]
+        for of in (lambda run: caveats.unread(run.scores), caveats.of_run)
+    )  # fmt: skip
     blocks = []
     for block in decisions.blocks():
         blocks.append(library.packed(block))
         progress(len(block))
     return environment().get_template("page.html.j2").render(
         runs=runs,
-        title=runs.names[0] if len(runs.names) == 1 else f"{len(runs.names)} runs",
+        title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
-        unread=[
-            f"{name}: {said}" if len(runs.names) > 1 else said
-            for name, run in zip(runs.names, runs.runs, strict=True)
-            for said in caveats.unread(run.scores)
-        ],
-        no_prompt=caveats.no_prompt(run.manifest for run in runs.runs),
-        headline=words.headline(runs.runs[0]) if len(runs.names) == 1 else matrix.headline(lines),
+        warnings=[*unread, *caveats.no_prompt(run.manifest for run in runs.runs), *others],
+        unread=len(unread),
+        size=contents.size(runs),
+        headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
+        key_figures=words.figures(runs.runs[0]) if alone else [],
+        palette=Markup(colours.variables()),
+        actions=_actions(runs),
         lines=lines,
         grids=matrix.grids(lines),
         uneven=matrix.uneven(runs),
@@ -126,9 +133,19 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
             "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},
-        "policies": policies(),
+        "actions": _actions(runs),
+        "policies": policies(runs.actions),
         "timeline": timeline(),
     }  # fmt: skip
+
+
+def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
+    """The colour of each action, and of text on it."""
+    every = colours.actions(runs.actions)
+    return {
+        name: (c, colours.INK if 5 * n < 3 * len(every) else "#FFFFFF")
+        for n, (name, c) in enumerate(every.items())
+    }
 
 
 def environment(*more: Path) -> Environment:

@@ -50,12 +50,11 @@ def panels(runs: Runs) -> Iterator[Panel]:
         references = _references(runs)
         yield Panel(
             "success-latency", "overview", "Success and latency",
-            "Lines through a point are 95 % intervals, over episodes where the summary has one. Shaded: the "
-            "paper's reaction window in an urban intersection." + (
-                " Dashed: reference drivers that need no model, in the same episodes."
-                if references else ""
+            "Lines through a point: 95 % intervals over episodes. Rings: what the paper reports, of other "
+            "scenes and another model. A reply that comes after the decision window is not fused." + (
+                " Dashed: reference drivers that need no model, in the same episodes." if references else ""
             ),
-            charts.success_latency(rows, references),
+            charts.success_latency(rows, references, windows_ms),
         )  # fmt: skip
     if rows := joined(statistics.statuses):
         yield Panel(

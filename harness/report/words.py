@@ -36,26 +36,46 @@ def interval(score: Score) -> str:
 
 
 def headline(run: Run) -> str:
-    """The result in one sentence: the best condition, and the one without V2V beside it."""
-    scores = {c: s for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
+    """The result in one short sentence: the best condition, and the one without V2V beside it."""
     model = run.manifest.model.get("name")
-    if not scores:
+    best, base = compared(run)
+    if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    best = max(scores, key=lambda c: scores[c].value or 0.0)
-    text = f"With {model}, {best} {_clears(scores[best])} of {run.source}"
-    latency = run.score(best, LATENCY)
-    if latency is not None:
-        text += f" at {shown(latency)['value']} a decision"
-    alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
-    base = alone[0] if alone else min(scores, key=lambda c: scores[c].value or 0.0)
-    if base == best:
-        return text + (", and no other condition does better." if len(scores) > 1 else ".")
-    text += f"; {base} {_clears(scores[base])}"
+    text = f"With {best} {model} clears {_success(run, best)} of the episodes"
+    if not base:
+        several = len(run.conditions) > 1
+        return text + (", and no other condition does better." if several else ".")
+    text += f", with {base} {_success(run, base)}"
     gain = run.score(best, GAIN + base)
     if gain is not None and interval(gain):
-        clear = "a clear difference" if _p_values(run, base)[best] <= LEVEL else "which may be chance"
-        text += f", a gap of {shown(gain)['value']} ({interval(gain)}), {clear}"
+        clear = "a clear difference" if _p_values(run, base)[best] <= LEVEL else "this may be chance"
+        text += f": {clear}"
     return text + "."
+
+
+def compared(run: Run) -> tuple[str, str]:
+    """The best condition, and the one that it is held against: the one without V2V, or the worst.
+
+    Empty where there is none.
+    """
+    scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, SUCCESS)) is not None}
+    best = max(scores, key=lambda c: scores[c], default="")
+    alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
+    base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
+    return best, "" if base == best else base
+
+
+def figures(run: Run) -> list[dict[str, str]]:
+    """The few numbers of a run that are read first, each with what it is and its interval."""
+    best, base = compared(run)
+    wanted = [
+        (f"success with {best}", run.score(best, SUCCESS)),
+        (f"more than with {base}", run.score(best, GAIN + base) if base else None),
+        (f"end unsafe with {best}", run.score(best, "unsafe_rate")),
+        (f"latency of a decision with {best}", run.score(best, LATENCY)),
+        ("of the ego's answers could not be read", run.score(metrics.ALL, "failed_rate_ego")),
+    ]
+    return [{"what": what, **shown(score)} for what, score in wanted if score is not None]
 
 
 def _p_values(run: Run, base: str) -> dict[str, float]:
@@ -72,8 +92,10 @@ def p_value(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
-def _clears(score: Score) -> str:
-    return f"clears {success_of(score)} of the episodes"
+def _success(run: Run, condition: str) -> str:
+    score = run.score(condition, SUCCESS)
+    assert score is not None
+    return shown(score)["value"]
 
 
 def success_of(score: Score) -> str:

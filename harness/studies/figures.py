@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 
-from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE
+from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE, conditions
 from harness.report.drawing.pictures import styled
 from harness.studies.axes import CORE, axis_of
 
@@ -35,7 +35,7 @@ def composite_a(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Fi
     names = list(dict.fromkeys(core.condition))
     talking = [name for name in names if _value(core, name, "messages_per_episode")[0] > 0]
     in_legend = len(names) > 3 or max(map(len, names)) > SHORT
-    colours = {name: COLOURS[n % len(COLOURS)] for n, name in enumerate(names)}
+    colours = conditions(names)
     for axes, metric, scale, label, bars, margin in (
         (latency, "latency_proxy_ms", 1.0, "latency of a decision, ms", names, 0.14),
         (success, "success_rate", 100.0, "success, %", names, 0.14),
@@ -159,7 +159,7 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     axes = figure.subplots()
     axes.plot([0, 100], [0, 100], color=GREY, linewidth=0.8, linestyle="--", label="the same")
     markers = {model: MARKERS[n % len(MARKERS)] for n, model in enumerate(dict.fromkeys(models))}
-    colours = {name: COLOURS[n % len(COLOURS)] for n, name in enumerate(dict.fromkeys(table.condition))}
+    colours = conditions(table.condition)
     for model, (_, row) in zip(models, table.iterrows(), strict=True):
         x, y = (
             100 * np.array([row[f"{kind}{end}"] for end in ("", "_low", "_high")])

@@ -12,28 +12,30 @@ from harness.report import choose
 from harness.runs.folder import read
 
 
-def point(actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict", avoidable=True):
-    """A decision point in two conditions."""
-    return actions, safe, verdict, avoidable
+def point(actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict"):
+    """A decision point in two conditions; an episode fails where one of its points is not safe."""
+    return actions, safe, verdict
 
 
 def run_of(out, episodes):
-    """A run of episodes, each a list of decision points, all as long."""
+    """A driven run of episodes, each a list of decision points, all as long."""
     points = {f"{e:05d}-{step}": p for e, course in enumerate(episodes) for step, p in enumerate(course)}
     conditions = ("single-local", "6g")
 
     def decision(row):
-        actions, safe, _, avoidable = points[row["scene"]]
+        row["action"] = points[row["scene"]][0][conditions.index(row["condition"])]
+
+    def episode(row):
         place = conditions.index(row["condition"])
-        row |= {"action": actions[place], "safe": safe[place], "safe_SLOWER": avoidable, "safe_IDLE": False}
-        row |= {"value": avoidable, "regret": not safe[place] if avoidable else None}
+        if not all(safe[place] for _, safe, _ in episodes[row["episode"]]):
+            row |= {"success": False, "failure": "collision"}
 
     def answer(row):
         row["verdict"] = points[row["scene"]][2]
 
     return read(made_up(
-        out, decision, answer=answer, points=[POINTS[name] for name in conditions], seeds=(0,),
-        episodes=len(episodes), steps=len(episodes[0]), helpers=0,
+        out, decision, episode, answer, closed_loop=True, points=[POINTS[name] for name in conditions],
+        seeds=(0,), episodes=len(episodes), steps=len(episodes[0]), helpers=0,
     ))  # fmt: skip
 
 
@@ -54,10 +56,11 @@ def test_telling_decisions_are_chosen_and_an_even_sample_fills_up(tmp_path):
     assert chosen == sorted(telling | sample)
 
 
-def test_only_the_first_failure_of_an_episode_is_one_and_none_where_nothing_was_safe(tmp_path):
-    fails = [point(safe=(False, False), avoidable=False), *[point(safe=(False, False))] * 2]
-    run = run_of(tmp_path / "run", [fails, [point()] * 3])
-    assert choose.failures(run) == {"00000-1": 0}
+def test_a_layout_begins_to_fail_where_its_failed_episodes_leave_those_that_did_not(tmp_path):
+    parted = [point(), point(safe=(False, True)), point()]
+    all_fail = [point(safe=(False, False)), point(), point()]
+    run = run_of(tmp_path / "run", [parted, all_fail, [point()] * 3])
+    assert choose.failures(run) == {"00000-2": 0, "00001-2": 0}
 
 
 def test_a_run_full_of_failures_still_shows_ordinary_decisions(tmp_path):
@@ -75,7 +78,6 @@ POINTS_AS_DRAWN = st.builds(
     st.tuples(*[st.sampled_from(["IDLE", "SLOWER"])] * 2),
     st.tuples(st.booleans(), st.booleans()),
     st.sampled_from(["strict", "recovered", "failed"]),
-    st.booleans(),
 )
 EPISODES = st.integers(1, 8).flatmap(
     lambda steps: st.lists(st.lists(POINTS_AS_DRAWN, min_size=steps, max_size=steps), min_size=1, max_size=5)

@@ -9,11 +9,13 @@ from evaluating import scenes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from harness.core.errors import UserError
 from harness.dataset.load import Scene
+from harness.report.drawing.colours import ROLES
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.scene import draw
@@ -65,8 +67,8 @@ def test_conflict_points_say_when_the_ego_and_the_other_are_there(dataset):
 def test_the_ego_from_the_south_is_in_the_lower_half_because_north_is_up(dataset):
     pixels = imread(io.BytesIO(picture(scenes_of(dataset)[0], "png")))[..., :3]
     height = len(pixels)
-    blue = np.abs(pixels - np.array([0x00, 0x72, 0xB2]) / 255).max(axis=-1) < 0.02
-    rows = np.flatnonzero(blue.any(axis=1))
+    ego = np.abs(pixels - to_rgb(ROLES["ego"])).max(axis=-1) < 0.02
+    rows = np.flatnonzero(ego.any(axis=1))
     above_the_legend = rows[rows < 0.92 * height]
     assert len(above_the_legend)
     assert above_the_legend.min() > height / 2

@@ -29,7 +29,7 @@ from harness.prompts import versions as prompts
 from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
-from harness.report.words import answer_times, headline, latency_source
+from harness.report.words import answer_times, figures, headline, latency_source
 from harness.runs.folder import csv_text, read
 from harness.runs.records import Episode, Latency, Score, Times
 
@@ -183,7 +183,7 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
         score = read(run).score(name, "success_rate")
         assert score.interval == "episodes"
         assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
-    assert "n = 2 episodes" in page.text
+    assert "2 episodes × 2 seeds of two; 95 % intervals over episodes" in page.text
     for metric in ("latency proxy", "trigger rate", "entropy"):
         assert metric in page.text
 
@@ -295,10 +295,14 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ended=ENDED,
     )
     assert headline(found) == (
-        "With rule-of-thumb, 6g clears 94.0 % (95 % interval 88.0 to 97.0 %) of the episodes of two "
-        "at 151.4 ms a decision; single-local clears 68.0 % (95 % interval 58.0 to 76.0 %) of the episodes, "
-        "a gap of 26.0 points (17.0 to 35.0 points), a clear difference."
+        "With 6g rule-of-thumb clears 94.0 % of the episodes, with single-local 68.0 %: a clear difference."
     )
+    told = [(figure["value"], figure["interval"]) for figure in figures(found)]
+    assert told == [
+        ("94.0 %", "88.0 to 97.0 %"),
+        ("26.0 points", "17.0 to 35.0 points"),
+        ("151.4 ms", "151.0 to 151.8 ms"),
+    ]
 
 
 def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_path):
@@ -310,7 +314,7 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_p
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
         ended=ENDED,
     )
-    assert headline(found).endswith("a gap of 2.0 points (-3.0 to 7.0 points), which may be chance.")
+    assert headline(found).endswith("with single-local 68.0 %: this may be chance.")
 
 
 def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
@@ -320,7 +324,7 @@ def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
         ("single-local", "success_rate", 0.7, None, None),
         ("6g", "success_rate", 0.7, None, None),
     )
-    alone = "With rule-of-thumb, single-local clears 70.0 % of the episodes of two"
+    alone = "With single-local rule-of-thumb clears 70.0 % of the episodes"
     assert headline(found) == f"{alone}, and no other condition does better."
 
 

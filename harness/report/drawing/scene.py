@@ -12,7 +12,7 @@ from matplotlib.patches import Patch, Polygon
 
 from harness.core.errors import printable, unknown
 from harness.dataset.load import Scene
-from harness.report.drawing.colours import BLUE, GREY, INK, PURPLE, VERMILLION
+from harness.report.drawing.colours import GREY, INK, ROLES
 from harness.report.drawing.geometry import VIEW_M, conflict_points, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.labels import Labels
@@ -24,17 +24,17 @@ SIDE_IN = 5.8  # of the square that shows it
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 
 LOOKS: dict[str, dict[str, Any]] = {
-    "ego": {"facecolor": BLUE, "edgecolor": INK, "linewidth": 1.0},
-    "helper": {"facecolor": "#8FD9BF", "edgecolor": "#00563F", "hatch": "//////", "linewidth": 0.8},
-    "danger": {"facecolor": VERMILLION, "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
+    "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
+    "helper": {"facecolor": "#E3CCEB", "edgecolor": "#6A3D80", "hatch": "//////", "linewidth": 0.8},
+    "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }
 HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
 DIAMOND: dict[str, Any] = {
-    "marker": "D", "markerfacecolor": "none", "markeredgecolor": VERMILLION, "markeredgewidth": 1.4,
+    "marker": "D", "markerfacecolor": "none", "markeredgecolor": ROLES["danger"], "markeredgewidth": 1.4,
 }  # fmt: skip
-CROSS: dict[str, Any] = {"marker": "X", "color": PURPLE, "markeredgecolor": INK, "markersize": 7}
-SIGHT = "#005A8C"
+CROSS: dict[str, Any] = {"marker": "X", "color": INK, "markeredgecolor": INK, "markersize": 7}
+SIGHT = "#8A8F98"
 NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other": "other vehicle"}
 
 
@@ -104,14 +104,14 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
         east, north = centre / np.abs(centre).max()
         horizontal, vertical = "<" if east < 0 else ">", "v" if north < 0 else "^"
         marker = horizontal if abs(east) == 1 else vertical
-        axes.plot(*edge, marker=marker, color=VERMILLION if look == "danger" else GREY, markersize=5)
+        axes.plot(*edge, marker=marker, color=ROLES["danger"] if look == "danger" else GREY, markersize=5)
         labels.add(edge, 1.5, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
     style = style_of(look, hidden)
     if hidden:
         style["linewidth"] = 1.1
-        style["edgecolor"] = VERMILLION if look == "danger" else style["edgecolor"]
+        style["edgecolor"] = ROLES["danger"] if look == "danger" else style["edgecolor"]
     axes.add_patch(Polygon(corners, **style, zorder=3))
     along = north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
     nose = centre + along * vehicle.length_m / 2
@@ -144,7 +144,7 @@ def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
         labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))
         text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
         # Labels of two points go apart, or their lines would cross.
-        labels.add(point, 2.0, text, colour="#8E3B6B", toward=point - points.mean(axis=0))
+        labels.add(point, 2.0, text, colour=INK, toward=point - points.mean(axis=0))
 
 
 def _when(arrival: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from itertools import cycle
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 
 from harness.core.errors import printable
 from harness.evaluate.replay import Played, Still
-from harness.report.drawing.colours import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILLION
+from harness.report.drawing.colours import BAD, GOOD, GREY, INK, LATE, ROLES
+from harness.report.drawing.colours import actions as colours_of
 from harness.report.drawing.geometry import VIEW_M, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.scene import style_of
@@ -27,7 +27,6 @@ Pixels = NDArray[np.uint8]  # (height, width, 3)
 
 SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
-EYES = (BLUE, GREEN, PURPLE, ORANGE)  # of the ego and the helpers: lines to what each sees
 
 
 class Canvas:
@@ -81,7 +80,8 @@ class Canvas:
 
 def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
-    for colour, (viewer, ids) in zip(cycle(EYES), seen.items(), strict=False):
+    for viewer, ids in seen.items():
+        colour = ROLES["ego" if viewer == state.ego.id else "helper"]
         lines = [np.array([at[viewer], at[other]]) for other in ids]
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
@@ -90,7 +90,7 @@ def _vehicle(vehicle: VehicleState, known: bool) -> Artist:
     """Filled if the ego knew of it when its last decision began."""
     style = style_of(vehicle.part, not known)
     if known and vehicle.crashed:
-        style["facecolor"] = VERMILLION
+        style["facecolor"] = BAD
     return Polygon(north_up(vehicle.corners()), **style)
 
 
@@ -122,13 +122,14 @@ def _messages(played: Played, still: Still) -> Iterator[Artist]:
         place = path[0] + share * (path[1] - path[0])
         yield Line2D(*path.T, color=GREY, linewidth=0.8, linestyle=":")
         if still.since_s >= sent_s:
-            colour = VERMILLION if lost or not message.on_time else INK
+            colour = BAD if lost else GOOD if message.on_time else LATE
             yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
 
 
 def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
     """The policy of the last decision, pale until it is ready."""
-    decision = still.decision
+    decision, colours = still.decision, colours_of(actions)
     for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
-        colour = VERMILLION if action == decision.action else "#BBBBBB"
-        yield Rectangle((0.0, n - 0.4), p, 0.8, color=colour, alpha=0.35 if still.open else 1.0)
+        edge = {"edgecolor": INK, "linewidth": 1.4 if action == decision.action else 0.3}
+        pale = 0.35 if still.open else 1.0
+        yield Rectangle((0.0, n - 0.4), p, 0.8, facecolor=colours[action], alpha=pale, **edge)

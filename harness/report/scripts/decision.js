@@ -1,4 +1,4 @@
-// One decision: the scene, who answered what to which prompt, what was fused from it, and what came of it.
+// The page of one decision: the scene, the answers with their prompts, the fused policy and its outcome.
 
 const outcome = ({ result, partner, fault }) =>
   result.replaceAll("_", " ") + (partner ? ` with ${partner}` : "") + (fault ? `, fault: ${fault}` : "");
@@ -119,13 +119,11 @@ class DecisionPage {
         this.told ? null : h("p", { class: "bad" }, "This run did not come to this scene."),
         h("div", { class: "pair" },
           this.picture(),
-          h("div", {}, this.came())),
+          h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
         h("h2", {}, "What was decided"),
         this.told ? this.decided() : null,
         this.about.names.length > 1 ? this.inEveryRun() : null,
-        h("div", { class: "figures" },
-          h("figure", {}, h("h3", {}, "Distributions before and after fusion"), policies),
-          h("figure", {}, h("h3", {}, "Latency, from seeing to acting"), timeline)),
+        h("h3", {}, "Latency, from seeing to acting"), timeline,
         h("h2", {}, "Prompts and answers"),
         (this.told?.answers ?? []).map((answer) =>
           answerSection(answer, this.detail, this.index.actions, this.about.meanings)),
@@ -169,7 +167,7 @@ class DecisionPage {
       pick("condition", "condition", same(this.made.map((d) => d.condition)), this.chosen?.condition),
       pick("seed", "seed", same(this.list.run.seeds), String(this.state.seed)),
       this.viewer ? pick("seen by", "viewer", same(this.viewers), this.viewer) : null,
-      this.viewer ? pick("view", "zoom", [["far", "160 m"], ["near", "80 m"]], this.params.get("zoom") ?? "far") : null,
+      this.viewer ? pick("view", "zoom", [["", "the conflict"], ["all", "all, 160 m"]], this.params.get("zoom") ?? "") : null,
       h("button", { type: "button", onclick: (event) => copy(event.target, location.href) }, "Copy link"));
   }
 
@@ -179,8 +177,7 @@ class DecisionPage {
       return h("p", { class: "picture" }, "No picture: this moment was not played again, or playing it again here does "
         + "not come to it. `harness video` draws the whole episode.");
     }
-    const half = this.params.get("zoom") === "near" ? ground.view_m / 2 : ground.view_m;
-    const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], half);
+    const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
     return h("div", { class: "picture" },
       drawing, h("p", { class: "quiet" }, `${said}. `, KEY), save("svg"), " ", save("png"));

@@ -1,6 +1,6 @@
 // The list of all decisions: filters, search, pages. Its state is in the page's address.
 
-const PAGE = 50;
+const PAGE = 20;
 const FILTERS = ["q", "run", "seed", "condition", "outcome", "danger", "status", "differ", "asked", "page"];
 
 class List {

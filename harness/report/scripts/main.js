@@ -1,7 +1,7 @@
 // What the address says is shown: the report, or one decision.
 
 const report = document.getElementById("report"), single = document.getElementById("decision");
-let about, index, list, page, drawn;
+let about, index, list, strips, page, drawn;
 
 function themes() {
   const button = document.getElementById("theme"), root = document.documentElement;
@@ -26,6 +26,7 @@ async function route() {
     return;
   }
   list.show();
+  strips.show();
   drawn ??= drawAll(about.charts);
   if (params.has("decisions")) {
     const coming = document.getElementById("decisions").getBoundingClientRect().top;
@@ -45,6 +46,7 @@ addEventListener("keydown", (event) => {
   document.querySelectorAll("table.sortable").forEach(sortable);
   [about, index] = (await Promise.all([unpacked("about"), unpacked("index")])).map(JSON.parse);
   list = new List(index, about, document.getElementById("list"));
+  strips = new Episodes(list, about.actions, document.getElementById("strips"));
   page = new DecisionPage(single, list, index, about);
   document.querySelectorAll("a[data-scene]").forEach((a) => { a.href = `#${new URLSearchParams(a.dataset)}`; });
   addEventListener("hashchange", route);

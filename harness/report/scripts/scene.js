@@ -12,87 +12,122 @@ const line = (a, b, cls) => svg("line", { x1: a[0], y1: -a[1], x2: b[0], y2: -b[
 const overlap = (a, b) =>
   Math.max(0, Math.min(a[2], b[2]) - Math.max(a[0], b[0])) * Math.max(0, Math.min(a[3], b[3]) - Math.max(a[1], b[1]));
 
-// The first of some places around a vehicle where its label covers nothing that was placed before.
-function placed(taken, half, x, y, width, height, away) {
+// The first of some places around what a label names where it covers nothing that was placed before.
+function placed(taken, view, x, y, width, height, away) {
   const around = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]];
   let best, least = Infinity;
-  for (const reach of [1, 2.2]) {
+  for (const reach of [0, 1, 2.5, 5]) {
     for (const [dx, dy] of around) {
-      const cx = x + dx * (away * reach + width / 2), cy = y + dy * (away * reach + height / 2);
+      const far = away + reach * height;
+      const cx = x + dx * (far + width / 2), cy = y + dy * (far + height / 2);
       const box = [cx - width / 2, cy - height / 2, cx + width / 2, cy + height / 2];
       const covered = taken.reduce((sum, other) => sum + overlap(box, other), 0);
-      const outside = width * height - overlap(box, [-half, -half, half, half]);
-      const cost = covered + 4 * outside + (reach > 1 ? 1 : 0);
-      if (cost < least) [least, best] = [cost, [cx, cy, box]];
+      const outside = width * height - overlap(box, view);
+      const cost = covered + 4 * outside + 0.02 * reach * width * height;
+      if (cost < least) [least, best] = [cost, [cx, cy, box, reach]];
     }
   }
   taken.push(best[2]);
   return best;
 }
 
-function birdsEye(world, ground, viewer, messages, half) {
+// A square around where paths cross and who comes there, as [west, north, side] in the picture's metres.
+function action(world, ego, sees, messages, most) {
+  const who = world.vehicles.filter((v) => v === ego || v.part === "danger" || sees.conflicts.some((c) => c.with === v.id)
+    || messages.some((m) => m.from === v.id));
+  const near = who.filter((v) => Math.hypot(v.x - ego.x, v.y - ego.y) < most);
+  const spots = [...near.map((v) => [v.x, -v.y]), ...sees.conflicts.map((c) => [c.x, -c.y])];
+  const [xs, ys] = [0, 1].map((k) => spots.map((spot) => spot[k]));
+  const side = Math.min(2 * most, Math.max(44, Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys)) + 16);
+  return [(Math.max(...xs) + Math.min(...xs) - side) / 2, (Math.max(...ys) + Math.min(...ys) - side) / 2, side];
+}
+
+// What lies behind walls and vehicles as seen from the middle of one, which is where its rays begin.
+function shadows(world, eye, far) {
+  const shapes = [...world.buildings.map((b) => b.corners), ...world.vehicles.filter((v) => v !== eye).map(corners)];
+  const beyond = ([x, y]) => {
+    const dx = x - eye.x, dy = y - eye.y, length = Math.hypot(dx, dy) || 1;
+    return [x + (dx / length) * far, y + (dy / length) * far];
+  };
+  return svg("g", { class: "shadow" }, shapes.flatMap((shape) => shape.map((a, n) => {
+    const b = shape[(n + 1) % shape.length];
+    return svg("polygon", { points: points([a, b, beyond(b), beyond(a)]) });
+  })));
+}
+
+function birdsEye(world, ground, viewer, messages, zoom) {
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
-  const seen = new Set([viewer, ...sees.seen]);
+  const seen = new Set([viewer, ...sees.seen]), most = ground.view_m;
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
-  const size = half / 23, within = (v) => Math.abs(v.x) < half - 1 && Math.abs(v.y) < half - 1;
+  const [west, north, side] = zoom === "all" ? [-most, -most, 2 * most] : action(world, ego, sees, messages, most);
+  const view = [west, north, west + side, north + side], size = side / 38;
+  const within = (v) => v.x > west + 1 && v.x < view[2] - 1 && -v.y > north + 1 && -v.y < view[3] - 1;
   const hidden = world.vehicles.filter((v) => !seen.has(v.id)).map((v) => v.id);
   const listed = (names) => names.join(", ") || "none";
   const beyond = world.vehicles.filter((v) => !within(v)).map((v) => v.id);
   const told = `${viewer} (${sees.role}) sees ${listed(sees.seen)}; hidden: ${listed(hidden)}; `
     + `occluded sectors: ${listed(sees.occluded)}${beyond.length ? `; beyond the picture: ${listed(beyond)}` : ""}`;
-  const viewBox = `${-half} ${-half} ${2 * half} ${2 * half}`;
-  const picture = svg("svg", { viewBox, class: "scene", role: "img", "aria-label": told });
+  const picture = svg("svg", { viewBox: `${west} ${north} ${side} ${side}`, class: "scene", role: "img", "aria-label": told });
   picture.append(
-    ...world.buildings.map((b) => svg("polygon", { points: points(b.corners), class: "building" })),
     svg("polygon", { points: points(ground.outline), class: "road" }),
     ...ground.marks.map((m) => svg("polyline", { points: points(m), class: "mark" })),
     ...ground.stops.map((s) => svg("polyline", { points: points(s), class: "stop" })),
+    shadows(world, eye, 4 * most),
+    ...world.buildings.map((b) => svg("polygon", { points: points(b.corners), class: "building" })),
     ...world.vehicles.filter((v) => v !== eye && seen.has(v.id)).map((v) => line([eye.x, eye.y], [v.x, v.y], "sight")),
   );
   const taken = world.vehicles.filter(within).map((v) => {
-    const r = v.length / 2;
-    return [v.x - r, -v.y - r, v.x + r, -v.y + r];
+    const [xs, ys] = [0, 1].map((k) => corners(v).map((corner) => (k ? -corner[k] : corner[k])));
+    return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
   });
+  taken.push(...sees.conflicts.map((c) => [c.x - 1.5, -c.y - 1.5, c.x + 1.5, 1.5 - c.y]));
+  const label = (text, x, y, away, kind) => {
+    const [lx, ly, box, reach] = placed(taken, view, x, y, text.length * size * 0.56, size * 1.15, away);
+    if (reach > 1) {
+      const end = [Math.min(Math.max(x, box[0]), box[2]), Math.min(Math.max(y, box[1]), box[3])];
+      picture.append(svg("line", { x1: x, y1: y, x2: end[0], y2: end[1], class: "leader" }));
+    }
+    picture.append(svg("text", { x: lx, y: ly, "font-size": size, class: `label ${kind}` }, text));
+  };
   for (const v of world.vehicles) {
     if (!within(v)) continue;
-    const marks = [v.part !== "other" && v.part, !seen.has(v.id) && "hidden", v.crashed && "crashed"];
     const shape = corners(v);
     const nose = [v.x + (Math.cos(v.heading) * v.length) / 2, v.y + (Math.sin(v.heading) * v.length) / 2];
     const tip = [nose[0] + Math.cos(v.heading) * v.speed, nose[1] + Math.sin(v.heading) * v.speed];
     picture.append(svg("g", { class: `vehicle ${v.part}${seen.has(v.id) ? "" : " unseen"}` },
-      svg("title", {}, `${v.id}, ${v.kind}, ${v.speed} m/s`),
+      svg("title", {}, `${v.id}, ${v.kind}, ${v.speed} m/s${seen.has(v.id) ? "" : `, hidden from ${viewer}`}`),
       svg("polygon", { points: points(shape) }),
       svg("polyline", { points: points([shape[1], nose, shape[0]]), class: "nose" }),
       v.speed > 0.5 ? line(nose, tip, "speed") : null,
       v.part === "danger" && svg("path", { d: `M${v.x} ${-v.y - 4.6}l4.6 4.6l-4.6 4.6l-4.6 -4.6z`, class: "ring" })));
-    const text = [v.id, ...marks.filter(Boolean)].join(" ");
-    const [x, y] = placed(taken, half, v.x, -v.y, text.length * size * 0.58, size * 1.1, v.length / 2 + 0.5);
-    picture.append(svg("text", { x, y, "font-size": size, class: `label ${v.part}` }, text));
   }
+  const when = (s) => (s == null ? "stands" : s < 0 ? "past" : `${s.toFixed(1)} s`);
+  const both = (c) => `${ego.id} ${when(c.ego)}, ${c.with} ${when(c.other)}`;
   for (const c of sees.conflicts) {
-    const when = (s) => (s == null ? "stands" : s < 0 ? "is past it" : `in ${s.toFixed(1)} s`);
-    const told = `${ego.id} ${when(c.ego)}, ${c.with} ${when(c.other)}`;
-    const cross = `M${c.x - 1.3} ${-c.y - 1.3}l2.6 2.6m0 -2.6l-2.6 2.6`;
-    picture.append(svg("path", { d: cross, class: "conflict" }, svg("title", {}, `paths cross: ${told}`)));
-    const [x, y] = placed(taken, half, c.x, -c.y, told.length * size * 0.5, size, 1.8);
-    picture.append(svg("text", { x, y, "font-size": size * 0.85, class: "label crossing" }, told));
+    picture.append(svg("path", { d: `M${c.x - 1.3} ${-c.y - 1.3}l2.6 2.6m0 -2.6l-2.6 2.6`, class: "conflict" },
+      svg("title", {}, `paths cross: ${both(c)}`)));
   }
   for (const m of messages) {
     const sender = world.vehicles.find((v) => v.id === m.from);
     if (!sender) continue;
-    const kind = m.on_time ? "ontime" : m.delivered ? "late" : "lost";
-    const told = m.delivered ? `${m.arrival_ms.toFixed(0)} ms${m.on_time ? "" : ", late"}` : "lost";
-    picture.append(line([sender.x, sender.y], [ego.x, ego.y], `message ${kind}`));
-    const at = m.delivered ? 0.55 : 0.4;
-    const x = sender.x + (ego.x - sender.x) * at, y = -(sender.y + (ego.y - sender.y) * at);
-    const [lx, ly] = placed(taken, half, x, y, told.length * size * 0.55, size, 0.6);
-    picture.append(svg("text", { x: lx, y: ly, "font-size": size * 0.9, class: `label ${kind}` }, told));
+    picture.append(line([sender.x, sender.y], [ego.x, ego.y], `message ${m.on_time ? "ontime" : m.delivered ? "late" : "lost"}`));
   }
+  for (const v of world.vehicles.filter(within)) {
+    const fate = messages.find((m) => m.from === v.id);
+    const said = !fate ? "" : fate.delivered ? `, ${fate.arrival_ms.toFixed(0)} ms${fate.on_time ? "" : " late"}` : ", lost";
+    label(`${v.id} ${v.speed.toFixed(0)} m/s${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
+  }
+  for (const c of sees.conflicts) label(both(c), c.x, -c.y, 1.6, "crossing");
+  const bar = side > 100 ? 20 : 10, [left, foot] = [west + side * 0.03, view[3] - side * 0.03];
+  picture.append(
+    svg("path", { d: `M${left} ${foot - side * 0.01}v${side * 0.01}h${bar}v${-side * 0.01}`, class: "scale" }),
+    svg("text", { x: left + bar / 2, y: foot - size * 0.9, "font-size": size, class: "label" }, `${bar} m`),
+  );
   return [picture, told];
 }
 
-const KEY = "Blue: ego; green: helper; red with a ring: the dangerous vehicle; dashed: hidden from the viewer. "
-  + "Thin lines: sight. Ahead of a vehicle its way in 1 s, × where paths cross. Thick lines to the ego: replies.";
+const KEY = "Purple: the ego; light: helpers; pink with a ring: the dangerous vehicle; dashed: hidden from the viewer, and so is "
+  + "all that is shaded. An arrow is the way in 1 s, × where paths cross and when who is there. Thick lines: replies to the ego.";
 const LOOKS = [
   "fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linejoin", "vector-effect", "opacity", "font-family",
   "font-weight", "text-anchor", "dominant-baseline", "paint-order",

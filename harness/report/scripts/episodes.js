@@ -1,0 +1,70 @@
+// Episodes as strips of their decisions, those that lost most first: a cell is one decision, and opens it.
+
+const STRIPS = 12; // shown until all are asked for
+
+// What an episode came to under one condition with one seed.
+function course(list, scenes, run, condition, seed) {
+  const path = scenes.filter((n) => list.action(n, run, condition, seed) != null);
+  const ends = path.map((n) => list.letter("ended", n, run, condition, seed));
+  return { path, ends, seed, lost: ends.includes("u"), slow: ends.filter((end) => end === "d").length };
+}
+
+class Episodes {
+  constructor(list, colours, place) {
+    Object.assign(this, { list, colours, place, every: false, by: "" });
+    this.episodes = new Map();
+    list.index.scenes.forEach(([, episode], n) => {
+      this.episodes.set(episode, [...(this.episodes.get(episode) ?? []), n]);
+    });
+  }
+
+  show() {
+    const { list, place } = this, { run } = list.state, { conditions, seeds } = list.run;
+    if (!conditions.includes(this.by)) this.by = "";
+    const found = [...this.episodes].map(([episode, scenes]) => {
+      const by = conditions.map((c) => seeds.map((seed) => course(list, scenes, run, c, seed)));
+      const counted = by.filter((_, n) => !this.by || conditions[n] === this.by).flat();
+      const sum = (of) => counted.reduce((total, one) => total + Number(one[of]), 0);
+      return { episode, danger: list.index.scenes[scenes[0]][3], by, cost: [sum("lost"), sum("slow")] };
+    }).filter(({ by }) => by.flat().some(({ path }) => path.length));
+    found.sort((a, b) => b.cost[0] - a.cost[0] || b.cost[1] - a.cost[1]);
+    const lossy = found.filter(({ cost }) => cost[0]).length;
+    const shown = this.every ? found : found.slice(0, STRIPS);
+    const rows = shown.map(({ episode, danger, by }) =>
+      [String(episode), danger ?? "none", ...by.map((of, n) => this.strip(of, run, conditions[n]))]);
+    const pick = choice("sorted by losses under", "by", [["", "all conditions"], ...conditions.map((c) => [c, c])], this.by,
+      (event) => { this.by = event.target.value; this.show(); });
+    place.replaceChildren();
+    fill(place, {}, [
+      h("form", { class: "filters" }, pick),
+      h("p", { class: "quiet" }, `${lossy} of ${found.length} episodes are lost with a seed or more.`),
+      table("episodes", ["episode", "danger", ...conditions], rows),
+      found.length > shown.length
+        && small(`Show all ${found.length}`, () => { this.every = true; this.show(); }),
+    ]);
+  }
+
+  // With the first seed that loses the episode, where there is one.
+  strip(of, run, condition) {
+    const lost = of.filter((one) => one.lost), one = lost[0] ?? of[0];
+    const said = lost.length ? `lost with ${lost.length} of ${of.length} seeds` : one.slow ? "slow" : "kept";
+    return one.path.length ? [
+      h("span", { class: "strip" }, one.path.map((n, k) => this.cell(n, k, one, run, condition))),
+      h("small", { class: lost.length ? "bad" : "" }, said),
+    ] : "–";
+  }
+
+  cell(n, k, { ends, lost, seed }, run, condition) {
+    const { list } = this, { index } = list, action = list.action(n, run, condition, seed);
+    // In the closed loop a decision has no end of its own, but where the episode begins to fail is known.
+    const end = !index.live ? ends[k] : lost && list.run.first.includes(n) ? "u" : "s";
+    const [colour, text] = this.colours[action];
+    const asked = list.letter("asked", n, run, condition, seed) === "1";
+    const words = { s: "safe", d: "safe, slower than the best", u: "the answer that lost this episode", n: "nothing to lose any more" };
+    const told = `step ${index.scenes[n][2]}: ${action}${asked ? ", asked" : ""}${index.live && end === "s" ? "" : `, ${words[end]}`}`;
+    return h("a", {
+      class: `cell end-${end}`, href: list.link(n, { run, seed, condition }), title: told, "aria-label": told,
+      style: end === "n" ? null : `background:${colour};color:${text}`,
+    }, end === "u" ? `${action[0]}✗` : end === "d" ? `${action[0]}◷` : action[0]);
+  }
+}
