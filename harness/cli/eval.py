@@ -83,7 +83,7 @@ def command(
         return
     folder = out or default_out(spec, resume)
     silent = as_json or quiet
-    with bar(f"asking {printable(spec.card.name, 30)}", 0, silent) as progress:
+    with bar(f"asking {printable(spec.card.name, 30)}", quiet=silent) as progress:
         cache = None if no_cache else default_file()
         done = evaluate(spec, folder, resume, progress, cache, progress.more)
     from harness.cli.report import write
