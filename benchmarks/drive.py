@@ -153,7 +153,7 @@ def wall_s(spec: Spec, workers: int, repeats: int) -> float:
     def once() -> float:
         with tempfile.TemporaryDirectory() as folder:
             start = perf_counter()
-            evaluate(spec, Path(folder) / "run", False, lambda done: None, workers=workers)
+            evaluate(spec, Path(folder) / "run", lambda done: None, workers=workers)
             return perf_counter() - start
 
     return min(once() for _ in range(repeats))

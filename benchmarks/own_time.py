@@ -112,7 +112,7 @@ def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
                 for owner, name in PARTS[part]:
                     clocks.enter_context(clocked(owner, name, spent, part))
             start = process_time()
-            out = run.evaluate(spec, Path(folder) / "run", False, lambda done: None).out
+            out = run.evaluate(spec, Path(folder) / "run", lambda done: None).out
             whole = process_time() - start
         own = whole - spent["proxy"]
         other = whole - sum(spent.values())

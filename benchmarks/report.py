@@ -57,7 +57,7 @@ def main() -> None:
             tuple(POINTS.values()),
             tuple(range(5)),
         )
-        evaluate(spec, base / "run", False, lambda done: None)
+        evaluate(spec, base / "run", lambda done: None)
         runs = gather([base / "run"])
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         for n in given.decisions:

@@ -12,6 +12,7 @@ import msgspec
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene
 from harness.dataset.schema import Branching, Edge, End
 from harness.evaluate.asking import Asker, requests
@@ -43,8 +44,10 @@ def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, *
     return Spec(cards.resolve(model), prompts.load("v2"), LiveSource(first_seed, episodes), **options)
 
 
-def run(spec: Spec, out: Path, resume: bool = False) -> Evaluated:
-    return evaluate(spec, out, resume, lambda done: None)
+def run(spec: Spec, out: Path) -> Evaluated:
+    done = evaluate(spec, out, lambda done: None)
+    tidy(out)
+    return done
 
 
 def figure(done: "Evaluated | Walked", condition: str, metric: str, interval: str = "episodes") -> Score:

@@ -9,9 +9,9 @@ import msgspec
 import pyarrow as pa
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.core.formats import FORMAT
 from harness.runs import folder
 from harness.runs.decisions import Decisions, schema
-from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
 from harness.runs.summary import counted, scores

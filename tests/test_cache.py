@@ -255,7 +255,7 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     points = tuple(POINTS.values())
     source = FrozenSource(data)
     spec = Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
-    return evaluate(spec, out, False, lambda done: None, cache)
+    return evaluate(spec, out, lambda done: None, cache)
 
 
 def test_a_run_from_the_cache_is_the_run_that_was_asked(
@@ -287,7 +287,7 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
 
     file.unlink()
     spec = spec_of(data, f"replay:{tmp_path / 'again'}", seeds=(0,))
-    evaluate(spec, tmp_path / "replayed", False, lambda done: None)
+    evaluate(spec, tmp_path / "replayed", lambda done: None)
     assert answers_of(tmp_path / "replayed") == answers_of(tmp_path / "again")
     assert same_decisions(tmp_path / "replayed", tmp_path / "again")
 
@@ -303,8 +303,7 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
         card = replace(card, server=replace(card.server, base_url=there.url))
         spec = Spec(card, prompts.load("v2"), FrozenSource(data), tuple(POINTS.values()), (0,))
         manifests = [
-            evaluate(spec, tmp_path / name, False, lambda done: None, file).manifest
-            for name in ("first", "again")
+            evaluate(spec, tmp_path / name, lambda done: None, file).manifest for name in ("first", "again")
         ]
     asked = len(answers_of(tmp_path / "first"))
     assert [m.cached_answers for m in manifests] == [0, asked]
@@ -325,7 +324,7 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     source = FrozenSource(load(small_path, limit=1))
     spec = Spec(card, prompts.load("v2"), source, tuple(POINTS.values()), (0,))
     for name in ("first", "again"):
-        done = evaluate(spec, tmp_path / name, False, lambda done: None, file)
+        done = evaluate(spec, tmp_path / name, lambda done: None, file)
     answers = answers_of(tmp_path / "again")
     assert done.manifest.cached_answers == len(answers)
     assert [a.raw for a in answers] == [a.raw for a in answers_of(tmp_path / "first")]
@@ -336,6 +335,6 @@ def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_pat
         card = cards.load(model)
         backend = open_backend(card)
         assert cached(backend, card, file) is backend
-        evaluate(spec_of(small, model), tmp_path / model, False, lambda done: None, file)
+        evaluate(spec_of(small, model), tmp_path / model, lambda done: None, file)
     assert not file.exists()
     assert isinstance(cached(Talker(), cards.load("openai-example"), file), Cached)

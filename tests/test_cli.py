@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from evaluating import spec_of
+from evaluating import run, spec_of
 from tokenizers import Tokenizer, models
 
 from harness import cli
 from harness.cli.options import parse_seeds
 from harness.cli.run import default_out
+from harness.core import work
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
+from harness.evaluate.run import evaluate
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",
@@ -132,8 +134,11 @@ def test_one_changed_byte_is_noticed_in_the_layouts(harness: Harness, broken: Pa
     data = bytearray((broken / "layouts.zip").read_bytes())
     data[len(data) // 2] ^= 1
     (broken / "layouts.zip").write_bytes(data)
-    for command in (["eval"], ["prompt", "check", "v2"]):
-        assert "layouts.zip 0000" in one_line(harness(*command, "--dataset", broken))
+    assert "layouts.zip 0000" in one_line(harness("prompt", "check", "v2", "--dataset", broken))
+    said = harness("eval", "--dataset", broken)
+    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
+    assert "layouts.zip 0000" in said.err
+    assert list(Path("reports").glob("*/.work/answers.jsonl")), "what was answered by then is kept"
 
 
 @pytest.mark.parametrize(
@@ -243,21 +248,49 @@ def test_a_thousand_seeds_are_the_most() -> None:
     assert len(parse_seeds("-1000:0")) == 1000
 
 
-def test_a_run_has_the_first_free_folder_and_resumes_in_the_last(
+HELD = """
+import sys
+from pathlib import Path
+from harness.core.files import alone
+with alone(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def interrupt(done: int) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_run_has_the_first_free_folder_or_goes_on_where_it_was_stopped(
     small: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     spec = spec_of(small)
     base = Path("reports/proxy-v2-small")
-    assert default_out(spec, resume=False) == default_out(spec, resume=True) == base
-    base.mkdir(parents=True)
-    second = base.with_name("proxy-v2-small-2")
-    assert (default_out(spec, resume=False), default_out(spec, resume=True)) == (second, base)
-    second.mkdir()
-    assert default_out(spec, resume=True) == second
+    assert default_out(spec) == base
+    run(spec, base)
+    second, third = (base.with_name(f"proxy-v2-small-{n}") for n in (2, 3))
+    assert default_out(spec) == second
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        evaluate(spec, second, interrupt)
+    assert stopped.value.__notes__ == [f"{second} keeps what is done"]
+    assert default_out(spec) == second
+    assert default_out(replace(spec, seeds=(7,))) == third, "it was begun with other settings"
+    monkeypatch.setattr(work, "GONE_S", 0.0)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HELD, str(second / ".work" / "lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdout.readline()
+    assert default_out(spec) == third, "another process is at it"
+    holder.communicate()
+    (second / ".work" / "config.json").write_text("{")
+    assert default_out(spec) == third, "it is damaged"
     hostile = replace(spec, card=replace(spec.card, name="../../etc/\x00\n"))
-    assert default_out(hostile, resume=False).parent == Path("reports")
-    assert "/" not in default_out(hostile, resume=False).name
+    assert default_out(hostile).parent == Path("reports")
+    assert "/" not in default_out(hostile).name
 
 
 @pytest.mark.parametrize("args", [["--help"], ["eval", "--help"], ["prompt", "--help"], ["model", "--help"]])

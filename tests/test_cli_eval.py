@@ -44,7 +44,7 @@ def test_json_is_the_manifest_and_the_summary(harness: Callable[..., Said], smal
     assert rows["6g", "success_rate", "episodes"]["n"] == 1
 
 
-def test_the_same_again_is_refused_and_resumed_it_says_the_same(
+def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     harness: Callable[..., Said], small_path: Path
 ) -> None:
     args = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out", "run")
@@ -53,11 +53,15 @@ def test_the_same_again_is_refused_and_resumed_it_says_the_same(
     code, out, err = harness(*args)
     assert (code, out) == (2, "")
     assert err == "harness: --out run already holds a finished run; choose another folder or delete it\n"
-    code, again, err = harness(*args, "--resume")
-    assert (code, again, err) == (0, first, "")
-    code, out, err = harness(*args[:-4], "--seeds", "1", "--out", "run", "--resume")
+    Path("run/.work").mkdir()  # as if it was killed while it wrote the report
+    Path("run/report.html").unlink()
+    code, out, err = harness(*args[:-4], "--seeds", "1", "--out", "run")
     assert (code, out) == (2, "")
-    assert err.startswith("harness: --resume: run was begun with another seeds; repeat its settings")
+    assert err.startswith("harness: --out run was begun with another seeds; repeat its settings")
+    code, again, err = harness(*args)
+    assert (code, again, err) == (0, first, "")
+    assert Path("run/report.html").is_file()
+    assert not Path("run/.work").exists()
 
 
 def test_a_dataset_in_the_command_has_its_name_or_a_path_from_here(

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -249,3 +250,16 @@ def test_an_answer_that_is_not_free_text_is_always_strict(backend: LanguageModel
 def test_requests_that_are_answered_alike_share_a_batch(backend: LanguageModel) -> None:
     requests = [ask(i, mode) for i in range(3) for mode in MODES]
     assert [c.batch_size for c in backend.complete(requests)] == [3] * 9
+
+
+@pytest.mark.parametrize("answer", MODES)
+def test_weights_that_are_no_numbers_are_an_error_of_the_engine_and_no_answer(
+    answer: AnswerMode, tmp_path: Path
+) -> None:
+    folder = tiny_qwen3.spoil(tiny_qwen3.build(tmp_path / "tiny"))
+    broken = open_backend(resolve(str(folder)), batch_size=2, device="cpu")
+    for said in broken.complete([ask(1, answer), ask(2, answer)]):
+        assert (said.text, said.finish_reason) == ("", "error")
+        assert said.error == (
+            "ArithmeticError: the logits are no numbers; the weights are damaged, or too large for this dtype"
+        )

@@ -106,7 +106,7 @@ def test_a_whole_run_makes_each_fusion_call_once(
     spec = spec_of(small, LANGUAGE_MODEL, points=(FUSION, slow), latency="paper", seeds=(0, 1, 2))
     announced: list[int] = []
     answered: list[int] = []
-    evaluate(spec, tmp_path / "run", False, answered.append, more=announced.append)
+    evaluate(spec, tmp_path / "run", answered.append, more=announced.append)
     calls = [name for name in backend.asked if "+" in name]
     assert set(Counter(calls).values()) == {1}
     steps = Counter(name.split("-")[1] for name in calls)
@@ -248,7 +248,7 @@ def killed(spec: Spec, out: Path, how: str, after: int) -> None:
             raise Killed
 
     with pytest.raises(Killed):
-        evaluate(spec, out, False, progress, more=more)
+        evaluate(spec, out, progress, more=more)
 
 
 @pytest.mark.parametrize("how", ["announced", "made"])
@@ -257,7 +257,7 @@ def test_killed_among_the_fusion_calls_it_goes_on(
 ) -> None:
     spec = spec_of(small, LANGUAGE_MODEL, points=CONDITIONS, latency="paper")
     killed(spec, tmp_path / "run", how, after=1)
-    run(spec, tmp_path / "run", resume=True)
+    run(spec, tmp_path / "run")
     assert same_decisions(tmp_path / "run", done.out)
     timeless = [
         [msgspec.structs.replace(answer, seconds=None) for answer in answers_of(out)]
@@ -290,7 +290,7 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
     killed(spec, tmp_path / "run", "made", after=20)
     begun = json.loads((tmp_path / "run/.work/config.json").read_text())["latency"]
     monkeypatch.setattr(timing, "load_a_core", lambda: 9.0)
-    resumed = run(spec, tmp_path / "run", resume=True)
+    resumed = run(spec, tmp_path / "run")
     assert msgspec.to_builtins(resumed.manifest.latency) == begun
     assert 0 < begun["ego_s"] < begun["fusion_s"]
     fused = [d for d in decisions(tmp_path / "run", FUSION.name) if any(m.on_time for m in d.messages)]

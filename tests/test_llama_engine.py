@@ -433,3 +433,19 @@ def test_nothing_is_said_on_stderr(tiny: Path, capfd: pytest.CaptureFixture[str]
         open_gguf(tiny / "config.json")
     opened.close()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
+def test_weights_that_are_no_numbers_are_an_error_of_the_engine_and_no_answer(
+    answer: str, tmp_path: Path
+) -> None:
+    folder = tiny_qwen3.spoil(tiny_qwen3.build(tmp_path / "tiny"), 1234.5)  # an export refuses NaN
+    file = folder / "F32.gguf"
+    export(folder, file, "F32")
+    marked, spoilt = (np.float32(value).tobytes() for value in (1234.5, np.nan))
+    file.write_bytes(file.read_bytes().replace(marked, spoilt))
+    for completion in open_gguf(file).complete(
+        [replace(r, answer=answer, max_tokens=80) for r in REQUESTS[:2]]
+    ):
+        assert completion.text == ""
+        assert "the logits are no numbers" in str(completion.error)

@@ -49,3 +49,22 @@ def test_every_recovered_completion_has_its_repairs_written_down() -> None:
 def test_the_corpus_shows_every_status_and_every_repair() -> None:
     assert {case.status for case in CASES} == set(Status)
     assert {repair for case in CASES for repair in case.expected.get("repairs", ())} == set(Repair)
+
+
+@pytest.mark.parametrize(
+    ("unit", "status", "detail"),
+    [
+        ('{"a":', Status.SYNTAX, "more than 3 braces that open no JSON object"),
+        ('{\\"a\\":', Status.SYNTAX, "more than 3 braces that open no JSON object"),
+        ("{}", Status.SYNTAX, "more than 5000 JSON objects"),
+        ("</think>", Status.EMPTY, "there is no answer in the text"),
+        ("<think>x</think>", Status.EMPTY, "there is no answer in the text"),
+        ("\\", Status.NO_JSON, "there is no JSON object in the text"),
+    ],
+)
+def test_a_megabyte_of_noise_is_given_up_before_it_takes_minutes(
+    unit: str, status: Status, detail: str
+) -> None:
+    """Tries are few where each is long. Time by size: benchmarks/campaigns/sizes.py."""
+    parsed = parse(unit * (1_000_000 // len(unit)), role="ego", actions=ACTIONS)
+    assert (parsed.status, parsed.detail) == (status, detail)

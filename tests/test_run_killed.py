@@ -44,10 +44,10 @@ def test_killed_at_any_time_and_resumed_it_is_the_same_run(killed: Path, small: 
 def _all_become_whole(outs: list[Path], killed: Path, small: Dataset) -> None:
     spec = spec_of(small)
     for out in outs:
-        done = run(spec, out, resume=True)
+        if not (out / "run.json").exists() or (out / ".work").exists():
+            assert run(spec, out).manifest.seeds == (0, 1)
         assert same_files(out, killed / "whole"), out.name
         assert {p.name for p in out.iterdir()} == RESULT, out.name
-        assert done.manifest.seeds == (0, 1)
 
 
 def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
@@ -60,7 +60,7 @@ def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
         raise Killed
 
     with pytest.raises(Killed):
-        evaluate(spec, out, False, die)
+        evaluate(spec, out, die)
     (out / ".work" / "answers.jsonl").write_bytes(kept)
     return out
 
@@ -80,7 +80,7 @@ def test_a_torn_last_line_is_dropped_and_asked_again(
     whole = tmp_path / "whole"
     run(spec_of(small), whole)
     out = unfinished(spec_of(small), tmp_path / "torn", answers[:-torn])
-    run(spec_of(small), out, resume=True)
+    run(spec_of(small), out)
     assert same_files(out, whole)
 
 
@@ -100,14 +100,14 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     marked = answers.replace(b'\\"IDLE\\"', b'\\"idle\\"', 1)
     assert marked != answers
     out = unfinished(spec_of(small), tmp_path / "run", marked)
-    run(spec_of(small), out, resume=True)
+    run(spec_of(small), out)
     assert b'\\"idle\\"' in (out / "answers.jsonl").read_bytes()
 
 
 def test_damaged_answers_are_one_line(answers: bytes, small: Dataset, tmp_path: Path) -> None:
     out = unfinished(spec_of(small), tmp_path / "run", b"[1\n" + answers)
     with pytest.raises(UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"):
-        run(spec_of(small), out, resume=True)
+        run(spec_of(small), out)
 
 
 @pytest.mark.parametrize(
@@ -129,19 +129,24 @@ def test_other_settings_are_refused_by_name_and_change_nothing(
     out = tmp_path / "run"
     if finished:
         run(spec_of(small), out)
+        (out / ".work").mkdir()
     else:
         unfinished(spec_of(small), out, answers[:5000])
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     with pytest.raises(UserError, match=f"was begun with another {named}; repeat its settings"):
-        run(spec_of(small, **other), out, resume=True)
+        run(spec_of(small, **other), out)
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
-def test_resuming_a_finished_run_asks_and_writes_nothing(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(
+    small: Dataset, tmp_path: Path
+) -> None:
     first = run(spec_of(small), tmp_path / "run")
-    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()}
-    again = run(spec_of(small), tmp_path / "run", resume=True)
-    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()} == before
+    (tmp_path / "run" / ".work").mkdir()
+    files = [p for p in (tmp_path / "run").iterdir() if p.is_file()]
+    before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files}
+    again = run(spec_of(small), tmp_path / "run")
+    assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "run").iterdir()} == before, "tidy"
     assert again.manifest == first.manifest
     assert list(again.scores) == list(first.scores)
 
@@ -152,6 +157,6 @@ def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Datase
         alone(out / ".work" / "lock"),
         pytest.raises(UserError, match=r"is being written by another process; wait for it"),
     ):
-        run(spec_of(small), out, resume=True)
+        run(spec_of(small), out)
     assert (out / ".work" / "answers.jsonl").read_bytes() == answers[:5000]
-    run(spec_of(small), out, resume=True)
+    run(spec_of(small), out)

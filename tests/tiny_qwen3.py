@@ -81,3 +81,14 @@ def build(folder: Path, *, template: str | None = TEMPLATE, context_tokens: int 
     model.save_pretrained(folder)
     assert json.loads((folder / "generation_config.json").read_text())["temperature"] == 0.6
     return folder
+
+
+def spoil(folder: Path, value: float = float("nan")) -> Path:
+    """Make the weights of a checkpoint's last norm no numbers, or others."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    weights = load_file(folder / "model.safetensors")
+    weights["model.norm.weight"] = torch.full_like(weights["model.norm.weight"], value)
+    save_file(weights, folder / "model.safetensors", {"format": "pt"})
+    return folder

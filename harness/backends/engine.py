@@ -3,6 +3,7 @@
 The answer modes are written once, on top of this; an engine knows nothing of JSON, letters or roles.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -57,6 +58,14 @@ class Engine(Protocol):
     def identity(self) -> dict[str, Any]:
         """What decides the answers, as JSON: engine, versions, weights, settings."""
         ...
+
+
+def check_logits(largest: Sequence[float]) -> None:
+    """Raise ArithmeticError if some sequence's largest logit is no number: its answer would mean nothing."""
+    if not all(map(math.isfinite, largest)):
+        raise ArithmeticError(
+            "the logits are no numbers; the weights are damaged, or too large for this dtype"
+        )
 
 
 def common_length(sequences: Sequence[list[int]]) -> int:

@@ -3,7 +3,10 @@
 Heavy packages load inside the commands, so that `harness --help` answers at once.
 """
 
+import errno
 import os
+import shlex
+import signal
 import sys
 from importlib import import_module
 from typing import Any
@@ -37,12 +40,24 @@ for panel, names in PANELS.items():
         else:
             app.command(name, rich_help_panel=panel)(module.command)
 
+# What is wrong with the machine and not with the program: disks that are full, read-only, broken or not ours.
+MACHINE = frozenset({
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR,
+    errno.EISDIR, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ELOOP,
+})  # fmt: skip
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as Ctrl-C does."""
+
+
 # typer carries a click of its own and exports of its errors only this one's children.
 _UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
-    """Entry point: bad input is one line on stderr and exit code 2."""
+    """Entry point: what a user can mend is one line on stderr and exit code 2."""
+    signal.signal(signal.SIGTERM, _terminate)
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
     program = get_command(app)
     shell.hasten(program)
@@ -50,8 +65,19 @@ def main() -> None:
         sys.exit(program(standalone_mode=False))
     except UserError as error:
         _fail(str(error))
-    except typer.Abort:
-        _fail("interrupted", 130)
+    except shell.Stopped as stopped:
+        terminated = isinstance(stopped.__cause__, _Terminated)
+        said = ["terminated" if terminated else "interrupted", *getattr(stopped.__cause__, "__notes__", ())]
+        if len(said) > 1:
+            said.append(
+                f"the same command goes on: {printable(shlex.join(['harness', *sys.argv[1:]]), 2000)}"
+            )
+        _fail("; ".join(said), 143 if terminated else 130)
+    except OSError as error:
+        if error.errno not in MACHINE:
+            raise
+        where = f"{printable(error.filename)}: " if error.filename else ""
+        _fail(f"{where}{error.strerror}; mend that, and type the same command again")
     except _UsageError as error:
         message, context = error.format_message(), error.ctx
         if message.startswith("Usage:"):  # a group without a command shows its help
@@ -60,6 +86,10 @@ def main() -> None:
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message, 300)} in `{typed}`; see `{path} --help`")
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _Terminated
 
 
 def _fail(message: str, code: int = 2) -> None:

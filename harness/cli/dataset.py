@@ -59,7 +59,8 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     from harness.dataset import load, verify
 
     path = load.find(dataset)
-    problems = verify.check(path)
+    with bar(f"checking {printable(path.name, 30)}", quiet=as_json):
+        problems = verify.check(path)
     manifest, digest = verify.read_manifest(path)
     if as_json:
         counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}

@@ -1,21 +1,16 @@
 """`harness distill`: train a small language model on a frozen dataset."""
 
-import math
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 
 import typer
 
-from harness.cli.progress import drawn
+from harness.cli.progress import bar
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose, stated
 
 SAMPLES = "60000,110000,16000,40000"
 BATCH = 16
-LINE_S = 60.0
 
 
 def command(
@@ -57,7 +52,12 @@ def command(
 
     plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
     begun_s = time.monotonic()
-    with _losses(plan.samples) as show:
+    with bar("training", sum(counts)) as progress:
+
+        def show(stage: str, seen: int, loss: float) -> None:
+            progress.label = f"{stage} loss {loss:.3f}"
+            progress(sum(counts[: STAGES.index(stage)]) + seen - progress.done)
+
         facts = run(data, versions, plan, out, show, device_of(device), threads)
     apart = facts["held_out"]
     typer.echo(
@@ -78,31 +78,3 @@ def _counts(text: str, least: int) -> list[int]:
             f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or more each"
         )
     return counts
-
-
-@contextmanager
-def _losses(samples: Mapping[str, int]) -> Iterator[Callable[[str, int, float], None]]:
-    """Shows each stage's progress and loss on stderr: a bar for people, a line a minute for a log."""
-    if sys.stderr.isatty():
-        from rich.console import Console
-
-        with drawn(Console(stderr=True)) as bars:
-            tasks = {
-                stage: bars.add_task(stage, total=count, start=False) for stage, count in samples.items()
-            }
-
-            def draw(stage: str, seen: int, loss: float) -> None:
-                bars.start_task(tasks[stage])
-                bars.update(tasks[stage], completed=seen, description=f"{stage} loss {loss:.3f}")
-
-            yield draw
-        return
-    said_s = -math.inf
-
-    def write(stage: str, seen: int, loss: float) -> None:
-        nonlocal said_s
-        if time.monotonic() - said_s > LINE_S or seen >= samples[stage]:
-            said_s = time.monotonic()
-            typer.echo(f"{stage} {seen}/{samples[stage]} loss {loss:.3f}", err=True)
-
-    yield write

@@ -9,6 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
+from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.resources import DATASET, folder
 from harness.core.seeds import purpose, stated
@@ -44,14 +45,13 @@ def command(
     dtype: options.Dtype = None,
     latency: options.Latency = None,
     out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
-    resume: options.Resume = False,
     save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
     no_cache: options.NoCache = False,
     tag: options.Tags = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Drive closed-loop episodes with a model in highway-env. Writes the run's folder, with a report."""
+    """Drive closed-loop episodes in highway-env. The same command continues one that was stopped."""
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
@@ -88,17 +88,19 @@ def command(
         latency=latency,
         tags=tuple(dict.fromkeys(tag or ())),
     )
-    where = out or default_out(spec, resume)
+    where = out or default_out(spec)
     silent = as_json or quiet
     with bar(f"driving {printable(spec.card.name, 30)}", episodes, silent) as progress:
         cache = None if no_cache else default_file()
-        done = evaluate(spec, where, resume, progress, cache, workers=workers)
+        done = evaluate(spec, where, progress, cache, workers=workers)
     # They draw with matplotlib, which no episode waits for.
     from harness.cli.report import write
     from harness.cli.video import write_failures
 
-    page = write([where], quiet=silent)
-    videos = write_failures(where, save_video, silent) if save_video else []
+    with work.going_on(where):
+        page = write([where], quiet=silent)
+        videos = write_failures(where, save_video, silent) if save_video else []
+    work.tidy(where)
     if as_json:
         echo_json(as_mapping(done))
     if silent:

@@ -9,7 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
-from harness.core import resources
+from harness.core import resources, work
 from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 
@@ -43,7 +43,6 @@ def command(
     dtype: options.Dtype = None,
     latency: options.Latency = None,
     out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-<dataset>."),
-    resume: options.Resume = False,
     no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
     tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
@@ -51,7 +50,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Evaluate a model with a prompt on frozen scenes. Writes the run's folder, with a report."""
+    """Evaluate a model with a prompt on frozen scenes. The same command continues one that was stopped."""
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
@@ -81,14 +80,16 @@ def command(
     if dry_run:
         _dry_run(spec, frozen, tokenizer, as_json, quiet)
         return
-    folder = out or default_out(spec, resume)
+    folder = out or default_out(spec)
     silent = as_json or quiet
-    with bar(f"asking {printable(spec.card.name, 30)}", 0, silent) as progress:
+    with bar(f"asking {printable(spec.card.name, 30)}", quiet=silent) as progress:
         cache = None if no_cache else default_file()
-        done = evaluate(spec, folder, resume, progress, cache, progress.more)
+        done = evaluate(spec, folder, progress, cache, progress.more)
     from harness.cli.report import write
 
-    page = write([folder], quiet=silent, dataset=frozen)
+    with work.going_on(folder):
+        page = write([folder], quiet=silent, dataset=frozen)
+    work.tidy(folder)
     if as_json:
         echo_json(as_mapping(done))
     if silent:

@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from harness.cli import options
+from harness.cli.progress import bar
 from harness.core.errors import printable
 
 LABEL = 16  # characters of a condition's name that leave its row on one line
@@ -18,8 +19,9 @@ def command(
     """Compare frozen with closed-loop success, by episode. Takes runs of `eval` and of `drive`."""
     from harness.studies import fidelity
 
-    result = fidelity.fidelity(runs)
-    page = fidelity.write(result, out)
+    with bar("comparing frozen with closed loop", quiet=as_json):
+        result = fidelity.fidelity(runs)
+        page = fidelity.write(result, out)
     if as_json:
         typer.echo(result.table.to_json(orient="records"))
         return

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 import typer
 
 from harness.cli import options
+from harness.cli.progress import bar
 from harness.core.errors import printable
 from harness.core.resources import DATASET
 
@@ -55,7 +56,9 @@ def pull(
 
     card = resolve(name, engine)
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
-    typer.echo(f"{printable(card.name)} lies in {printable(fetch(card), 1000)}{licence}")
+    with bar(f"fetching {printable(card.name, 30)}"):
+        where = fetch(card)
+    typer.echo(f"{printable(card.name)} lies in {printable(where, 1000)}{licence}")
 
 
 @app.command()

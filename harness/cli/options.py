@@ -42,7 +42,6 @@ Latency = Annotated[
         "(batch 1, on this machine if it is idle). Default: the card's, else the paper's."
     ),
 ]
-Resume = Annotated[bool, Option("--resume", help="Continue a run that was stopped.")]
 NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that an earlier run has.")]
 Tags = Annotated[list[str] | None, Option(help="Word to find the run by. Repeatable.")]
 Json = Annotated[bool, Option("--json", help="Print JSON.")]

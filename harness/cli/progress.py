@@ -1,47 +1,104 @@
-"""A progress bar on stderr for anything slower than two seconds."""
+"""How far anything slower than two seconds is, on stderr: a bar on a terminal, else a line every 30 s."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import timedelta
+from itertools import count
+from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
+LINE_S = 30.0
+SETTLE_S = 5.0  # by when what a killed command left is counted: it is no measure of the pace
+MARKS = 5  # lines over which the pace is taken
 
-@dataclass(frozen=True)
+
 class Bar:
-    """Called with how many are newly done; `more` is called with how many more turn out to be owed."""
+    """Called with how many are newly done.
 
-    advance: Callable[[int], None] = lambda done: None
-    more: Callable[[int], None] = lambda count: None
+    Attributes:
+        label: what is done.
+        total: how many there are; 0 while nobody knows.
+        done: how many are done.
+    """
+
+    def __init__(self, label: str, total: int) -> None:
+        self.label, self.total, self.done = label, total, 0
+        self.changed: Callable[[], object] = lambda: None
 
     def __call__(self, done: int) -> None:
         """So many are newly done."""
-        self.advance(done)
+        self.done += done
+        self.changed()
+
+    def more(self, owed: int) -> None:
+        """So many more turn out to be owed."""
+        self.total += owed
+        self.changed()
 
 
 @contextmanager
-def bar(label: str, total: int, quiet: bool = False) -> Iterator[Bar]:
-    """A bar: how many are done, how fast, time left. None is drawn unless stderr is a terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield Bar()
+def bar(label: str, total: int = 0, quiet: bool = False) -> Iterator[Bar]:
+    """How many are done, how fast, and the time left; nothing where `quiet`."""
+    progress = Bar(label, total)
+    if quiet:
+        yield progress
+        return
+    if not sys.stderr.isatty():
+        with _lines(progress):
+            yield progress
         return
     from rich.console import Console
 
-    with drawn(Console(stderr=True)) as progress:
-        task = progress.add_task(label, total=total)
-        owed = total
+    with drawn(Console(stderr=True)) as bars:
+        task = bars.add_task(label, total=total or None)
+        progress.changed = lambda: bars.update(
+            task, completed=progress.done, total=progress.total or None, description=progress.label
+        )
+        yield progress
 
-        def more(count: int) -> None:
-            nonlocal owed
-            owed += count
-            progress.update(task, total=owed)
 
-        yield Bar(lambda done: progress.advance(task, done), more)
+@contextmanager
+def _lines(progress: Bar) -> Iterator[None]:
+    """Write a line every 30 s from a thread of its own, so also while nothing is finished."""
+    over = Event()
+
+    def write() -> None:
+        begun_s = time.monotonic()
+        over.wait(SETTLE_S)
+        marks = deque([(time.monotonic(), progress.done)], maxlen=MARKS)
+        for number in count(1):
+            if over.wait(begun_s + number * LINE_S - time.monotonic()):
+                return
+            marks.append((time.monotonic(), progress.done))
+            with suppress(OSError, ValueError):  # nobody listens any more
+                print(line(progress, marks, marks[-1][0] - begun_s), file=sys.stderr, flush=True)
+
+    thread = Thread(target=write, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> str:
+    """`asking proxy 812/1206 58.0/s 0:00:07 left`; `marks` are times in seconds and what was done by then."""
+    (since_s, before), (now_s, done) = marks[0], marks[-1]
+    speed = (done - before) / (now_s - since_s)
+    of = f"{done}/{progress.total}" if progress.total else str(done or "")
+    if speed:
+        at = pace(speed, (progress.total - done) / speed if progress.total else None, None)
+    else:
+        at = f"{timedelta(seconds=round(took_s))} so far"
+    return " ".join(filter(None, (progress.label, of, at)))
 
 
 def drawn(console: "Console") -> "Progress":

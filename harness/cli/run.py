@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,16 +41,14 @@ def file_name(model: str) -> str:
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
 
 
-def default_out(spec: "Spec", resume: bool) -> Path:
-    """The first folder of the run's name under reports/ that is free; with `resume`, the last that is not."""
+def default_out(spec: "Spec") -> Path:
+    """The first folder of the run's name under reports/ that is free, or where this was stopped."""
+    from harness.evaluate.run import goes_on
+
     mode = "" if spec.answer == "json" else f"-{spec.answer}"
     name = f"{file_name(spec.card.name)}-{spec.prompt.version}{mode}-{spec.source.name}"
-    last = free = Path("reports") / name
-    number = 1
-    while free.exists():
-        last, number = free, number + 1
-        free = free.with_name(f"{name}-{number}")
-    return last if resume else free
+    folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
+    return next(folder for folder in folders if not folder.exists() or goes_on(spec, folder))
 
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:

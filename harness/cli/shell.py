@@ -13,8 +13,19 @@ UNREAD = object()
 DIGITS = 18  # most of a number that is read here
 
 
+class Stopped(Exception):
+    """A command was interrupted, of which typer would say nothing; the cause is the KeyboardInterrupt."""
+
+
 class Map(TyperGroup):
     """A group whose help lists its commands by panel, in one column."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Invoke the command. Raises Stopped if it is interrupted."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stopped:
+            raise Stopped from stopped
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each panel's commands, each with the first sentence of its help."""

@@ -62,7 +62,7 @@ def command(
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
     conditions, silent = list(dict.fromkeys(condition)), as_json or quiet
-    with bar("grid points", 0, silent) as progress:
+    with bar("grid points", quiet=silent) as progress:
         stored = [Stored(run, latency, progress.more, progress, not no_model) for run in runs]
         panels = {
             axis.name: settings(stored, axis, values, conditions)

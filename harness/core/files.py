@@ -3,8 +3,10 @@
 import hashlib
 import json
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -67,14 +69,22 @@ def digest(value: Any) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write to, which takes the place of `path` at the end; gone if that is not reached."""
+    """A file to write to, which takes the place of `path` at the end; gone if that is not reached.
+
+    What killed processes left of such files goes as well: nobody holds them any more.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".{escape(path.name)}.*.part"):
+        with suppress(OSError), alone(left):
+            left.unlink()
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.unlink(missing_ok=True)  # a link, or of a process that had this number
     try:
-        yield part
-        with part.open("rb+") as f:
-            os.fsync(f.fileno())
-        os.replace(part, path)
+        with alone(part):
+            yield part
+            with part.open("rb+") as f:
+                os.fsync(f.fileno())
+            os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
 
@@ -86,16 +96,31 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Hold a lock file, which a killed process gives back. Raises BlockingIOError if another holds it.
+def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold a file's lock, which a killed process gives back; the file is made where it is missing.
 
     Where the system has no such locks (Windows) nothing is held.
+
+    Raises:
+        BlockingIOError: another process holds it for longer than `patience_s`.
+        OSError: it cannot be opened, or is a link, which is not followed.
     """
     try:
         import fcntl
     except ImportError:
         yield
         return
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    try:
+        until_s = time.monotonic() + patience_s
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= until_s:
+                    raise
+                time.sleep(0.05)
         yield
+    finally:
+        os.close(file)

@@ -1,13 +1,12 @@
 """`harness dataset build`: layouts into a folder, in any number of processes, and on after a kill.
 
-Each finished layout is a file of its own under `.building/`; when all are there they become one
+Each finished layout is a file of its own under `.work/`; when all are there they become one
 `layouts.zip`. What is in it depends on the scenario, the seed, the number of episodes and the folder's name
 alone.
 """
 
 import json
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -19,8 +18,10 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import msgspec
 
 from harness import __version__
+from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
+from harness.core.formats import WORK
 from harness.core.parallel import spread
 from harness.core.seeds import purpose, stated
 from harness.dataset.forest import Forest
@@ -35,13 +36,12 @@ from harness.dataset.schema import (
     record_type,
     tree_schema,
 )
-from harness.dataset.verify import level_name, tree_name
+from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
 from harness.world.audit import Audit, audit, ready
 from harness.world.reference import drive_all
 from harness.world.scenario import BEACON_DIALS, Scenario
 
-WORK = ".building"
 LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
 
@@ -88,13 +88,35 @@ def build(
             f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or '-', "
             "a letter or digit first"
         )
-    work = _begin(out, config)
-    done = [e for e in range(episodes) if (work / _shard(e)).is_file()]
+    if (out / "manifest.json").exists():
+        if not (out / WORK).is_dir():
+            raise UserError(
+                f"--out {printable(out)} already holds a finished dataset; choose another folder or delete it"
+            )
+        made: dict[str, Any] = msgspec.to_builtins(read_manifest(out)[0])  # stopped while it tidied up
+        work.same(out, config, {key: made[key] for key in config})
+        work.tidy(out)
+        return made
+    if begun := work.begun(out, work.Begun):
+        work.same(out, config, begun.settings)
+    with work.working(out, begun or work.Begun(settings=config)) as place:
+        manifest = _built(scenario, out, place, config, workers, progress, audits, more)
+    work.tidy(out)
+    return manifest
+
+
+def _built(
+    scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: int,
+    progress: Callable[[int], None], audits: bool, more: Callable[[int], None],
+) -> dict[str, Any]:  # fmt: skip
+    """Freeze what is missing, and write the dataset's files, the manifest last."""
+    episodes, seed = config["episodes"], config["seed"]
+    done = [e for e in range(episodes) if (place / _shard(e)).is_file()]
     progress(len(done))
     todo = sorted(set(range(episodes)) - set(done))
-    spread(partial(_freeze_to_file, scenario, work, seed), todo, workers, progress)
+    spread(partial(_freeze_to_file, scenario, place, seed), todo, workers, progress)
 
-    texts = _join(work, episodes, out / LAYOUTS)
+    texts = _join(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
     found = None
@@ -119,32 +141,7 @@ def build(
     for name, data in files.items():
         write_whole(out / name, data)
     write_whole(out / "manifest.json", _pretty(manifest))
-    shutil.rmtree(work)
     return manifest
-
-
-def _begin(out: Path, config: dict[str, Any]) -> Path:
-    """The working folder, new or the one a killed build left. Refuses to touch anything else."""
-    shown = printable(out)
-    if (out / "manifest.json").exists():
-        raise UserError(f"--out {shown} already holds a finished dataset; choose another folder or delete it")
-    work = out / WORK
-    if (work / "config.json").is_file():
-        if json.loads((work / "config.json").read_text()) != config:
-            raise UserError(
-                f"--out {shown} holds a build begun with other settings; repeat those to go on, or delete it"
-            )
-    elif out.is_dir() and any(p.name != WORK for p in out.iterdir()):
-        raise UserError(f"--out {shown} is a folder with other files in it; choose an empty or a new one")
-    elif out.exists() and not out.is_dir():
-        raise UserError(f"--out {shown} is a file; choose a folder")
-    try:
-        write_whole(work / "config.json", canonical_json(config))
-    except OSError as error:
-        raise UserError(
-            f"--out {shown} cannot be written ({error.strerror}); choose another folder"
-        ) from None
-    return work
 
 
 def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> None:

@@ -1,9 +1,7 @@
-"""`harness eval` and `harness drive`: walk, score, write. A killed run resumes where it was."""
+"""`harness eval` and `harness drive`: walk, score, write. A run that was stopped goes on where it was."""
 
 import math
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -17,8 +15,10 @@ from harness.backends.base import Backend
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
+from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import alone, canonical_json, digest, write_whole
+from harness.core.files import digest
+from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import spread
 from harness.dataset.load import Scene
@@ -30,7 +30,6 @@ from harness.evaluate.spec import Spec, versions
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
-from harness.runs.formats import CONFIG, FORMAT, WORK
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Episode, Latency, Manifest, Score
 from harness.runs.summary import counted, scores
@@ -40,6 +39,15 @@ if TYPE_CHECKING:  # the simulator is loaded by who drives
 
 EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
+
+
+class Begun(work.Begun, frozen=True, kw_only=True):
+    """What a run began with, which it keeps when it goes on."""
+
+    created: str
+    identity: str  # digest of the model's
+    tags: tuple[str, ...]
+    latency: Latency
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,6 @@ class Evaluated:
 def evaluate(
     spec: Spec,
     out: Path,
-    resume: bool,
     progress: Callable[[int], None],
     cache: Path | None = None,
     more: Callable[[int], None] = lambda count: None,
@@ -62,10 +69,12 @@ def evaluate(
 ) -> Evaluated:
     """Evaluate a model with a prompt and write the run's folder; the same for any number of workers.
 
+    What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever adds to
+    the run calls at the end.
+
     Args:
         spec: what is evaluated.
         out: the run's folder.
-        resume: continue the run that a kill left there.
         progress: called with the number of new answers, or of episodes just driven, those kept from before
             included.
         cache: file of completions kept between runs, for language models; None for no cache.
@@ -75,15 +84,20 @@ def evaluate(
     Raises:
         UserError: the folder holds something else, or the model is not available. Nothing is written then.
     """
-    if resume and (out / "run.json").is_file():
-        return finished(spec, out)
-    refuse(spec, out, resume)
+    if (out / "run.json").exists():
+        if (out / WORK).is_dir():
+            return finished(spec, out)
+        raise UserError(
+            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
+        )
+    begun = work.begun(out, Begun)
+    if begun:
+        work.same(out, _compared(spec.settings()), _compared(begun.settings))
+    elif spec.latency == latencies.MEASURED:
+        timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        done = _frozen(spec, spec.source, out, progress, cache, more)
-    else:
-        done = _closed_loop(spec, cast("LiveSource", spec.source), out, progress, cache, workers)
-    tidy(out)
-    return done
+        return _frozen(spec, spec.source, out, begun, progress, cache, more)
+    return _closed_loop(spec, cast("LiveSource", spec.source), out, begun, progress, cache, workers)
 
 
 @dataclass(frozen=True)
@@ -102,33 +116,35 @@ def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walke
 
 
 def _frozen(
-    spec: Spec, source: FrozenSource, out: Path, progress: Callable[[int], None], cache: Path | None,
-    more: Callable[[int], None],
+    spec: Spec, source: FrozenSource, out: Path, begun: Begun | None, progress: Callable[[int], None],
+    cache: Path | None, more: Callable[[int], None],
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
-    latency = _latency(spec, out, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
-    with working(spec, out, backend.identity(), latency) as work:
+    latency = _latency(spec, begun, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
+    begun = _begin(spec, out, begun, backend.identity(), latency)
+    with work.working(out, begun) as place:
         asked = cached(backend, spec.card, cache)
-        asker = Asker(spec, lambda: asked, latency, work / "answers.jsonl", progress=progress, more=more)
+        asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", progress=progress, more=more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
-            return _written(spec, out, work, dataset.episodes, walked, backend.identity(), latency)
+            return _written(spec, out, begun, dataset.episodes, walked, backend.identity())
 
 
 def _closed_loop(
-    spec: Spec, source: "LiveSource", out: Path, progress: Callable[[int], None], cache: Path | None,
-    workers: int,
+    spec: Spec, source: "LiveSource", out: Path, begun: Begun | None, progress: Callable[[int], None],
+    cache: Path | None, workers: int,
 ) -> Evaluated:  # fmt: skip
     # Compiled templates do not travel between processes.
     spec = replace(spec, prompt=replace(spec.prompt))
     # Engines are opened where they answer: a forked process has none of their threads.
-    [(identity, latency)] = spread(partial(_begin, out=out), [spec], workers, lambda done: None)
-    with working(spec, out, identity, latency) as work:
+    [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
+    begun = _begin(spec, out, begun, identity, latency)
+    with work.working(out, begun) as place:
         size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
         chunks = [range(at, min(at + size, source.episodes)) for at in range(0, source.episodes, size)]
         sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
-        drive = partial(_driven, spec, source.first_seed, latency, work, cache)
+        drive = partial(_driven, spec, source.first_seed, latency, place, cache)
         parts = spread(drive, chunks, min(workers, len(chunks)), lambda done: progress(next(sizes)))
         with uncollected():
             read = [folder.read_part(part, spec.actions) for part in parts]
@@ -137,16 +153,16 @@ def _closed_loop(
                 [episode for _, episodes, _ in read for episode in episodes],
                 {answer.id: answer for _, _, answers in read for answer in answers},
             )
-            return _written(spec, out, work, tuple(range(source.episodes)), walked, identity, latency)
+            return _written(spec, out, begun, tuple(range(source.episodes)), walked, identity)
 
 
 def _driven(
-    spec: Spec, first_seed: int, latency: Latency, work: Path, cache: Path | None, chunk: range
+    spec: Spec, first_seed: int, latency: Latency, place: Path, cache: Path | None, chunk: range
 ) -> Path:
     """Drive a chunk, unless a killed run did."""
     from harness.evaluate.live_world import LiveWorld
 
-    part = work / f"episodes-{chunk.start:06d}"
+    part = place / f"episodes-{chunk.start:06d}"
     if not part.is_dir():
         asker = Asker(
             spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
@@ -157,19 +173,21 @@ def _driven(
     return part
 
 
-def _begin(spec: Spec, out: Path) -> tuple[dict[str, Any], Latency]:
+def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
     """Identity of the model and latency of its decisions in the closed loop."""
     backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, None)
     source = cast("LiveSource", spec.source)
     return backend.identity(), _latency(
-        spec, out, backend, lambda: source.trial(timing.SCENES, spec.ego_alone)
+        spec, begun, backend, lambda: source.trial(timing.SCENES, spec.ego_alone)
     )
 
 
-def _latency(spec: Spec, out: Path, backend: Backend, trial: Callable[[], Sequence[Scene]]) -> Latency:
-    """What a resumed run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
-    if (out / WORK / CONFIG).is_file():
-        return msgspec.convert(_begun(out / WORK)["latency"], Latency)
+def _latency(
+    spec: Spec, begun: Begun | None, backend: Backend, trial: Callable[[], Sequence[Scene]]
+) -> Latency:
+    """What the run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
+    if begun:
+        return begun.latency
     return latencies.known(spec.latency, spec.card, backend) or timing.measured(spec, backend, trial())
 
 
@@ -185,12 +203,10 @@ def _opened(
 
 
 def _written(
-    spec: Spec, out: Path, work: Path, numbers: tuple[int, ...], walked: Walked, identity: dict[str, Any],
-    latency: Latency,
-) -> Evaluated:  # fmt: skip
+    spec: Spec, out: Path, begun: Begun, numbers: tuple[int, ...], walked: Walked, identity: dict[str, Any]
+) -> Evaluated:
     """Score a walk and write the run's files, the manifest last."""
-    begun = _begun(work)
-    spec = spec.tagged(begun)
+    spec, latency = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags)))), begun.latency
     again = spec
     if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
         again = replace(spec, latency=latencies.as_declared(latency))
@@ -199,7 +215,7 @@ def _written(
     answers = folder.ordered(walked.answers.values(), walked.decisions)
     summary = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
     manifest = msgspec.convert({
-        "format": FORMAT, "name": out.name, "created": begun["created"], "command": again.command(out),
+        "format": FORMAT, "name": out.name, "created": begun.created, "command": again.command(out),
         "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency),
         "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": identity,
         "cached_answers": sum(answer.cached for answer in answers),
@@ -213,88 +229,38 @@ def _written(
 def finished(spec: Spec, out: Path) -> Evaluated:
     """The run that is there already. Raises UserError if it is another run, or damaged."""
     run = folder.read(out)
-    _same(spec.settings(), msgspec.json.decode(msgspec.json.encode(run.manifest)), out)
-    tidy(out)
+    stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
+    work.same(out, _compared(spec.settings()), _compared({key: stored[key] for key in spec.settings()}))
     return Evaluated(out, run.manifest, run.scores)
 
 
-def tidy(out: Path) -> None:
-    """Remove what the work left, and what kills left of files half written."""
-    shutil.rmtree(out / WORK, ignore_errors=True)
-    for part in out.glob(".*.part"):
-        part.unlink(missing_ok=True)
-
-
-def refuse(spec: Spec, out: Path, resume: bool) -> None:
-    """Raise before anything is loaded or written, if the folder cannot be used."""
-    shown = printable(out)
-    if (out / "run.json").exists():
-        raise UserError(f"--out {shown} already holds a finished run; choose another folder or delete it")
-    if (out / WORK / CONFIG).is_file():
-        if not resume:
-            raise UserError(f"--out {shown} holds an unfinished run; add --resume to go on, or delete it")
-        _same(spec.settings(), _begun(out / WORK)["settings"], out)
-    elif out.exists() and (not out.is_dir() or any(p.name != WORK for p in out.iterdir())):
-        raise UserError(f"--out {shown} exists and is no run; choose another folder")
-    if spec.latency == latencies.MEASURED and not (out / WORK / CONFIG).is_file():
-        timing.refuse_busy()
-
-
-def _begun(work: Path) -> dict[str, Any]:
-    begun: dict[str, Any] = msgspec.json.decode((work / CONFIG).read_bytes())
-    return begun
-
-
-def _same(settings: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Refuse to go on with other settings, naming those that differ."""
-    now = msgspec.json.decode(canonical_json(settings))
-    other = _differing(now, stored)
-    if "world" in other and "world" in stored:
-        # It may lie in another folder now.
-        inside = [key for key in _differing(now["world"], stored["world"]) if key != "path"]
-        other = [key for key in other if key != "world"] + [f"{key} of the world" for key in inside]
-    if other:
-        raise UserError(
-            f"--resume: {printable(out)} was begun with another {', '.join(other)}; "
-            "repeat its settings, or choose another --out"
-        )
-
-
-def _differing(now: dict[str, Any], stored: dict[str, Any]) -> list[str]:
-    return [key for key, value in now.items() if stored.get(key) != value]
-
-
-@contextmanager
-def working(spec: Spec, out: Path, identity: dict[str, Any], latency: Latency) -> Iterator[Path]:
-    """The working folder, new or the one that a kill left. A new one goes again if the input proves bad."""
-    work, made = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
-    new = not (work / CONFIG).is_file()
-    if not new and _begun(work)["identity"] != digest(identity):
-        raise UserError(
-            f"--resume: the model behind {printable(spec.card.name)} is not the one this run was begun with "
-            "(its files, package versions or device differ); start a new run in another --out"
-        )
+def goes_on(spec: Spec, out: Path) -> bool:
+    """Whether this was begun in a folder, stopped there, and nobody is at it."""
     try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"--out {printable(out)} cannot be made ({error.strerror}); choose another folder"
-        ) from None
-    try:
-        with alone(work / "lock"):
-            if new:
-                (work / "answers.jsonl").unlink(missing_ok=True)
-                begun = {"created": datetime.now(UTC).isoformat(timespec="seconds"),
-                         "settings": spec.settings(), "identity": digest(identity),
-                         "tags": spec.tags, "latency": msgspec.to_builtins(latency)}  # fmt: skip
-                write_whole(work / CONFIG, canonical_json(begun))
-            yield work
-    except BlockingIOError:
-        raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
+        begun = work.begun(out, Begun)
+        if begun:
+            work.same(out, _compared(spec.settings()), _compared(begun.settings))
     except UserError:
-        if new:
-            shutil.rmtree(work)
-            for path in made:
-                with suppress(OSError):  # somebody else's run is in it by now
-                    path.rmdir()
-        raise
+        return False
+    return begun is not None and not work.held(out)
+
+
+def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as they are compared: those of the world by name, but for the folder where it lies now."""
+    world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
+    return {**{key: value for key, value in settings.items() if key != "world"}, **world}
+
+
+def _begin(spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency) -> Begun:
+    """What the run began with. Raises UserError if that was another model."""
+    if begun is None:
+        return Begun(
+            settings=spec.settings(), created=datetime.now(UTC).isoformat(timespec="seconds"),
+            identity=digest(identity), tags=spec.tags, latency=latency,
+        )  # fmt: skip
+    if begun.identity != digest(identity):
+        raise UserError(
+            f"--out {printable(out)} was begun with another model behind {printable(spec.card.name)} (its "
+            "files, package versions or device differ); delete it, or choose another folder"
+        )
+    return begun

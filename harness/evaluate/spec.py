@@ -2,11 +2,11 @@
 
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol, Self, get_args
+from typing import Any, Protocol, get_args
 
 import msgspec
 
@@ -169,10 +169,6 @@ class Spec:
                 "use paper or measured, or add inference_s to the card"
             )
 
-    def tagged(self, begun: Mapping[str, Any]) -> Self:
-        """This, with a run's own tags before these."""
-        return replace(self, tags=tuple(dict.fromkeys((*begun.get("tags", ()), *self.tags))))
-
     @property
     def actions(self) -> tuple[str, ...]:
         """Meta-actions, in the environment's order."""
@@ -193,7 +189,7 @@ class Spec:
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def settings(self) -> dict[str, Any]:
-        """What a resumed run must have in common with the one it continues, as plain values."""
+        """What a run that goes on must have in common with what it began as, as plain values."""
         world = msgspec.to_builtins(self.source.record())
         return {
             "model": asdict(self.card),

@@ -16,6 +16,8 @@ from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.values import is_schema, match
 
 _MAX_BROKEN = 200  # braces that open nothing; a text with more is noise, and each costs a try
+_MAX_TRIED = 4_000_000  # characters that these tries may read in all, or a megabyte would take minutes
+_MAX_OBJECTS = 5_000  # no answer has as many
 _OPENING = re.compile(r"[{｛]")
 _FENCE = re.compile(r"```[ \t]*[\w+-]*|~~~[ \t]*\w*")
 _STRAY = frozenset("[](){},;:.\"'`*\\")
@@ -108,12 +110,15 @@ def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int
 def _objects(text: str, cut: bool) -> _Objects:
     """Objects from left to right; a brace that opens none is passed by."""
     objects = _Objects()
-    tries = at = 0
+    at = tries = 0
+    most_tries = min(_MAX_BROKEN, _MAX_TRIED // (len(text) + 1))
     while opening := _OPENING.search(text, at):
         start = at = opening.start()
         try:
             value, at = relaxed.DECODER.raw_decode(text, start)
             objects.readings.append((start, relaxed.Reading(value, at)))
+            if len(objects.readings) > _MAX_OBJECTS:
+                raise Failure(Status.SYNTAX, f"more than {_MAX_OBJECTS} JSON objects")
             continue
         except (ValueError, RecursionError):
             pass
@@ -135,8 +140,8 @@ def _objects(text: str, cut: bool) -> _Objects:
             if error.meant and objects.broken is None:
                 objects.broken = start
         tries += 1
-        if tries > _MAX_BROKEN:
-            raise Failure(Status.SYNTAX, f"more than {_MAX_BROKEN} braces that open no JSON object")
+        if tries > most_tries:
+            raise Failure(Status.SYNTAX, f"more than {most_tries} braces that open no JSON object")
     return objects
 
 

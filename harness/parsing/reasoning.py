@@ -53,7 +53,8 @@ def split(text: str, thinking: bool) -> tuple[str | None, str]:
         if depth:
             depth -= 1
         else:
-            thoughts, answers = [*thoughts, *answers], []
+            thoughts += answers
+            answers.clear()
         thoughts.append(piece)
     if depth or (thinking and not closed):
         raise Failure(Status.TRUNCATED_REASONING, "the thought was not closed, so no answer was begun")

@@ -1,4 +1,4 @@
-"""Which decision points of a driven run tell most: where episodes begin to fail, others of note, an even sample."""
+"""Which decision points of a driven run tell most: where episodes begin to fail, then an even sample."""
 
 from collections.abc import Sequence
 

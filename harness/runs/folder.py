@@ -23,10 +23,10 @@ from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.formats import FORMAT, READ_BY
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
-from harness.runs.formats import FORMAT, READ_BY
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score, Variant
 

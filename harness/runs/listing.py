@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.runs.formats import CONFIG, FORMAT, READ_BY, WORK
+from harness.core.formats import CONFIG, FORMAT, READ_BY, WORK
 
 DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
@@ -111,7 +111,7 @@ def _one(path: str, root: str) -> Listed | None:
         try:
             begun = _json(path, WORK, CONFIG)
             kind = KINDS[begun["settings"]["world"]["kind"]]
-            made = Listed("", kind, "unfinished", _date(begun["created"]), "--resume")
+            made = Listed("", kind, "unfinished", _date(begun["created"]), "the same command goes on")
             return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")

@@ -12,7 +12,8 @@ import numpy as np
 
 from harness.coordination.channel import density_coupled_loss
 from harness.coordination.operating_point import POINTS, named_point
-from harness.evaluate.run import Evaluated, evaluate
+from harness.core.work import tidy
+from harness.evaluate.run import Evaluated, evaluate, finished
 from harness.evaluate.spec import Spec
 from harness.runs.records import Score
 from harness.studies import figures
@@ -61,7 +62,11 @@ def run_closed_loop(
     Returns:
         The summary: a row a grid point and metric.
     """
-    done = evaluate(spec, out / RUN, (out / RUN).exists(), progress, cache, workers=workers)
+    if (out / RUN / "run.json").is_file():
+        done = finished(spec, out / RUN)
+    else:
+        done = evaluate(spec, out / RUN, progress, cache, workers=workers)
+    tidy(out / RUN)
     grids = panels()
     summary = _summary(done, grids)
     core, *sweeps = (summary[summary.panel == name] for name in grids)

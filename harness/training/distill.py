@@ -1,7 +1,6 @@
 """From a frozen dataset to a small model, in stages that a kill does not undo."""
 
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,8 +9,8 @@ from typing import Any
 import torch
 import transformers
 
-from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, write_whole
+from harness.core import work
+from harness.core.files import write_whole
 from harness.dataset.load import Dataset
 from harness.prompts.versions import Prompt
 from harness.training.gguf_export import export
@@ -50,8 +49,18 @@ def distill(
     """
     if threads:
         torch.set_num_threads(threads)
-    work = _begin(out, {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)})
-    student = Student(dataset, prompts, plan, work, device)
+    settings = {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)}
+    if begun := work.begun(out, work.Begun):
+        work.same(out, settings, begun.settings)
+    with work.working(out, begun or work.Begun(settings=settings)) as place:
+        facts = _trained(dataset, Student(dataset, prompts, plan, place, device), out, progress)
+    work.tidy(out)
+    return facts
+
+
+def _trained(dataset: Dataset, student: Student, out: Path, progress: Progress) -> dict[str, Any]:
+    """Train what is missing, and write the model's folder."""
+    prompts, plan = student.prompts, student.plan
     curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
         "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest.seed,
@@ -70,29 +79,7 @@ def distill(
     export(out, out / f"{out.absolute().name}-f16.gguf")
     write_whole(out / "README.md", model_card(out.absolute().name, facts))
     write_whole(out / "training.json", json.dumps(facts, indent=1) + "\n")
-    shutil.rmtree(work)
     return facts
-
-
-def _begin(out: Path, settings: dict[str, Any]) -> Path:
-    """The working folder, new or the one that a killed call with the same settings left."""
-    shown, work = printable(out), out / ".work"
-    kept = work / "settings.json"
-    if kept.is_file():
-        if json.loads(kept.read_text()) != json.loads(canonical_json(settings)):
-            raise UserError(
-                f"--out {shown} was begun with another dataset, prompt, seed or samples; repeat those, "
-                "or delete it"
-            )
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"--out {shown} exists; choose a new folder")
-    try:
-        write_whole(kept, canonical_json(settings))
-    except OSError as error:
-        raise UserError(
-            f"--out {shown} cannot be written ({error.strerror}); choose another folder"
-        ) from None
-    return work
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:

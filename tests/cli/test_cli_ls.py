@@ -93,15 +93,22 @@ def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) 
     assert told["live"]["date"] == json.loads((folder / "live/run.json").read_text())["created"]
 
 
-def test_an_unfinished_run_says_resume(harness: Callable[..., Said], folder: Path) -> None:
+def test_an_unfinished_run_says_that_the_same_command_goes_on(
+    harness: Callable[..., Said], folder: Path
+) -> None:
     manifest = json.loads((folder / "live/run.json").read_text())
     shutil.rmtree(folder / "live")
     (folder / "live/.work").mkdir(parents=True)
     begun = {"created": manifest["created"], "settings": manifest, "identity": "", "tags": []}
     (folder / "live/.work/config.json").write_text(json.dumps(begun))
     [one] = [one for one in runs(folder) if one.name == "live"]
-    assert (one.kind, one.state, one.why, one.model) == ("drive", "unfinished", "--resume", "proxy")
-    assert "unfinished: --resume\n" in harness("ls", folder)[1]
+    assert (one.kind, one.state, one.why, one.model) == (
+        "drive",
+        "unfinished",
+        "the same command goes on",
+        "proxy",
+    )
+    assert "unfinished: the same command goes on\n" in harness("ls", folder)[1]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 """The bar on stderr: how many, how fast, until when."""
 
 import io
+import subprocess
 import sys
 
 import pytest
 from rich.console import Console
 
-from harness.cli.progress import Bar, bar, drawn, pace
+from harness.cli.progress import Bar, drawn, line, pace
 
 
 @pytest.mark.parametrize(
@@ -45,9 +46,43 @@ def test_a_line_fits_eighty_columns_and_tells_all(label: str) -> None:
     assert "━━" in line
 
 
-def test_nothing_is_drawn_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
-    assert not sys.stderr.isatty()
-    with bar("asking", 3) as progress:
-        progress(1)
-        progress.more(2)
-    assert (type(progress), capsys.readouterr()) == (Bar, ("", ""))
+TYPED = """
+import sys, time
+from harness.cli import progress
+progress.LINE_S, progress.SETTLE_S = 0.2, 0.01
+with progress.bar("asking", 30, quiet="quiet" in sys.argv) as bar:
+    bar(10)
+    bar.more(10)
+    time.sleep({0})
+"""
+
+
+def said(seconds: float, *options: str) -> str:
+    """What a process says on its stderr, no terminal, that takes so long and finishes nothing."""
+    command = [sys.executable, "-c", TYPED.format(seconds), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stderr
+
+
+def test_without_a_terminal_lines_say_how_far_it_is_also_while_nothing_is_finished() -> None:
+    lines = said(1.0).splitlines()
+    assert len(lines) >= 2
+    assert set(lines) <= {f"asking 10/40 0:00:0{s} so far" for s in (0, 1)}
+
+
+def test_what_is_over_before_the_first_line_is_due_or_is_quiet_says_nothing() -> None:
+    assert said(0.0) == said(1.0, "quiet") == ""
+
+
+@pytest.mark.parametrize(
+    ("total", "done", "told"),
+    [
+        (1206, 812, "asking 812/1206 10.0/s 0:00:39 left"),
+        (1206, 512, "asking 512/1206 0:01:00 so far"),
+        (0, 812, "asking 812 10.0/s"),
+        (0, 512, "asking 512 0:01:00 so far"),
+    ],
+)
+def test_a_line_has_the_pace_since_the_oldest_mark_whatever_was_done_before(
+    total: int, done: int, told: str
+) -> None:
+    assert line(Bar("asking", total), [(5.0, 512), (20.0, 600), (35.0, done)], 60.0) == told

@@ -7,12 +7,12 @@ import msgspec
 from evaluating import all_scenes, says, spec_of
 
 from harness.backends.base import Completion
+from harness.core.formats import FORMAT
 from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
-from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid
 from harness.runs.records import Manifest
 from harness.runs.summary import counted, scores

@@ -42,12 +42,12 @@ def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_a
     command = [sys.executable, "-m", "harness", "dataset", "build", "occluded-intersection"]
     command += ["--episodes", "6", "--seed", str(FIRST_SEED), "--workers", "2", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True) as process:
-        while process.poll() is None and len(list(out.glob(".building/0*.zip"))) < 2:
+        while process.poll() is None and len(list(out.glob(".work/0*.zip"))) < 2:
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
     assert not (out / "manifest.json").exists()
-    finished = len(list(out.glob(".building/0*.zip")))
+    finished = len(list(out.glob(".work/0*.zip")))
     progress = []
     build(SCENARIO, out, 6, FIRST_SEED, 2, progress.append)
     assert (progress[0], sum(progress)) == (finished, 6)
@@ -55,9 +55,9 @@ def test_a_build_killed_half_way_and_continued_by_two_workers_has_the_bytes_of_a
 
 
 def test_a_build_begun_with_other_settings_is_not_continued(tmp_path):
-    (tmp_path / "begun" / ".building").mkdir(parents=True)
-    (tmp_path / "begun" / ".building" / "config.json").write_text("{}")
-    with pytest.raises(UserError, match="begun with other settings"):
+    (tmp_path / "begun" / ".work").mkdir(parents=True)
+    (tmp_path / "begun" / ".work" / "config.json").write_text('{"settings": {"seed": 1}}')
+    with pytest.raises(UserError, match=r"begun with another .*seed"):
         build(SCENARIO, tmp_path / "begun", 1, 0, 1, lambda done: None)
 
 
@@ -72,7 +72,7 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    for name, why in {"notes": "other files", "file": "is a file", "a b": "cannot name a dataset"}.items():
+    for name, why in {"notes": "other files", "file": "no folder", "a b": "cannot name a dataset"}.items():
         with pytest.raises(UserError, match=why):
             build(SCENARIO, tmp_path / name, 1, 0, 1, lambda done: None)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "mine.txt", "notes"]

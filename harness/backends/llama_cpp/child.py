@@ -3,21 +3,20 @@
 The process is spawned, so that it has only what its opener loads. Messages are pickled through a pipe.
 """
 
-import os
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from operator import attrgetter
-from threading import Thread
 from typing import Any
 
 from harness.backends.base import Completion, Request
 from harness.core.errors import UserError, printable
+from harness.core.parallel import end_with_parent
 
 LOADS = 3  # deaths in a row, while it loads, before we give up
 
@@ -147,20 +146,12 @@ class Child:
 
 def _serve(pipe: Connection, opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
     """Open a backend and answer until the parent is gone. Runs in the child."""
-    Thread(target=_die_with_parent, daemon=True).start()
+    end_with_parent()
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         backend, failed = _attempt(_open, opener, arguments, options)
         pipe.send((None, failed))
         while not failed:
             pipe.send(_attempt(_get, backend, *pipe.recv()))
-
-
-def _die_with_parent() -> None:
-    """End this process with the parent's, however that ends, also in the middle of an answer."""
-    parent = parent_process()
-    assert parent
-    parent.join()
-    os._exit(1)
 
 
 def _open(opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
-from harness.backends.engine import common_length
+from harness.backends.engine import check_logits, common_length
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.chat import GgufChat
 from harness.backends.llama_cpp.context import LlamaContext, Logits
@@ -142,6 +142,7 @@ class LlamaSession:
         self._logits = logits
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        check_logits(self._logits.max(axis=1).tolist())
         best = []
         for row, listed in zip(self._logits, among, strict=True):
             if listed is None:
@@ -152,7 +153,9 @@ class LlamaSession:
         return best
 
     def log_probs(self, tokens: Sequence[int]) -> Floats:
-        logits = self._logits - self._logits.max(axis=1, keepdims=True).astype(np.float64)
+        largest = self._logits.max(axis=1, keepdims=True).astype(np.float64)
+        check_logits(largest.ravel().tolist())
+        logits = self._logits - largest
         total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
         found: Floats = logits[:, list(tokens)] - total
         return found

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from transformers.cache_utils import DynamicCache, DynamicLayer
 
-from harness.backends.engine import Session
+from harness.backends.engine import Session, check_logits
 from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
 from harness.core.arrays import Floats
 
@@ -105,6 +105,7 @@ class Rows:
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
+        check_logits(self._logits.amax(-1).tolist())
         found = []
         for row, tokens in zip(self._logits, among, strict=True):
             if tokens is None:
@@ -117,6 +118,7 @@ class Rows:
 
     def log_probs(self, tokens: Sequence[int]) -> Floats:
         logits = self._logits.float()
+        check_logits(logits.amax(-1).tolist())
         found: Floats = (logits[:, list(tokens)] - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
         return found
 

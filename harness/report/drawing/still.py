@@ -130,6 +130,8 @@ def _bars(still: Still, actions: Sequence[str]) -> Iterator[Artist]:
     """The policy of the last decision, pale until it is ready."""
     decision, colours = still.decision, colours_of(actions)
     for n, (action, p) in enumerate(zip(actions, decision.fused, strict=True)):
-        edge = {"edgecolor": INK, "linewidth": 1.4 if action == decision.action else 0.3}
+        width = 1.4 if action == decision.action else 0.3
         pale = 0.35 if still.open else 1.0
-        yield Rectangle((0.0, n - 0.4), p, 0.8, facecolor=colours[action], alpha=pale, **edge)
+        yield Rectangle(
+            (0.0, n - 0.4), p, 0.8, facecolor=colours[action], alpha=pale, edgecolor=INK, linewidth=width
+        )
