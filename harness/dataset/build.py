@@ -19,6 +19,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import msgspec
 
 from harness import __version__
+from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.parallel import spread
@@ -36,7 +37,7 @@ from harness.dataset.schema import (
     tree_schema,
 )
 from harness.dataset.verify import level_name, tree_name
-from harness.world.audit import Audit, audit, ready
+from harness.world.audit import Audit, audit
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
@@ -68,7 +69,7 @@ def build(
     """
     audits = audits and episodes >= LEAST_AUDITED
     if audits:
-        ready()
+        extras.need("an audit", "sklearn")
     config = {
         **settings(scenario),
         "episodes": episodes,
