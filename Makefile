@@ -9,7 +9,9 @@ LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIV
 
 .PHONY: eval test check light browser docs bench clean
 
-eval: .venv/base ## evaluate the default model on the shipped dataset and write the report
+eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
+	$(BIN)/harness eval --model proxy
+	$(MAKE) --no-print-directory .venv/llama-cpp
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
 
 test: check browser ## every check and every test
@@ -49,6 +51,10 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(PYTHON) -m venv .venv
 
 .venv/base: .venv/bin/python pyproject.toml requirements.lock
+	$(INSTALL) --no-compile --editable .
+	touch $@
+
+.venv/llama-cpp: .venv/base
 	$(LLAMA_CPP) $(INSTALL) --editable '.[llama-cpp]'
 	touch $@
 
@@ -58,7 +64,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 
 .venv/dev: .venv/bin/python pyproject.toml requirements.lock
 	$(LLAMA_CPP) $(INSTALL) --editable '.[transformers,llama-cpp,dev]'
-	touch $@ .venv/base .venv/docs
+	touch .venv/base .venv/llama-cpp .venv/docs $@
 
 .venv-light/test: pyproject.toml requirements.lock
 	$(PYTHON) -m venv .venv-light

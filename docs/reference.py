@@ -67,13 +67,27 @@ def section(path: str, command: Any, example: str) -> str:
     return "\n".join([*lines, "```console", f"$ {example}", "```", ""])
 
 
+def overview(found: list[tuple[str, Any]]) -> str:
+    """Every command with the first sentence of its purpose, in the groups of `--help`."""
+    panels = {name: command.rich_help_panel for name, command in get_command(app).commands.items()}
+    lines = ["| command | what it does |", "|---|---|"]
+    for panel in dict.fromkeys(panels.values()):
+        lines.append(f"| **{panel}** | |")
+        for path, command in found:
+            if panels[path.split()[1]] == panel:
+                purpose = _cell(command.help.partition(". ")[0].rstrip("."))
+                lines.append(f"| [{path}](#{path.replace(' ', '-')}) | {purpose} |")
+    return "\n".join([*lines, ""])
+
+
 def reference() -> str:
     """The page."""
     lines = [" ".join(line.partition(" #")[0].split()) for line in all_typed()]
     found = list(commands(get_command(app), "harness"))
     # A command without an example ends this here: the documents have to show each of them.
     examples = {path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found}
-    return "\n".join([HEAD, *(section(path, command, examples[path]) for path, command in found)])
+    sections = (section(path, command, examples[path]) for path, command in found)
+    return "\n".join([HEAD, overview(found), *sections])
 
 
 def _cell(text: str) -> str:

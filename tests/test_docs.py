@@ -32,16 +32,6 @@ def test_every_failure_on_purpose_is_documented() -> None:
         assert f"`{name}`" in documented
 
 
-def test_the_readme_names_every_command() -> None:
-    from typer.main import get_command
-
-    from harness.cli import app
-
-    readme = (ROOT / "README.md").read_text()
-    for name in get_command(app).commands:  # type: ignore[attr-defined]
-        assert f"`harness {name}" in readme
-
-
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_every_setting_of_an_operating_point_is_documented_with_its_default(setting: str) -> None:
     text = (ROOT / "docs/operating-points.md").read_text()

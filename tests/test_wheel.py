@@ -40,11 +40,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, tmp_path: Path) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
-    def harness(*words: str) -> str:
+    def typed(*words: str) -> "subprocess.CompletedProcess[str]":
         command = [str(site / "bin/harness"), *words]
-        done = subprocess.run(
+        return subprocess.run(
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
+
+    def harness(*words: str) -> str:
+        done = typed(*words)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -59,5 +62,8 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     run = tmp_path / told["run"]
     files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
     assert {p.name for p in run.iterdir()} == files
+    simulated = typed("drive", "--model", "proxy")
+    assert (simulated.returncode, simulated.stderr.count("\n")) == (2, 1)
+    assert "pip install 'swarmdrive-harness[sim]'" in simulated.stderr
     [metadata] = site.glob("lib/*/site-packages/swarmdrive_harness-*.dist-info")
     assert (metadata / "licenses/LICENSE").read_text() == (ROOT / "LICENSE").read_text()

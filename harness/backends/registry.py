@@ -12,6 +12,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal
 
+from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ BUILT_IN: Mapping[str, Registration] = {
         card_keys=(*_WEIGHTS, "dtype"),
         required_keys=("weights",),
         packages={"torch": "torch", "transformers": "transformers"},
-        install="pip install 'swarmdrive-harness[transformers]'",
+        install=extras.install("transformers"),
         finds="harness.backends.weights:find_checkpoint",
     ),
     "llama-cpp": Registration(
@@ -106,7 +107,7 @@ BUILT_IN: Mapping[str, Registration] = {
         card_keys=(*_WEIGHTS, "file", "quantisation"),
         required_keys=("weights",),
         packages={"llama_cpp": "llama-cpp-python"},
-        install="pip install 'swarmdrive-harness[llama-cpp]'",
+        install=extras.install("llama-cpp"),
         finds="harness.backends.weights:find_gguf",
     ),
     "openai": Registration(

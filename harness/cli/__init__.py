@@ -15,6 +15,7 @@ import typer
 from typer.main import get_command
 
 from harness.cli import shell
+from harness.core import extras
 from harness.core.errors import UserError, printable
 
 PANELS = {
@@ -65,6 +66,10 @@ def main() -> None:
         sys.exit(program(standalone_mode=False))
     except UserError as error:
         _fail(str(error))
+    except ModuleNotFoundError as error:
+        if (lack := extras.OPTIONAL.get((error.name or "").partition(".")[0])) is None:
+            raise
+        _fail(str(extras.without("this command", *lack)))
     except shell.Stopped as stopped:
         terminated = isinstance(stopped.__cause__, _Terminated)
         said = ["terminated" if terminated else "interrupted", *getattr(stopped.__cause__, "__notes__", ())]

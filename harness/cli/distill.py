@@ -6,6 +6,7 @@ from pathlib import Path
 import typer
 
 from harness.cli.progress import bar
+from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose, stated
 
@@ -24,14 +25,10 @@ def command(
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
 ) -> None:
     """Train a small Qwen3 on a frozen dataset. The same command again continues training that was stopped."""
-    from harness.backends.registry import missing_package
     from harness.dataset import load
     from harness.prompts import versions as prompts
 
-    if package := missing_package("transformers"):
-        raise UserError(
-            f"harness distill needs {package}; run `pip install 'swarmdrive-harness[transformers]'`"
-        )
+    extras.need("harness distill", "torch", "transformers")
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")

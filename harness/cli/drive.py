@@ -9,7 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
-from harness.core import work
+from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.resources import DATASET, folder
 from harness.core.seeds import purpose, stated
@@ -72,6 +72,8 @@ def command(
     purpose(first_seed, episodes)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     options.in_range("--save-video", save_video, 0, episodes)
+    if save_video:
+        extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
     scenarios.get(scenario)
     spec = Spec(

@@ -18,7 +18,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import msgspec
 
 from harness import __version__
-from harness.core import work
+from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
@@ -38,7 +38,7 @@ from harness.dataset.schema import (
 )
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
-from harness.world.audit import Audit, audit, ready
+from harness.world.audit import Audit, audit
 from harness.world.reference import drive_all
 from harness.world.scenario import BEACON_DIALS, Scenario
 
@@ -70,7 +70,7 @@ def build(
     """
     audits = audits and episodes >= LEAST_AUDITED
     if audits:
-        ready()
+        extras.need("an audit", "sklearn")
     config = {
         "scenario": scenario.name,
         "actions": list(scenario.actions),

@@ -9,12 +9,11 @@ of one fold's model. Where it does better than chance, so can any model: then be
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
-from harness.core import noise
+from harness.core import extras, noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.core.parallel import spread
@@ -94,17 +93,11 @@ def audit(
     Raises:
         UserError: scikit-learn is missing, or too few of the layouts have a danger, or too few have none.
     """
-    ready()
+    extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
     moments = _moments(spread(partial(_hidden, scenario), seeds, workers, progress), scenario)
     auc, told_by = judge(moments, tuple(scenario.road().sectors))
     return Audit(scenario.name, layouts, seed, tuple(np.unique(moments.step).tolist()), auc, told_by)
-
-
-def ready() -> None:
-    """Raise UserError if scikit-learn is missing."""
-    if find_spec("sklearn") is None:
-        raise UserError("an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`")
 
 
 def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:

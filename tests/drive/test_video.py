@@ -88,7 +88,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     for name, says in (
         ("x.avi", "end it in .gif or .mp4"),
         ("folder.gif", "is a folder; name a file in it"),
-        ("x.mp4", "needs imageio-ffmpeg; pip install 'swarmdrive-harness[video]', or end it in .gif"),
+        ("x.mp4", ".mp4 needs imageio-ffmpeg, which is not installed; run `pip install 'swarmdrive-harness["),
     ):
         if name == "x.mp4":
             monkeypatch.setattr(sys, "path", without)

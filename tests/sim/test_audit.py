@@ -142,7 +142,8 @@ def test_without_scikit_learn_one_line_says_what_to_install(harness, monkeypatch
     monkeypatch.setitem(sys.modules, "sklearn", None)
     code, out, err = harness("scenario", "audit", NAME)
     assert (code, out) == (2, "")
-    assert err == "harness: an audit needs scikit-learn; run `pip install 'swarmdrive-harness[audit]'`\n"
+    install = "pip install 'swarmdrive-harness[audit]'"
+    assert err == f"harness: an audit needs scikit-learn, which is not installed; run `{install}`\n"
 
 
 @pytest.mark.slow

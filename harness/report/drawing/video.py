@@ -12,6 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.evaluate.replay import Played, stills
@@ -45,10 +46,8 @@ def check(out: Path) -> None:
     shown = f"--out {printable(out)}"
     if out.suffix not in (".gif", ".mp4"):
         raise UserError(f"{shown}: end it in .gif or .mp4")
-    if out.suffix not in formats():
-        raise UserError(
-            f"{shown}: .mp4 needs imageio-ffmpeg; pip install 'swarmdrive-harness[video]', or end it in .gif"
-        )
+    if out.suffix == ".mp4":
+        extras.need(f"{shown}: .mp4", "imageio_ffmpeg")
     if out.is_dir():
         raise UserError(f"{shown} is a folder; name a file in it")
 
