@@ -86,8 +86,8 @@ def _table(c: InCondition) -> list[str]:
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     """The gates as test cases, for what shows JUnit's XML."""
     failed = sum(bool(verdict.failed) for verdict in verdicts)
-    counts = {"tests": str(len(verdicts)), "failures": str(failed)}
-    suite = Element("testsuite", name="harness compare", **counts)
+    counts = {"name": "harness compare", "tests": str(len(verdicts)), "failures": str(failed)}
+    suite = Element("testsuite", counts)
     runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
     for each in verdicts:
         case = SubElement(suite, "testcase", classname=runs, name=printable(each.gate))
