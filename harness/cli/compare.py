@@ -19,6 +19,7 @@ def command(
     ),
     show: int = typer.Option(10, help="Most episodes and requests to list of each kind."),
     html: Path | None = typer.Option(None, help="File to write a page to as well."),
+    junit: Path | None = typer.Option(None, help="File to write the gates to, as test cases in JUnit's XML."),
     as_markdown: bool = typer.Option(False, "--markdown", help="Print Markdown, for a pull request."),
     as_json: options.Json = False,
 ) -> None:
@@ -31,16 +32,22 @@ def command(
     if as_markdown and as_json:
         raise UserError("--markdown and --json: give one of them")
     options.in_range("--show", show, 0, 100_000)
-    if html and html.is_dir():
-        raise UserError(f"--html {printable(html)} is a folder; name a file in it")
+    for option, file in (("--html", html), ("--junit", junit)):
+        if file and file.is_dir():
+            raise UserError(f"{option} {printable(file)} is a folder; name a file in it")
+    if junit and not fail_if:
+        raise UserError("--junit writes gates; give one or more with --fail-if")
     gates = [gate(typed) for typed in fail_if or ()]
     difference = compared(pair(a, b))
     verdicts = [judge(each, difference) for each in gates]
-    if html:
-        from harness.report.compare.page import render
+    if html or junit:
         from harness.report.page import save
+    if html:
+        from harness.report.compare import page
 
-        save(render(difference, verdicts, show), html, "--html")
+        save(page.render(difference, verdicts, show, page.beside(html)), html, "--html")
+    if junit:
+        save(text.junit(difference, verdicts), junit, "--junit")
     if as_json:
         echo_json(text.mapping(difference, verdicts, show))
     else:

@@ -1,12 +1,11 @@
 """`harness sweep`: finished runs at other operating points."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import interval
 from harness.cli.progress import bar
 from harness.core.errors import UserError, printable, unknown
 
@@ -15,12 +14,6 @@ if TYPE_CHECKING:
 
 PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
 LABEL = 14  # characters of a grid point's name that leave its row on one line
-COLUMNS = (
-    ("trigger %", "trigger_rate", 100),
-    ("msgs", "messages_per_episode", 1),
-    ("latency ms", "latency_proxy_ms", 1),
-    ("late %", "deadline_miss_rate", 100),
-)
 
 
 def command(
@@ -83,30 +76,17 @@ def command(
                     f"{printable(source.name)}: walks to {len(left)} decision points are left out, since the "
                     "run has no answer for them; without --no-model they are asked"
                 )
-        typer.echo(f"wrote {printable(where / 'sweep.svg')}")
+        typer.echo(f"wrote {printable(where / 'index.html')}")
 
 
 def tables(summary: "pd.DataFrame") -> None:
     """Print a study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
-    from harness.studies.axes import CORE
+    from harness.studies.sweep import tables
 
-    heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head, _, _ in COLUMNS)
-    above = ""
-    for place, rows in summary.groupby(["source", "panel", "condition", "value"], sort=False, dropna=False):
-        source, panel, condition, value = place
-        title = f"{printable(source)}" + ("" if panel == CORE else f" · {printable(condition)} over {panel}")
-        if title != above:
-            typer.echo(f"{title}\n{'condition' if panel == CORE else panel:<{LABEL}}{heads}")
-            above = title
-        # Over episodes, but where a seed has episodes of its own.
-        of = {str(row["metric"]): row for row in sorted(rows.to_dict("records"), key=_over_episodes)}
-        success = of["success_rate"]
-        text = interval(success["mean"], success["ci_low"], success["ci_high"], 100)
-        cells = "".join(f"{scale * of[metric]['mean']:>11.1f}" for _, metric, scale in COLUMNS)
-        at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
-        label = f"{printable(at):<{LABEL}}" if len(at) < LABEL else f"{printable(at)}\n{'':<{LABEL}}"
-        typer.echo(f"{label}{text:>22}{cells}")
-
-
-def _over_episodes(row: dict[Any, Any]) -> bool:
-    return bool(row["interval"] == "episodes")
+    for title, rows in tables(summary).items():
+        heads = f"{'success % [95 % CI]':>22}" + "".join(f"{head:>11}" for head in rows[0].others)
+        typer.echo(f"{printable(title)}\n{rows[0].axis:<{LABEL}}{heads}")
+        for row in rows:
+            at = printable(row.at)
+            label = f"{at:<{LABEL}}" if len(row.at) < LABEL else f"{at}\n{'':<{LABEL}}"
+            typer.echo(f"{label}{row.success:>22}" + "".join(f"{text:>11}" for text in row.others.values()))

@@ -11,7 +11,7 @@ from harness.core.arrays import Floats
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.runs import Runs
-from harness.report.words import success_of
+from harness.report.words import shown
 from harness.runs.folder import Run
 from harness.runs.metrics import LATENCY, SUCCESS, difference, p_value
 from harness.runs.records import Score
@@ -216,8 +216,9 @@ def headline(found: Sequence[Line]) -> str:
         best = next((line for line in of_condition if line.mark == BEST), None)
         if best is not None and (success := best.scores[SUCCESS]):
             close = [line.name for line in of_condition if line.mark == CLOSE]
-            rest = f", not told apart from {', '.join(close)}" if close else ""
-            outcomes.append(f"{condition}: {best.name} {success_of(success)}{rest}")
+            others = f"{len(close)} others" if len(close) > 1 else "".join(close)
+            rest = f", not told from {others}" if close else ""
+            outcomes.append(f"{condition}: {best.name} {shown(success)['value']}{rest}")
         elif len(of_condition) > 1:
             outcomes.append(f"{condition}: none, as each is behind another run or shares no episodes with it")
     return f"Best under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."

@@ -98,12 +98,6 @@ def _success(run: Run, condition: str) -> str:
     return shown(score)["value"]
 
 
-def success_of(score: Score) -> str:
-    """A success rate and its interval, where it has one."""
-    bounds = f" (95 % interval {interval(score)})" if interval(score) else ""
-    return shown(score)["value"] + bounds
-
-
 def latency_source(latency: Latency) -> str:
     """Where the inference time comes from, and how long it is."""
     source = {

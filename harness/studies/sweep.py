@@ -1,21 +1,33 @@
 """`harness sweep`: stored answers at every point of a grid."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
 from harness.evaluate.spec import versions
+from harness.report.library import picture
+from harness.report.page import environment
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
 from harness.studies.folder import write, write_manifest
+from harness.studies.ledger import with_interval
 from harness.studies.play import Source, joined, play
 from harness.studies.stored import Stored
 
 if TYPE_CHECKING:
     import pandas as pd
+
+TEMPLATES = Path(__file__).parent / "templates"
+COLUMNS = (
+    ("trigger %", "trigger_rate", 100),
+    ("msgs", "messages_per_episode", 1),
+    ("latency ms", "latency_proxy_ms", 1),
+    ("late %", "deadline_miss_rate", 100),
+)
 
 
 def settings(
@@ -68,8 +80,9 @@ def run_sweep(
 ) -> "pd.DataFrame":  # fmt: skip
     """Play every source at every grid point; points and sources are paired by common random numbers.
 
-    Writes `conditions` and `episodes` as CSV and JSON Lines, `sweep.json`, and the panels as SVG, PDF and
-    PNG: `sweep` along the axes, and a source's operating points, where they are among the panels.
+    Writes `index.html`, `conditions` and `episodes` as CSV and JSON Lines, `sweep.json`, and the panels as
+    SVG, PDF and PNG: `sweep` along the axes, and a source's operating points, where they are among the
+    panels.
 
     Returns:
         The summary: a row a source, grid point and metric.
@@ -96,4 +109,41 @@ def run_sweep(
         "versions": versions(),
     }
     write_manifest(out, "sweep", manifest)
+    page = environment(TEMPLATES).get_template("sweep.html.j2").render(
+        pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
+        tables=tables(whole.summary), seeds=seeds,
+    )  # fmt: skip
+    write_whole(out / "index.html", page)
     return whole.summary
+
+
+@dataclass(frozen=True)
+class Row:
+    """One grid point as text: where `at` on which `axis`, success with its interval, others by name."""
+
+    axis: str
+    at: str
+    success: str
+    others: dict[str, str]
+
+
+def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
+    """A study's main figures, a table a source and curve, by its title."""
+    found: dict[str, list[Row]] = {}
+    places = ["source", "panel", "condition", "value"]
+    for place, rows in summary.groupby(places, sort=False, dropna=False):
+        source, panel, condition, value = place
+        title = str(source) if panel == CORE else f"{source} · {condition} over {panel}"
+        # Over episodes, but where a seed has episodes of its own.
+        of = {row["metric"]: row for row in sorted(rows.to_dict("records"), key=_over_episodes)}
+        success = of["success_rate"]
+        ends = (100 * success[name] for name in ("mean", "ci_low", "ci_high"))
+        others = {name: f"{scale * of[metric]['mean']:.1f}" for name, metric, scale in COLUMNS}
+        at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
+        axis = "condition" if panel == CORE else str(panel)
+        found.setdefault(title, []).append(Row(axis, at, with_interval(*ends), others))
+    return found
+
+
+def _over_episodes(row: dict[Any, Any]) -> bool:
+    return bool(row["interval"] == "episodes")

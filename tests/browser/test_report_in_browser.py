@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from urllib.parse import parse_qsl
 
 import pytest
 
@@ -64,6 +65,65 @@ def test_it_opens_from_disk_with_every_chart_drawn(opened, report):
         assert charts.nth(n).locator("svg").count() == 1, charts.nth(n).get_attribute("data-chart")
     assert page.get_by_text("cannot be drawn").count() == 0
     picture(page, "report-1440")
+
+
+def test_what_is_read_first_stands_on_the_first_screen(opened, report):
+    one = report.parent / "proxy-v2" / "report.html"
+    page = opened(one, size={"width": 1440, "height": 900})
+    for what in (".caveat", ".headline", ".key div:last-child", "#chart-success-latency svg"):
+        box = page.locator(what).first.bounding_box()
+        assert box["y"] + box["height"] <= 900, what
+    assert page.locator(".key > div").count() == 5
+    assert len(page.locator(".headline").inner_text()) < 120
+    assert not page.locator("#metrics table").is_visible(), "all metrics are behind a fold"
+    picture(page, "report-first")
+
+
+def test_the_answer_that_lost_an_episode_is_two_clicks_away(opened, report, index):
+    page = opened(report)
+    page.get_by_role("link", name="Episodes", exact=True).click()
+    losing = page.locator("#strips .cell.end-u").first
+    told = losing.get_attribute("aria-label")
+    assert told.endswith("the answer that lost this episode")
+    losing.click()
+    expect(page.locator("#decision h1")).to_contain_text("Decision")
+    where = dict(parse_qsl(page.evaluate("location.hash.slice(1)")))
+    said = f"{where['condition']}: {told.split()[2].rstrip(',')} ✗ the answer that lost this episode"
+    expect(page.locator("#decision .verdict.bad").filter(has_text=where["condition"])).to_contain_text(said)
+
+
+def test_episodes_are_sorted_by_what_they_cost(opened, report, index):
+    page = opened(report)
+    run, S = index["runs"][0], len(index["runs"][0]["seeds"])
+    every = len(run["conditions"]) * S
+
+    def cost(episode, condition):
+        lost = set()
+        for n, (_, of, *_) in enumerate(index["scenes"]):
+            ends = run["ended"][n * every + condition * S : n * every + condition * S + S]
+            lost |= {s for s in range(S) if of == episode and ends[s] == "u"}
+        return len(lost)
+
+    for by in ("", "single-local", "6g"):
+        page.locator("#strips select").select_option(by)
+        of = [k for k, name in enumerate(run["conditions"]) if by in ("", name)]
+        rows = page.locator("#strips tbody th").all_inner_texts()
+        costs = [sum(cost(int(episode), k) for k in of) for episode in rows]
+        assert costs == sorted(costs, reverse=True)
+        assert by or costs[0] > 0
+
+
+def test_the_picture_follows_the_conflict_and_shades_what_is_hidden(opened, report, index):
+    page = opened(report, f"#scene={index['scenes'][1][0]}", {"width": 1440, "height": 900})
+    side = float(page.locator("svg.scene").get_attribute("viewBox").split()[2])
+    assert 40 < side < 160
+    assert page.locator("svg.scene .shadow polygon").count() > 0
+    assert page.locator("svg.scene .scale").count() == 1
+    assert page.locator("svg.scene .label.ego").inner_html().endswith(" m/s")
+    box = page.locator(".pair .chart svg").bounding_box()
+    assert box["y"] + box["height"] <= 900, "the distributions are on the first screen too"
+    page.locator("select[name=zoom]").select_option("all")
+    expect(page.locator("svg.scene")).to_have_attribute("viewBox", "-80 -80 160 160")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -243,6 +303,8 @@ def test_it_prints_light_and_without_controls(opened, report):
     printed = page.pdf()
     assert printed.startswith(b"%PDF")
     assert len(printed) > 50_000
+    page.set_viewport_size({"width": 718, "height": 1040})  # A4 with margins of 10 mm
+    assert page.evaluate("document.documentElement.scrollWidth") <= 718
 
 
 @pytest.mark.parametrize("where", ["", "#scene"])

@@ -22,7 +22,7 @@ def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], 
         assert "wrote" in out
         assert harness(*args, f"quiet-{args[0]}", "--quiet") == (0, "", "")
         assert {p.name for p in Path(f"quiet-{args[0]}").iterdir()} >= {
-            "eval": {"run.json", "report.html"}, "drive": {"run.json"}, "sweep": {"sweep.json", "sweep.svg"},
+            "eval": {"run.json", "report.html"}, "drive": {"run.json"}, "sweep": {"sweep.json", "index.html"},
         }[args[0]]  # fmt: skip
         if args is not once:
             Path("loud").rename(f"loud-{args[0]}")

@@ -25,7 +25,7 @@ def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     code, out, err = harness("sweep", done, "--proxy", "--out", "swept")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    assert out.splitlines()[-1] == "wrote swept/sweep.svg"
+    assert out.splitlines()[-1] == "wrote swept/index.html"
     table = pd.read_csv("swept/conditions.csv")
     assert set(table.panel) == {"core", "size", "loss", "tau"}
     assert set(table[table.panel == "core"].condition) == {"single-local", "v2x", "6g"}

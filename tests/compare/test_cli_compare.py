@@ -6,12 +6,17 @@ from collections.abc import Callable
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import parse_qsl
+from xml.etree import ElementTree
 
 import pytest
 from changing import ends
 from run_on_disk import Row, answers_of, change, configure
 
+from harness.core.statistics import Estimate
+from harness.report.compare.difference import Difference
 from harness.report.compare.text import code
+from harness.report.compare.words import line
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
@@ -200,6 +205,64 @@ def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Pat
         assert "< 0.001" in said
         assert f"Holm's method for the {len(of)} differences that have one" in said
     assert not [line for line in printed[0].splitlines() if line.endswith((" 0.000", "= 0.000"))]
+
+
+def test_better_and_worse_are_marked_in_words_and_signs_where_they_are_beyond_chance(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
+    change(runs[0], decision=lambda row: row.update(latency_ms=100.0, deadline_missed=False))
+    change(runs[1], decision=lambda row: row.update(latency_ms=150.0 + row["episode"] % 2 * 0.01))
+    out = harness("compare", *runs, "--html", "page.html")[1]
+    [*marked] = (line for line in out.splitlines() if line.startswith(("✓", "✗")))
+    assert any(line.startswith("✗ latency_proxy_ms") for line in marked)
+    assert not any("success_rate" in line for line in marked), "it is the same in both"
+    page = unescape(Path("page.html").read_text())
+    assert "<strong>+50.0</strong> ✗ worse" in page
+    assert page.count('class="forest worse"') == len(marked)
+    back = harness("compare", *reversed(runs))[1]
+    turned = [line.split()[1] for line in back.splitlines() if line.startswith("✓")]
+    assert turned == [line.split()[1] for line in marked]
+
+
+def test_a_flip_leads_to_the_decisions_of_both_runs_that_lost_it(
+    worse: tuple[Path, Path], harness: Harness
+) -> None:
+    (worse[0] / "report.html").touch()
+    (worse[1] / "report.html").touch()
+    assert harness("compare", *worse, "--html", "page.html")[0] == 0
+    links = re.findall(r'<a href="([^"]+)">([AB])', unescape(Path("page.html").read_text()))
+    assert [name for _, name in links] == ["A", "B"]
+    for (href, _), run in zip(links, worse, strict=True):
+        file, _, where = href.partition("#")
+        assert Path(file).resolve() == run / "report.html"
+        scene = dict(parse_qsl(where))["scene"]
+        assert scene in {answer.scene for answer in answers_of(run)}
+        assert scene.startswith("00001-"), "the episode that flipped"
+        assert "condition=6g&seed=0" in where
+
+
+def test_gates_are_test_cases_of_junit(worse: tuple[Path, Path], harness: Harness) -> None:
+    gates = ("--fail-if", "6g:success_rate < -0.01", "--fail-if", "unsafe_rate > 0.5")
+    assert harness("compare", *worse, *gates, "--junit", "gates.xml")[0] == 1
+    suite = ElementTree.parse("gates.xml").getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
+    failed, passed = suite.findall("testcase")
+    assert (failed.get("name"), passed.get("name")) == ("6g:success_rate < -0.01", "unsafe_rate > 0.5")
+    assert "in 6g (-0.25)" in failed.find("failure").get("message", "")
+    assert passed.find("failure") is None
+    code, _, err = harness("compare", *worse, "--junit", "gates.xml")
+    assert (code, err) == (2, "harness: --junit writes gates; give one or more with --fail-if\n")
+
+
+def test_no_number_has_more_than_four_figures() -> None:
+    def told(value: float) -> str:
+        return line(Difference("bits_per_episode", value, 0.0, Estimate(value, value, value, 2, 0))).a
+
+    assert [told(value) for value in (0.0, 7.0, 1234.4, 25850.3, 25856.0)] == [
+        "0", "7", "1234", "25850", "25860",
+    ]  # fmt: skip
+    gap = Difference("least_gap_m", 123.456, 0.0, Estimate(-0.04, -0.04, -0.04, 2, 0))
+    assert (line(gap).a, line(gap).change) == ("123.5", "+0.0")
 
 
 HOSTILE = "`<script>alert(1)</script> @everyone ![x](http://x) {{ 7 * 7 }} | ``\n\u202e"

@@ -1,5 +1,6 @@
 """`harness view`: the list of runs, and what it opens."""
 
+import asyncio
 import json
 import os
 import re
@@ -11,12 +12,14 @@ from pathlib import Path
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import configure, names, said
 
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.report.view import pages
+from harness.report.view.app import WAY_BACK, View
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
@@ -75,7 +78,7 @@ def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: 
 
 def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, reports: Path) -> None:
     report = reports / "first/report.html"
-    assert browser.get("/run?path=first").content == report.read_bytes()
+    assert browser.get("/run?path=first").text.replace(f"{WAY_BACK}\n", "") == report.read_text()
     report.write_text("an old one")
     os.utime(report, (1, 1))
     made = browser.get("/run?path=first").text
@@ -101,6 +104,45 @@ def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
         page = browser.get(f"/compare?{query}").text
         assert "A: proxy · prompt v2 · json<br>B: cruise · prompt v2 · json" in page
         assert "latency_p95_ms" in page
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        "/run?path=first",
+        "/run?path=first%2Fsweep-tau",
+        "/report?path=first",
+        "/compare?path=first&path=second",
+    ],
+)
+def test_every_page_leads_back_to_the_list(page: str, browser: TestClient) -> None:
+    text = browser.get(page).text
+    assert text.index('<a href="/"') < text.index("<h1")
+
+
+def test_nothing_is_drawn_for_who_left_while_others_pages_were_drawn(
+    reports: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[int] = []
+
+    def draw(folders: list[Path]) -> str:
+        drawn.append(len(folders))
+        return "<body>"
+
+    monkeypatch.setattr(pages, "report", draw)
+    view = View(reports)
+
+    async def asked(gone: bool) -> int:
+        async def receive() -> dict[str, str]:
+            return {"type": "http.disconnect" if gone else "http.request"}
+
+        scope = {"type": "http", "method": "GET", "query_string": b"path=first&path=second"}
+        return (await view.report(Request(scope, receive))).status_code
+
+    assert asyncio.run(asked(gone=True)) == 204
+    assert drawn == []
+    assert asyncio.run(asked(gone=False)) == 200
+    assert drawn == [2]
 
 
 def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:

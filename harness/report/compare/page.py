@@ -1,17 +1,98 @@
 """A comparison as one HTML file: needs no network and runs no script."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from urllib.parse import quote, urlencode
+
+import numpy as np
+from markupsafe import Markup
 
 from harness.report.compare import words
-from harness.report.compare.difference import Comparison
+from harness.report.compare.difference import Comparison, Difference, Flip
 from harness.report.compare.gate import Verdict
+from harness.report.compare.pair import Side
+from harness.report.drawing import colours
 from harness.report.page import environment
+from harness.runs.folder import Run
+from harness.runs.metrics import is_rate
 
 TEMPLATES = Path(__file__).parent / "templates"
+WIDTH, HEIGHT = 240, 22  # of one line of the forest plot
+Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
-def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> str:
-    """The page; `most` episodes and requests are listed of each kind."""
-    template = environment(TEMPLATES).get_template("compare.html.j2")
-    return template.render(found=comparison, pair=comparison.pair, verdicts=verdicts, most=most, words=words)
+def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
+    """The page; `most` episodes and requests are listed of each kind, with links to the runs' pages."""
+    pair = comparison.pair
+    lost = {name: _lost(side) for name, side in (("A", pair.a), ("B", pair.b))}
+
+    def links(condition: str, flip: Flip) -> Iterator[tuple[str, str]]:
+        for name, side in (("A", pair.a), ("B", pair.b)):
+            where, scene = place(side.run), lost[name].get((condition, flip.seeds[0], flip.episode))
+            if where and scene:
+                asked = {"scene": scene, "condition": condition, "seed": flip.seeds[0]}
+                yield name, f"{where}#{urlencode(asked)}"
+
+    return environment(TEMPLATES).get_template("compare.html.j2").render(
+        found=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links,
+        forest=_forest(comparison), palette=Markup(colours.variables()),
+    )  # fmt: skip
+
+
+def beside(out: Path) -> Place:
+    """Links from a file to the pages in the runs' folders, where there are any."""
+
+    def place(run: Run) -> str | None:
+        page = run.path / "report.html"
+        return quote(os.path.relpath(page, out.resolve().parent)) if page.is_file() else None
+
+    return place
+
+
+def _lost(side: Side) -> dict[tuple[str, int, int], str]:
+    """By condition, seed and episode the decision that lost it; where none is known to, the last."""
+    run = side.run
+    d = run.decisions
+    condition, seed, episode = d.codes("condition", run.conditions), d.whole("seed"), d.whole("episode")
+    regret = np.nan_to_num(d["regret"]) == 1.0
+    last: dict[tuple[str, int, int], str] = {}
+    losing: dict[tuple[str, int, int], str] = {}
+    for scene, rows in d.scenes.items():
+        for n in range(rows.start, rows.stop):
+            key = run.conditions[condition[n]], int(seed[n]), int(episode[n])
+            last[key] = scene
+            if regret[n]:
+                losing.setdefault(key, scene)
+    return last | losing
+
+
+def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:
+    """Draws a line of the forest plot: rates on one scale, any other metric on its own in all conditions."""
+
+    def scale(metric: str) -> str:
+        return "rate" if is_rate(metric) else metric
+
+    reach: dict[str, float] = {}
+    for d in (d for c in comparison.conditions for d in c.differences):
+        ends = [abs(x) for x in (d.change.value, d.change.low, d.change.high) if x == x]
+        reach[scale(d.metric)] = max(reach.get(scale(d.metric), 0.0), *ends)
+
+    def draw(d: Difference) -> Markup:
+        most = reach[scale(d.metric)] or 1.0
+        middle, y = WIDTH / 2, HEIGHT / 2
+
+        def x(value: float) -> float:
+            return round(middle + value / most * (middle - 8), 1)
+
+        verdict, e = words.verdict(d), d.change
+        spread = ""
+        if e.low == e.low:
+            spread = f'<path d="M{x(e.low)} {y}H{x(e.high)}M{x(e.low)} {y - 3}v6M{x(e.high)} {y - 3}v6"/>'
+        point = f'<rect x="{x(e.value) - 3.5}" y="{y - 3.5}" width="7" height="7"/>'
+        return Markup(
+            f'<svg class="forest {verdict}" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
+            f'aria-hidden="true"><path class="zero" d="M{middle} 0V{HEIGHT}"/>{spread}{point}</svg>'
+        )
+
+    return draw

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from textwrap import wrap
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 from harness.core.errors import printable
 from harness.report.compare import words
@@ -37,9 +38,10 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
         if len(label) > 25:
             yield label
             label = ""
-        yield f"{label:<26}{'A':>9}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>8}"
+        yield f"{label:<26}{'A':>8}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>9}"
         for one in map(words.line, c.differences):
-            yield f"{one.metric:<26}{one.a:>9}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>8}"
+            named = f"{words.SIGNS[one.verdict]:<2}{one.metric}"
+            yield f"{named:<27}{one.a:>7}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>9}"
         yield words.success(c, pair)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
     yield words.many(comparison)
@@ -74,10 +76,24 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
 
 def _table(c: InCondition) -> list[str]:
     rows = [
-        f"| {one.metric} | {one.a} | {one.b} | {one.change} | {one.interval} | {one.p} |"
+        f"| {words.SIGNS[one.verdict]} {one.metric} | {one.a} | {one.b} | {one.change} | {one.interval} "
+        f"| {one.p} |"
         for one in map(words.line, c.differences)
     ]
     return ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|", *rows]
+
+
+def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
+    """The gates as test cases, for what shows JUnit's XML."""
+    failed = sum(bool(verdict.failed) for verdict in verdicts)
+    counts = {"name": "harness compare", "tests": str(len(verdicts)), "failures": str(failed)}
+    suite = Element("testsuite", counts)
+    runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
+    for each in verdicts:
+        case = SubElement(suite, "testcase", classname=runs, name=printable(each.gate))
+        if each.failed:
+            SubElement(case, "failure", message=printable(words.judged(each), WHOLE))
+    return tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def code(text: str) -> str:

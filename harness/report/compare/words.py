@@ -1,5 +1,6 @@
 """A comparison in words and numbers, as its table, its Markdown and its page all say them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,13 +11,35 @@ from harness.report.compare.difference import Comparison, Difference, Flip, InCo
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
 from harness.report.words import p_value
-from harness.runs.metrics import unit
+from harness.runs.metrics import SUCCESS, unit
+
+# Of all other metrics less is better.
+MORE_IS_BETTER = {"success_rate", "least_gap_m"}
+NEITHER = {
+    "off_lag_rate", "decisions_per_episode", "trigger_rate", "effective_loss", "entropy_nats",
+    "normalised_entropy",
+}  # fmt: skip
+BETTER, WORSE = "better", "worse"
+SIGNS = {BETTER: "✓", WORSE: "✗", "": ""}
+# What a page shows first; the others are behind a fold.
+LEADING = (
+    "success_rate",
+    "unsafe_rate",
+    "late_rate",
+    "latency_proxy_ms",
+    "messages_per_episode",
+    "fallback_rate",
+)
 
 
 @dataclass(frozen=True)
 class Line:
-    """A difference as text: the metric with its unit, both means, B - A, its interval and Holm's p."""
+    """A difference as text: the metric with its unit, both means, B - A, its interval and Holm's p.
 
+    `verdict` is `better` or `worse` where p is at most 0.05 and the metric has a good side.
+    """
+
+    verdict: str
     metric: str
     a: str
     b: str
@@ -29,16 +52,49 @@ def line(d: Difference) -> Line:
     """A difference as text; shares in percent."""
     factor, suffix, digits = unit(d.metric)
 
-    def signed(value: float) -> str:
+    def figures(value: float, sign: str = "") -> str:
+        """Four figures at most."""
+        if value != value:
+            return "–"
+        least = 3 - math.floor(math.log10(max(abs(value * factor), 1e-9)))
+        places = min(digits, least)
         # 0.0 is added so that there is no -0.0.
-        return "–" if value != value else f"{round(value * factor, digits) + 0.0:+.{digits}f}"
+        return f"{round(value * factor, places) + 0.0:{sign}.{max(places, 0)}f}"
+
+    def signed(value: float) -> str:
+        return figures(value, "+")
 
     e = d.change
     return Line(
-        f"{d.metric}{' %' if suffix == ' %' else ''}", f"{d.a * factor:.{digits}f}",
-        f"{d.b * factor:.{digits}f}", signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
+        verdict(d), f"{d.metric}{' %' if suffix == ' %' else ''}", figures(d.a), figures(d.b),
+        signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
         "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
     )  # fmt: skip
+
+
+def verdict(d: Difference) -> str:
+    """`better` or `worse` where the difference is beyond chance and large enough to be shown; else empty."""
+    factor, _, digits = unit(d.metric)
+    if d.p_corrected is None or d.p_corrected > LEVEL or d.metric in NEITHER:
+        return ""
+    if round(d.change.value * factor, digits) == 0:
+        return ""
+    return BETTER if (d.change.value > 0) == (d.metric in MORE_IS_BETTER) else WORSE
+
+
+def findings(comparison: Comparison) -> list[tuple[str, str]]:
+    """Of each condition, what became of success: a sentence and its verdict."""
+    told = []
+    for c in comparison.conditions:
+        for d in c.differences:
+            if d.metric == SUCCESS:
+                one = line(d)
+                how = one.verdict or "may be chance"
+                said = f"{c.condition}: success {one.change} points {one.interval}: {how}"
+                told.append(
+                    (said + (f", Holm's p {one.p}" if d.p_corrected is not None else ""), one.verdict)
+                )
+    return told
 
 
 def who(side: Side) -> str:
@@ -101,7 +157,8 @@ def many(comparison: Comparison) -> str:
         "p goes with the interval (1 less the level at which that would just touch 0) and is corrected by "
         f"Holm's method for the {len(p_values)} differences that have one: one or more of them is below "
         f"{LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the tests "
-        "of success and gates are of one difference each, not corrected"
+        "of success and gates are of one difference each, not corrected. "
+        f"{SIGNS[BETTER]} better, {SIGNS[WORSE]} worse: p is at most {LEVEL}"
     )
 
 

@@ -218,7 +218,7 @@ class DecisionPage {
     const { told, chosen, run } = this, [id] = this.index.scenes[this.n];
     const shares = policyRows(told, chosen, this.index.actions), times = timelineRows(told, chosen, run);
     const window_s = run.points[chosen.condition].window_s, lines = new Set(times.map((row) => row.who)).size;
-    await chart(policies, `policies-${id}`, { ...this.about.policies, height: 15 * shares.length }, { values: shares });
+    await chart(policies, `policies-${id}`, { ...this.about.policies, height: 13 * shares.length }, { values: shares });
     await chart(timeline, `timeline-${id}`, { ...this.about.timeline, height: 22 * lines }, {
       values: times,
       window: window_s ? [{ window_ms: 1000 * window_s, what: "the decision window closes" }] : [],

@@ -6,7 +6,9 @@ const STRIPS = 12; // shown until all are asked for
 function course(list, scenes, run, condition, seed) {
   const path = scenes.filter((n) => list.action(n, run, condition, seed) != null);
   const ends = path.map((n) => list.letter("ended", n, run, condition, seed));
-  return { path, ends, seed, lost: ends.includes("u"), slow: ends.filter((end) => end === "d").length };
+  // In the closed loop a letter is what the whole episode came to, and too late is a loss.
+  const lost = ends.includes("u") || (list.live && ends.includes("d"));
+  return { path, ends, seed, lost, slow: ends.filter((end) => end === "d").length };
 }
 
 class Episodes {

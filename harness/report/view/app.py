@@ -54,6 +54,8 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
     "Cross-Origin-Opener-Policy": "unsafe-none",
 }
 
+WAY_BACK = '<p class="way-back"><a href="/">← All runs</a></p>'
+
 
 def app(folder: Path) -> ASGIApp:
     """The application for one folder of runs."""
@@ -115,8 +117,8 @@ class View:
             return await run_in_threadpool(self._study, one)
         written, made = (own_file(self.folder, one.name, name) for name in ("report.html", "run.json"))
         if written and made and written.stat().st_mtime >= made.stat().st_mtime:
-            return FileResponse(written, headers=OF_RUNS)
-        return await self._drawn(partial(pages.report, self._whole([one])))
+            return await run_in_threadpool(_shown, written)
+        return await self._drawn(request, partial(pages.report, self._whole([one])))
 
     def picture(self, request: Request) -> Response:
         """A picture of a study."""
@@ -134,14 +136,15 @@ class View:
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
-        return await self._drawn(partial(pages.compared, *self._whole(sorted(picked, key=lambda o: o.date))))
+        older, newer = self._whole(sorted(picked, key=lambda o: o.date))
+        return await self._drawn(request, partial(pages.compared, self.folder, older, newer))
 
     async def report(self, request: Request) -> Response:
         """The report of all runs that are picked."""
         picked = await run_in_threadpool(self._picked, request)
         if not picked:
             raise UserError("no run is picked; pick one or more for a report")
-        return await self._drawn(partial(pages.report, self._whole(picked)))
+        return await self._drawn(request, partial(pages.report, self._whole(picked)))
 
     def wrong(self, request: Request, error: Exception) -> Response:
         """A page of one line about a request that cannot be answered."""
@@ -176,10 +179,10 @@ class View:
     def _study(self, one: Listed) -> Response:
         page = own_file(self.folder, one.name, "index.html")
         if page:
-            return FileResponse(page, headers=OF_RUNS)
+            return _shown(page)
         return HTMLResponse(pages.study(one, pictures(self.folder, one.name)))
 
-    async def _drawn(self, page: Callable[[], str]) -> Response:
+    async def _drawn(self, request: Request, page: Callable[[], str]) -> Response:
         made: Future[str] = Future()
         made.set_running_or_notify_cancel()
 
@@ -190,6 +193,17 @@ class View:
                 made.set_exception(error)
 
         async with self._drawing:
+            if await request.is_disconnected():  # while others' pages were drawn
+                return Response(status_code=204)
             # No pool: Ctrl-C would wait for the threads of one.
             Thread(target=make, daemon=True).start()
-            return HTMLResponse(await asyncio.wrap_future(made), headers=OF_RUNS)
+            return _with_way_back(await asyncio.wrap_future(made))
+
+
+def _shown(page: Path) -> Response:
+    return _with_way_back(page.read_text(encoding="utf-8", errors="replace"))
+
+
+def _with_way_back(page: str) -> Response:
+    """A page of a run, with a link to the list before all that it says itself."""
+    return HTMLResponse(page.replace("<body>", f"<body>\n{WAY_BACK}", 1), headers=OF_RUNS)

@@ -11,6 +11,7 @@ from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.report.page import environment, render
 from harness.report.runs import gather
+from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
 
 RUNS = ("eval", "drive")
@@ -32,9 +33,13 @@ def report(folders: Sequence[Path]) -> str:
     return render(gather(folders))
 
 
-def compared(a: Path, b: Path) -> str:
-    """Run B compared with run A."""
-    return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH)
+def compared(folder: Path, a: Path, b: Path) -> str:
+    """Run B compared with run A, both of a folder."""
+
+    def place(run: Run) -> str:
+        return f"/run?{urlencode({'path': run.path.relative_to(folder).as_posix()})}"
+
+    return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, place)
 
 
 def listed(folder: Path, words: str, order: str) -> str:
