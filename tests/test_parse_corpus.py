@@ -55,7 +55,7 @@ def test_the_corpus_shows_every_status_and_every_repair() -> None:
     ("unit", "status", "detail"),
     [
         ('{"a":', Status.SYNTAX, "more than 3 braces that open no JSON object"),
-        ('{\\"a\\":', Status.SYNTAX, "more than 3 braces that open no JSON object"),
+        ('{\\"a\\":', Status.SYNTAX, "more than 4 braces that open no JSON object"),
         ("{}", Status.SYNTAX, "more than 5000 JSON objects"),
         ("</think>", Status.EMPTY, "there is no answer in the text"),
         ("<think>x</think>", Status.EMPTY, "there is no answer in the text"),
@@ -65,6 +65,6 @@ def test_the_corpus_shows_every_status_and_every_repair() -> None:
 def test_a_megabyte_of_noise_is_given_up_before_it_takes_minutes(
     unit: str, status: Status, detail: str
 ) -> None:
-    """Tries are few where each is long. Time by size: benchmarks/campaigns/sizes.py."""
+    """Seconds by size: benchmarks/campaigns/sizes.py. Here: tries are few where each is long."""
     parsed = parse(unit * (1_000_000 // len(unit)), role="ego", actions=ACTIONS)
     assert (parsed.status, parsed.detail) == (status, detail)

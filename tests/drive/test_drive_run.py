@@ -80,7 +80,7 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     resumed = 0
-    for n in (6, 20, 38, 60, 78):  # before the settings are kept, in chunks, before a table, tidying up
+    for n in (6, 20, 38, 60, 90):  # before the settings are kept, in chunks, before a table, tidying up
         out = tmp_path / f"at-{n}"
         command = [sys.executable, str(HERE / "killed_drive.py"), str(out), str(n)]
         killed = subprocess.run(command, env=environment, capture_output=True, check=False)
