@@ -15,6 +15,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene
 from harness.dataset.schema import Branching, Edge, End
+from harness.dataset.select import Selection
 from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.live_world import LiveSource
@@ -36,7 +37,9 @@ def spec_of(
     dataset: Dataset, model: str = "proxy", prompt: str = "v2", limit: int | None = None, **options: Any
 ) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(cards.resolve(model), prompts.load(prompt), FrozenSource(dataset, limit), **options)
+    return Spec(
+        cards.resolve(model), prompts.load(prompt), FrozenSource(dataset, Selection(limit)), **options
+    )
 
 
 def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:

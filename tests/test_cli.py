@@ -13,7 +13,7 @@ import pytest
 from evaluating import run, spec_of
 from tokenizers import Tokenizer, models
 
-from harness import cli
+from harness import __version__, cli
 from harness.cli.options import parse_seeds
 from harness.cli.run import default_out
 from harness.core import work
@@ -78,6 +78,11 @@ def one_line(said: Said) -> str:
         (["eval", "--limit", "ten"], "Invalid value for '--limit'"),
         (["eval", "--seeds", ""], "--seeds : give a range such as 0:5, or a list"),
         (["eval", "--seeds", "5:0"], "--seeds 5:0: give a range"),
+        (["eval", "--seeds", "5"], "--seeds 5: give 0:5 for seeds from 0 on, or 5:6 for seed 5 alone"),
+        (["eval", "--danger", "up"], "unknown --danger 'up'; known: left, none, oncoming, right"),
+        (["eval", "--only", "3:9999"], "--only 3:9999: give episodes from 0 to 3, such as 3,10:20"),
+        (["eval", "--sample", "201"], "--sample 201: there are 4 episodes to draw from"),
+        (["eval", "--sample", "0"], "--sample 0: give 1 or more episodes"),
         (["eval", "--seeds", "1,1"], "--seeds [1, 1]: give one or more different whole numbers"),
         (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
         (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),
@@ -191,6 +196,23 @@ def test_what_says_json_is_json(harness: Harness, small_path: Path) -> None:
     assert list(json.loads(harness(*args, "--viewer", "v3", "--json").out)) == ["v3"]
     checked = json.loads(harness("prompt", "check", "v1", "--dataset", small_path, "--json").out)
     assert checked == {"version": "v1", "budget": [200, 400], "tokens": {}, "outside": []}
+
+
+def test_one_version_that_cannot_be_used_hides_no_other(harness: Harness, tmp_path: Path) -> None:
+    harness("init", "mine")
+    os.chdir("mine")
+    harness("prompt", "lock", "mine")
+    with Path("prompts/mine/ego.j2").open("a") as file:
+        file.write("edited")
+    for form, mark in (((), "{} "), (("--json",), '"version": "{}"')):
+        said = harness("prompt", "list", *form)
+        assert (said.code, said.err.count("\n")) == (2, 1)
+        assert "prompt mine was released and its text has changed" in said.err
+        assert all(mark.format(version) in said.out for version in ("mine", "v1", "v3"))
+
+
+def test_the_version_is_printed(harness: Harness) -> None:
+    assert harness("--version") == Said(0, f"harness {__version__}\n", "")
 
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:

@@ -191,6 +191,7 @@ def test_no_seconds_retries_or_batches_move_a_row(
         found.append(run(spec, tmp_path / name).manifest)
         assert same_rows(tmp_path / name, tmp_path / "a")
     assert [m.latency for m in found] == [PAPER] * 3
+    assert [m.retries for m in found] == [0, 2 * len(answers_of(tmp_path / "b")), 0]
     assert found[0].answer_times == found[1].answer_times == {}, "no time, or none of a first attempt"
     egos = sum(answer.role == "ego" for answer in answers_of(tmp_path / "c"))
     assert found[2].answer_times["ego"] == Times(egos, 0.5, 0.5, 0.5)

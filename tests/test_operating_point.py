@@ -6,8 +6,9 @@ from dataclasses import asdict, replace
 import pytest
 
 from harness.coordination.channel import CHANNELS
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.operating_point import POINTS, SHORT, OperatingPoint, named_point
 from harness.core.errors import UserError
+from harness.studies.axes import AXES
 
 
 def test_the_paper_has_three_operating_points_that_differ_only_in_the_channel():
@@ -103,6 +104,12 @@ def test_a_change_of_a_point_is_called_by_its_text():
     assert named_point("single-local:fallback=brake").fallback == "brake"
 
 
+@pytest.mark.parametrize("name", SHORT)
+def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
+    asked, swept = named_point(f"6g:{name}=0.3"), AXES[name].at(POINTS["6g"], 0.3)
+    assert replace(asked, name="6g") == swept != POINTS["6g"]
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -114,6 +121,7 @@ def test_a_change_of_a_point_is_called_by_its_text():
         ("6g:on_demand=yes", "on_demand is 'yes'; it must be true or false"),
         ("6g:loss=nan", "loss is nan; it must be a probability"),
         ("6g:loss=0.1,loss=0.2", "loss is given twice"),
+        ("6g:window=300,window_s=0.2", "window_s is given twice"),
         ("6g:consensus=vote", "unknown consensus 'vote'"),
         ("6g:messages=none", "unknown messages 'none'"),
         (

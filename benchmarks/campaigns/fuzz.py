@@ -49,11 +49,12 @@ def main() -> None:
             sound = (read.intent is None) == (read.verdict == "failed")
             if read.intent is not None:
                 sound &= isclose(sum(read.intent), 1.0, abs_tol=1e-9) and all(p >= 0 for p in read.intent)
+            said = repr(read)
         except Exception as error:
-            sound, read = False, error
+            sound, said = False, repr(error)
         if not sound:
             wrong += 1
-            print(f"{read!r} from {role}, {thinking}, {cut}: {text!r}")
+            print(f"{said} from {role}, {thinking}, {cut}: {text!r}")
     took_s = time.process_time() - begun_s
     for status, count in statuses.items():
         print(f"{status:<24}{count:>10}")

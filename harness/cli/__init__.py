@@ -14,6 +14,7 @@ from typing import Any
 import typer
 from typer.main import get_command
 
+from harness import __version__
 from harness.cli import shell
 from harness.core import extras
 from harness.core.errors import UserError, printable
@@ -28,11 +29,25 @@ PANELS = {
 app = typer.Typer(
     name="harness",
     cls=shell.Map,
-    help="Evaluate prompts and parsing in cooperative driving.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"harness {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: bool = typer.Option(False, "--version", callback=_version, help="Print the version."),
+) -> None:
+    """Evaluate prompts and parsing in cooperative driving."""
+
+
 for panel, names in PANELS.items():
     for name in names:
         module = import_module(f"harness.cli.{name}")

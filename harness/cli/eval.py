@@ -10,7 +10,7 @@ from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core import resources, work
-from harness.core.errors import UserError, printable
+from harness.core.errors import printable
 from harness.core.seeds import stated
 
 if TYPE_CHECKING:
@@ -35,7 +35,11 @@ def command(
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
     seeds: options.Seeds = "0:5",
-    limit: int | None = typer.Option(None, help="How many of the dataset's episodes. Default: all."),
+    limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
+    only: str | None = typer.Option(None, help="Episodes by number: 3,10:20 is 3 and 10 to 19."),
+    danger: str | None = typer.Option(None, help="Sector its danger comes from, such as left; or none."),
+    sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
+    sample_seed: int = typer.Option(0, help="Seed of the draw."),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     batch_size: options.BatchSize = 8,
@@ -55,18 +59,18 @@ def command(
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load
+    from harness.dataset.select import Selection
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
 
-    if limit is not None and limit < 1:
-        raise UserError(f"--limit {limit}: give 1 or more episodes")
-    frozen = load.load(load.find(dataset), limit)
+    selection = Selection(limit, only, danger, sample, sample_seed)
+    frozen = selection.of(load.load(load.find(dataset), None if selection.given else limit))
     spec = Spec(
         card=cards.resolve(model, engine),
         prompt=versions.load(prompt),
-        source=FrozenSource(frozen, limit),
+        source=FrozenSource(frozen, selection),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
         seeds=options.parse_seeds(seeds),
         thinking=thinking,
@@ -94,9 +98,10 @@ def command(
         echo_json(as_mapping(done))
     if silent:
         return
+    seeds_of = frozen.manifest.episodes if selection.given else len(frozen.episodes)
     notes = (
         f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds; "
-        f"{stated(frozen.manifest.seed, len(frozen.episodes))};",
+        f"{'of ' if selection.given else ''}{stated(frozen.manifest.seed, seeds_of)};",
         "intervals over episodes; msgs an episode; gain: over single-local, paired",
     )
     show(done, frozen.name, COLUMNS, notes)

@@ -112,9 +112,7 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     from harness.prompts import versions as prompts
 
     data = load.load(load.find(DATASET), 1)
-    spec = Spec(
-        card, prompts.load(PROMPT), FrozenSource(data, 1), (), (0,), thinking, "json", 1, device, dtype
-    )
+    spec = Spec(card, prompts.load(PROMPT), FrozenSource(data), (), (0,), thinking, "json", 1, device, dtype)
     ways = ("json",) if spec.thinking else get_args(AnswerMode)
     scenes = data.scenes(data.forest.ids[:1])
     # The first of a scene's questions is the ego's.

@@ -57,6 +57,9 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
     except ValueError:
         seeds = ()
+    if not colon and len(seeds) == 1 and seeds != (0,):
+        n, end = (printable(at, 20) for at in (seeds[0], seeds[0] + 1))
+        raise UserError(f"--seeds {n}: give 0:{n} for seeds from 0 on, or {n}:{end} for seed {n} alone")
     if not 0 < len(seeds) <= MOST_SEEDS:
         raise UserError(
             f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "

@@ -24,18 +24,27 @@ Version = Annotated[str, typer.Argument(help="Prompt version.")]
 
 @app.command("list")
 def list_prompts(as_json: options.Json = False) -> None:
-    """List the prompt versions."""
+    """List the prompt versions. Exit code 2 if one of them cannot be used."""
     from harness.prompts import versions as prompts
 
     fields = ("version", "released", "sha256", "description", "changed", "known_failures")
-    versions = [prompts.load(name) for name in prompts.names()]
-    rows = [{field: getattr(version, field) for field in fields} for version in versions]
+    rows: list[dict[str, Any]] = []
+    for name in prompts.names():
+        try:
+            version = prompts.load(name)
+        except UserError as error:
+            rows.append({"version": name, "error": str(error)})
+        else:
+            rows.append({field: getattr(version, field) for field in fields})
     if as_json:
         echo_json(rows)
-        return
-    for row in rows:
-        state = "released" if row["released"] else "draft"
-        typer.echo(f"{row['version']:<12} {state:<9} {printable(row['description'], 57)}")
+    else:
+        for row in rows:
+            state = "wrong" if "error" in row else "released" if row["released"] else "draft"
+            about = printable(row.get("description", "cannot be used: see below"), 57)
+            typer.echo(f"{row['version']:<12} {state:<9} {about}")
+    if wrong := [row["error"] for row in rows if "error" in row]:
+        raise UserError("; ".join(wrong))
 
 
 @app.command()

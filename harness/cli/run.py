@@ -96,6 +96,8 @@ def _origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Itera
         yield f"{m.cached_answers} answers came from the cache (--no-cache asks anew)"
     if m.engine_errors:
         yield f"{m.engine_errors} answers are errors of the engine; answers.jsonl has its messages"
+    if m.retries:
+        yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
     for role in ("ego", "helper", "merge"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:

@@ -156,8 +156,9 @@ POINTS = {
 def named_point(text: str) -> OperatingPoint:
     """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
 
-    Every channel profile of a package is a point of the profile's name, with the defaults. The text is the
-    point's name. Raises UserError if there is no such point or setting, or a value is not allowed.
+    A setting may go by its name in `SHORT`. Every channel profile of a package is a point of the profile's
+    name, with the defaults. The text is the point's name. Raises UserError if there is no such point or
+    setting, or a value is not allowed.
     """
     name, colon, settings = text.partition(":")
     if name not in POINTS and name not in CHANNELS:
@@ -166,14 +167,19 @@ def named_point(text: str) -> OperatingPoint:
     changed: dict[str, Any] = {}
     for setting in settings.split(",") if colon else ():
         key, _, value = setting.partition("=")
-        if key not in SETTINGS:
-            raise unknown(f"setting of operating point {name}", key, SETTINGS, f"; as in {name}:window_s=0.3")
-        if key in changed:
-            raise UserError(f"operating point {printable(text)!r}: {key} is given twice; give it once")
-        changed[key] = setting_of(key, value)
+        field, scale = SHORT.get(key, (key, 1.0))
+        if field not in SETTINGS:
+            known = (*SETTINGS, *SHORT)
+            raise unknown(f"setting of operating point {name}", key, known, f"; as in {name}:window_s=0.3")
+        if field in changed:
+            raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
+        given = setting_of(field, value)
+        changed[field] = given * scale if isinstance(given, float) else given
     return replace(point, name=text, **changed) if changed else point
 
 
+# Settings by another name, as `harness sweep --over` has them, each with what makes its unit the setting's.
+SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
 
 

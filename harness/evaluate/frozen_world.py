@@ -9,6 +9,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
+from harness.dataset.select import ALL, Selection
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
@@ -18,10 +19,10 @@ from harness.world.scenario import Scenario, frames
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """A dataset, already limited to the first `limit` episodes; None for all."""
+    """A dataset, which has only the selected episodes already."""
 
     dataset: Dataset
-    limit: int | None = None
+    selection: Selection = ALL
     kind: ClassVar[World] = "frozen"
     command: ClassVar[str] = "eval"
 
@@ -45,14 +46,15 @@ class FrozenSource:
         p = self.scenario.parameters
         return FrozenScenes(
             name=self.dataset.name, sha256=self.dataset.sha256, nodes=len(self.dataset.forest.ids),
-            episodes=len(self.dataset.episodes), limit=self.limit,
+            episodes=len(self.dataset.episodes), limit=self.selection.limit,
             delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
-            path=str(self.dataset.path),
+            path=str(self.dataset.path), selection=self.selection.given,
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
-        """The dataset's folder and the limit."""
-        return [("--dataset", argument(self.dataset.path)), ("--limit", self.limit)]
+        """The dataset's folder, and which episodes of it."""
+        given = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
+        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *given]
 
 
 class _Walks:

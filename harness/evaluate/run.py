@@ -220,6 +220,7 @@ def _written(
         "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": identity,
         "cached_answers": sum(answer.cached for answer in answers),
         "engine_errors": sum(answer.error is not None for answer in answers),
+        "retries": sum(answer.retries for answer in answers),
         "versions": versions(),
     }, Manifest)  # fmt: skip
     folder.write(out, manifest, walked.decisions, episodes, answers, summary)

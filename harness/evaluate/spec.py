@@ -207,9 +207,11 @@ class Spec:
 
     def command(self, out: Path) -> str:
         """A command line that runs this again, quoted for a shell."""
+        first = self.seeds[0]
+        seeds = ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}"
         options = [
             ("--model", argument(self.card)), ("--prompt", self.prompt.version),
-            *self.source.options(), ("--seeds", ",".join(map(str, self.seeds))),
+            *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),

@@ -255,8 +255,8 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     interval: str
 
 
-class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True):
-    """A world of decision trees: the dataset, of which a run with `limit` has the first episodes only."""
+class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True):
+    """Decision trees: a dataset, and which of its episodes: all without `limit` and `selection`."""
 
     name: str
     sha256: str
@@ -266,6 +266,7 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
     delay_allowance_s: float
     decision_lag_s: float
     path: str
+    selection: dict[str, int | str] = {}
 
 
 class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True):
@@ -301,6 +302,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     identity: dict[str, Any]
     cached_answers: int
     engine_errors: int
+    retries: int = 0
     versions: dict[str, str] = field(default_factory=dict)
 
     @property

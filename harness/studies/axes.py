@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.consensus import POOLS, names
-from harness.coordination.operating_point import POINTS, SETTINGS, OperatingPoint, setting_of
+from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.core.errors import UserError, printable, unknown
 
 MOST_POINTS = 1000
@@ -53,11 +53,11 @@ class Axis:
 AXES = {
     axis.name: axis
     for axis in (
-        Axis("tau", "entropy threshold τ, nats", "tau_nats", 1.0, "0.3:1.05:0.05"),
+        Axis("tau", "entropy threshold τ, nats", *SHORT["tau"], "0.3:1.05:0.05"),
         Axis("loss", "loss of one crossing, %", "loss", 0.01, "0:50:5"),
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
-        Axis("latency", "nominal latency of the channel, ms", "latency_s", 1e-3, "0,5,10,25,50,100"),
-        Axis("window", "decision window, ms", "window_s", 1e-3, "150:400:25"),
+        Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
+        Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS)),
     )
 }
