@@ -10,10 +10,11 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 from msgspec.structs import replace
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.run import Evaluated
-from harness.report.caveats import caveats, no_prompt
+from harness.report.caveats import caveats, no_prompt, of_run
+from harness.runs import folder
 from harness.runs.records import Manifest, Score
 
 Said = tuple[int, str, str]
@@ -114,3 +115,16 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert f"A: {UNREAD}" in unescape(Path("both.html").read_text())
     assert harness("report", *both, "--out", "matrix.html")[0] == 0
     assert f": {UNREAD}" in unescape(Path("matrix.html").read_text())
+
+
+def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path) -> None:
+    """Four episodes; decisions over v2x take longer than the dataset's lag; one condition is a control."""
+    points = (POINTS["v2x"], named_point("6g:messages=shuffled"))
+    done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
+    assert list(of_run(folder.read(done.out))) == [
+        "Only 4 episodes: a rate's interval may reach 49 points to either side.",
+        "6g:messages=shuffled is a control: the ego hears what helpers say in another layout. A decision's "
+        "page shows what its own helpers say.",
+        "With v2x most decisions take longer than these frozen scenes allow for: driving may end otherwise "
+        "(harness fidelity).",
+    ]

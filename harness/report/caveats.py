@@ -43,6 +43,12 @@ def of_run(run: Run) -> Iterator[str]:
     if run.manifest.engine_errors or retries:
         errors = run.manifest.engine_errors
         yield f"The engine stumbled: {errors} requests ended in an error, {retries} attempts were repeated."
+    shuffled = [c["name"] for c in run.manifest.conditions if c.get("messages", "own") != "own"]
+    if shuffled:
+        yield (
+            f"{', '.join(map(printable, shuffled))} is a control: the ego hears what helpers say in another "
+            "layout. A decision's page shows what its own helpers say."
+        )
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
     if off:
         yield (
