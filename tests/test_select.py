@@ -55,7 +55,3 @@ def test_a_run_says_which_and_its_command_selects_them_again(harness: Callable[.
     again[again.index("a")] = "b"
     assert harness(*again[1:])[0] == 0
     assert Path("a/episodes.csv").read_text() == Path("b/episodes.csv").read_text()
-    code, _, err = harness(
-        "eval", "--sample", "2", "--condition", "6g", "--seeds", "3:4", "--out", "a", "--resume"
-    )
-    assert (code, "selection of the world" in err) == (2, True), err
