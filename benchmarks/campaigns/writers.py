@@ -37,7 +37,8 @@ def main() -> None:
             "fidelity": ("fidelity", run, here / "driven", "--out", "it"),
             "video": ("video", here / "driven", 0, "--out", "it.gif"),
             "campaign paper": (
-                "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2", "--out", "it",
+                "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2",
+                "--out", "it",
             ),
             "compare": ("compare", run, run),
             "init": ("init", "it"),

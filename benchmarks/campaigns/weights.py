@@ -1,6 +1,6 @@
 """A model whose weights are no numbers: every answer an error of the engine, in every mode, on each engine.
 
-    python benchmarks/campaigns/numbers.py
+    python benchmarks/campaigns/weights.py
 
 The model is the tests' tiny Qwen3, its last norm NaN; `eval` asks it about one episode.
 """
