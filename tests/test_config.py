@@ -1,5 +1,6 @@
 """Typed records from tables: what is read, and the one line that every mistake is."""
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +111,17 @@ def test_what_is_no_toml_is_said_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "route.toml"
     file.write_text("a = 1")
     assert toml(file, "r") == {"a": 1}
-    for data in (b"[a", b"\xff"):
+    for data in (b"[a", b"\xff", b"a = " + b"9" * 5000, b"a = " + b"[" * 3000):
         file.write_bytes(data)
         with pytest.raises(UserError, match=r"^r is no TOML: .*; mend the file$"):
             toml(file, "r")
+
+
+def test_a_folder_a_pipe_a_dangling_link_and_a_device_are_no_toml(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "device").symlink_to("/dev/zero")
+    for name in ("folder", "pipe", "link", "device"):
+        with pytest.raises(UserError, match=r"^r is no TOML: .*; mend the file$"):
+            toml(tmp_path / name, "r")

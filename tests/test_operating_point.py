@@ -141,3 +141,11 @@ def test_only_a_point_with_a_channel_asks_again():
     assert named_point("v2x:consensus=ego-prompt").asks_again
     assert not named_point("v2x").asks_again
     assert not named_point("single-local:consensus=ego-prompt").asks_again
+
+
+@pytest.mark.parametrize(
+    "setting", ["loss=.1", "latency_s=0.1", "density_coupled=true", "roadside_edge=true"]
+)
+def test_a_setting_of_the_channel_is_refused_where_there_is_none(setting: str) -> None:
+    with pytest.raises(UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"):
+        named_point(f"single-local:{setting}")

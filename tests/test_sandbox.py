@@ -2,7 +2,7 @@
 
 import pytest
 from jinja2 import StrictUndefined, UndefinedError
-from jinja2.exceptions import SecurityError
+from jinja2.exceptions import SecurityError, TemplateAssertionError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from harness.prompts.versions import LOOP, Sandbox
@@ -40,3 +40,25 @@ def test_what_is_no_member_is_still_kept_from_a_template(template):
 def test_a_member_that_is_not_there_is_an_error():
     with pytest.raises(UndefinedError):
         rendered("{{ graph.egg }}", graph={"ego": {}})
+
+
+@pytest.mark.parametrize(
+    "template",
+    ["{{ 'a'.ljust(3000000000) }}", "{{ 'a' * 10000000000 }}", "{{ [1] * 10000000000 }}",
+     "{{ 10 ** 10000000 }}",
+     "{{ '%3000000000d' | format(1) }}", "{{ '%*d' | format(3000000000, 1) }}", "{{ '%3000000000d' % 1 }}",
+     "{{ '{:3000000000}'.format(1) }}"],
+)  # fmt: skip
+def test_no_template_fills_memory(template):
+    with pytest.raises(SecurityError):
+        rendered(template)
+
+
+@pytest.mark.parametrize("template", ["{{ 'a' | center(3000000000) }}", "{{ 'a' | indent(3000000000) }}"])
+def test_filters_that_pad_are_gone(template):
+    with pytest.raises(TemplateAssertionError):
+        rendered(template)
+
+
+def test_numbers_are_multiplied_and_formatted():
+    assert rendered("{{ (0.25 * 100) | round | int }} {{ '%.2f' | format(0.5) }} {{ 7 % 4 }}") == "25 0.50 3"

@@ -53,7 +53,7 @@ def command(
 
 def _line(head: str, text: str) -> None:
     for n, line in enumerate(wrap(text, WIDTH - MARGIN, break_on_hyphens=False) or ["none"]):
-        typer.echo(f"{'' if n else head:<{MARGIN}}{line}")
+        typer.echo(f"{'' if n else head:<{MARGIN}}{printable(line, 1000)}")
 
 
 def _lacking(remedies: list[tuple[str, str]]) -> None:

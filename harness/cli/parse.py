@@ -9,6 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.core import errors
 
+MOST_BYTES = 1 << 24
 FINISH_REASONS = ("stop", "length", "error")
 
 
@@ -58,7 +59,10 @@ def command(
 def _read(file: str) -> str:
     """The text, line ends untouched. Bytes that are not UTF-8 become U+FFFD, and a note on stderr says so."""
     try:
-        data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
+        with sys.stdin.buffer if file == "-" else Path(file).open("rb") as source:
+            data = source.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise ValueError(f"it is larger than {MOST_BYTES >> 20} MB")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         shown = errors.printable(file)

@@ -72,7 +72,8 @@ def show(
     for v, messages in sent.items():
         for message in messages:
             typer.echo(f"--- {v} {message['role']}")
-            typer.echo(message["content"])
+            for line in message["content"].split("\n"):
+                typer.echo(printable(line, len(line) * 10))
 
 
 @app.command()

@@ -25,6 +25,7 @@ import msgspec
 from msgspec.inspect import type_info
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import text_of
 
 Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
@@ -46,8 +47,17 @@ def toml(path: Path, where: str) -> dict[str, Any]:
         UserError: it is no TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return loads(text_of(path), where)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = printable(getattr(error, "strerror", None) or error)
+        raise UserError(f"{where} is no TOML: {reason}; mend the file") from None
+
+
+def loads(text: str, where: str) -> dict[str, Any]:
+    """The tables of a TOML text. Raises UserError if it is none."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # too many digits, and brackets, among them
         raise UserError(f"{where} is no TOML: {printable(error)}; mend the file") from None
 
 

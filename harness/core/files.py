@@ -1,8 +1,10 @@
 """Files are written whole or not at all, and named by what is in them."""
 
+import errno
 import hashlib
 import json
 import os
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -49,6 +51,15 @@ def _written_alike(value: Any) -> bool:
 
 def _without_exponent(number: float) -> bool:
     return 1e-4 <= number < 1e16 or number == 0.0 or -1e16 < number <= -1e-4
+
+
+def text_of(path: Path, most: int = 1 << 24) -> str:
+    """Text of a file. Raises OSError if it is none or above `most` bytes, UnicodeDecodeError if not UTF-8."""
+    if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for, and a device never ends
+        raise OSError(errno.EINVAL, "it is no file")
+    if path.stat().st_size > most:
+        raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
+    return path.read_bytes().decode("utf-8")
 
 
 def sha256_bytes(data: bytes) -> str:

@@ -38,7 +38,7 @@ def find(kind: str, name: str) -> Path:
         UserError: the project and the harness both have one of that name, which would then mean two things.
     """
     found = list(dict.fromkeys(where / name for where in _folders(kind)))  # one, if `name` is absolute
-    there = [path for path in found if os.path.exists(path)]
+    there = [path for path in found if os.path.lexists(path)]
     if len(there) > 1:
         raise UserError(
             f"{kind}/{printable(name)} is in this project and ships with the harness; give yours another name"

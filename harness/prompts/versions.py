@@ -5,7 +5,7 @@ A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with
 is a new version.
 """
 
-import tomllib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +14,14 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from jinja2 import StrictUndefined, Template, TemplateSyntaxError
+from jinja2.exceptions import SecurityError
 from jinja2.nodes import EvalContext
 from jinja2.runtime import Context, LoopContext
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from harness.core.config import Count, convert
+from harness.core.config import Count, convert, loads
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
 
 Graph = Mapping[str, Any]
@@ -31,9 +32,34 @@ NO_WORDS: Mapping[str, str] = MappingProxyType({})
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
 LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
 
+WIDE = re.compile(r"\d{3}|\*")  # in a format: a hundred characters or more, or a width from elsewhere
+PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
+
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """What a template may do. `graph.ego` is the member of that name: no method of a mapping hides it."""
+    """What a template may do. `graph.ego` is the member of that name: no method of a mapping hides it.
+
+    Nothing in it makes a text or a number that fills memory.
+    """
+
+    intercepted_binops = frozenset({"*", "**", "%"})
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        for name in ("center", "indent"):
+            del self.filters[name]
+        self.filters["format"] = _formatted
+
+    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
+        """The value, of numbers alone, and of small powers."""
+        numbers = all(isinstance(side, int | float) for side in (left, right))
+        if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
+            raise SecurityError(f"{operator} is not allowed on such values")
+        return super().call_binop(context, operator, left, right)
+
+    def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
+        """No method of a text that pads."""
+        return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
 
     def getattr(self, obj: Any, attribute: str) -> Any:
         """The member, or what the sandbox allows."""
@@ -42,7 +68,16 @@ class Sandbox(ImmutableSandboxedEnvironment):
             return obj[attribute]
         if type(obj) is LoopContext and attribute in LOOP:
             return getattr(obj, attribute)
+        if isinstance(obj, str) and attribute in PADDING:
+            return self.unsafe_undefined(obj, attribute)
         return super().getattr(obj, attribute)
+
+
+def _formatted(text: str, *values: Any) -> str:
+    """Jinja's `format`, of narrow fields."""
+    if WIDE.search(text):
+        raise SecurityError(f"a format as wide as {text!r} is not allowed")
+    return text % values
 
 
 @dataclass(frozen=True)
@@ -180,7 +215,7 @@ def load(version: str, where: Path | None = None) -> Prompt:
     base = _base(version, where)
     texts = {name: _text(base / version / name) for name in FILES}
     what = f"prompt {version} prompt.toml"
-    table = _toml(texts["prompt.toml"], what)
+    table = loads(texts["prompt.toml"], what)
     sha256 = digest(texts)
     released = _released(base)
     if version in released and released[version] != sha256:
@@ -218,18 +253,11 @@ def digest(texts: Mapping[str, str]) -> str:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
+        return text_of(file)
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"prompt file {printable(file)} cannot be read: {printable(error)}") from None
 
 
 def _released(base: Path) -> dict[str, str]:
     file = base / "released.toml"
-    return _toml(_text(file), f"prompt file {printable(file)}") if file.is_file() else {}
-
-
-def _toml(text: str, what: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{what} is no TOML: {printable(error)}") from None
+    return loads(_text(file), f"prompt file {printable(file)}") if file.is_file() else {}

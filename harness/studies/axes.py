@@ -78,6 +78,8 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     Raises:
         UserError: it is none, or too long.
     """
+    if text is not None and not text.strip():
+        raise UserError(f"--grid: no values for {axis.name}; give some, or leave it out")
     if not text and not axis.usual:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
