@@ -216,8 +216,8 @@ def test_a_folder_in_use_is_refused_and_left_as_it_is(
     in_file = file / "run"
     for out, said in (
         (proxy_run, "already holds a finished run; choose another folder or delete it"),
-        (other, "exists and is no run; choose another folder"),
-        (file, "exists and is no run; choose another folder"),
+        (other, "is a folder with other files in it; choose an empty or a new one"),
+        (file, "is no folder; choose an empty or a new one"),
         (in_file, "cannot be made (Not a directory); choose another folder"),
     ):
         before = {p: p.read_bytes() for p in (*proxy_run.iterdir(), other / "thesis.tex", file)}
@@ -242,13 +242,14 @@ def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Pat
     assert "has no weights" in refused(spec_of(small, str(tmp_path / "hollow")), tmp_path / "out")
 
 
-def test_a_prompt_that_does_not_render_some_scene_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
-    """The template fails at the third step only, when answers have been had."""
+def test_a_prompt_that_does_not_render_some_scene_leaves_no_run(small: Dataset, tmp_path: Path) -> None:
+    """The template fails at the third step only. The answers until then have been paid for, and stay."""
     prompt = prompts.load("v2")
     text = prompt.texts["ego"].replace("Distribution:", "{{ graph.step + (0 if graph.step < 2 else 'x') }}")
     broken = replace(prompt, texts={**prompt.texts, "ego": text})
-    said = refused(replace(spec_of(small), prompt=broken), tmp_path / "out")
-    assert said.startswith("prompt v2 ego.j2 does not render")
+    with pytest.raises(UserError, match=r"prompt v2 ego\.j2 does not render"):
+        run(replace(spec_of(small), prompt=broken), tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".work"}
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,7 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
         score = read(run).score(name, "success_rate")
         assert score.interval == "episodes"
         assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
-    assert "2 episodes × 2 seeds of two; 95 % intervals over episodes" in page.text
+    assert "2 episodes × 3 seeds of two; 95 % intervals over episodes" in page.text
     for metric in ("latency proxy", "trigger rate", "entropy"):
         assert metric in page.text
 
