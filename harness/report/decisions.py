@@ -73,6 +73,7 @@ class Decisions:
         self.ids = [scene for scene, _ in order]
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         self._ends = [_ends(run) for run in runs.runs]
+        self._episodes = [_episodes(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self.index = {
             "actions": runs.actions,
@@ -186,16 +187,7 @@ class Decisions:
         for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
             shown = {**_shown(d), "end": str(self._ends[n][row])}
             decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
-        number = int(run.decisions.whole("episode")[rows.start])
-        ends = [
-            {
-                "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
-                "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
-                "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
-                "other_crashes": e.other_crashes,
-            }
-            for e in run.episodes if e.episode == number
-        ]  # fmt: skip
+        ends = self._episodes[n][int(run.decisions.whole("episode")[rows.start])]
         return {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
 
 
@@ -210,6 +202,19 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
     role = "helper" if answer.role == "helper" else "ego"
     return spans(answer.raw, role, run.actions, run.manifest.thinking)
+
+
+def _episodes(run: Run) -> dict[int, list[dict[str, Any]]]:
+    """How each episode ended, by number: an entry a condition and seed."""
+    ends: dict[int, list[dict[str, Any]]] = {}
+    for e in run.episodes:
+        ends.setdefault(e.episode, []).append({
+            "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
+            "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
+            "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
+            "other_crashes": e.other_crashes,
+        })  # fmt: skip
+    return ends
 
 
 def _ends(run: Run) -> Any:
