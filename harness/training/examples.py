@@ -1,10 +1,13 @@
 """What each viewer of a scene is asked, and what the decision tree says it should have intended.
 
+An action is safe if the episode still succeeds when the driver that sees no more than the ego takes the rest:
+what only one who sees everything could still save is not safe for who does not. Each safe action has the
+weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one has none. Where IDLE and
+FASTER come to the same (at the highest speed level) most goes to IDLE. A viewer that cannot tell scenes apart
+is best served by the mean of their labels, so what it cannot see makes it unsure.
+
 Of each level of a tree up to `OF_A_LEVEL` decision points are taken, drawn by the layout: so a model sees the
-scenes that its own errors lead to. Each safe action has the weight exp(-delay / 0.25 s), so that a needless
-SLOWER counts little; an unsafe one has none. Where IDLE and FASTER come to the same (at the highest speed
-level) most goes to IDLE. A viewer that cannot tell scenes apart is best served by the mean of their labels,
-so what it cannot see makes it unsure.
+scenes that its own errors lead to. Those at which nothing is safe any more, 70 % of all, are left out.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +23,7 @@ from harness.prompts.versions import NO_WORDS, Prompt
 from harness.training.answers import message
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
+TEACHER = "local-view"
 SOFTNESS_S = 0.25
 OF_A_LEVEL = 6
 CALM = {"FASTER": 0.3}  # prior weight of an action, 1 if not named
@@ -45,22 +49,26 @@ class Question:
 
 
 def labels(dataset: Dataset) -> Floats:
-    """Soft labels of every decision point, (N, A); uniform where no action is safe."""
-    safe, delay_s = dataset.forest.safe, dataset.forest.delay_s
+    """Soft labels of every decision point, (N, A); NaN where no action is safe."""
+    forest = dataset.forest
+    last = forest.then(TEACHER)
+    safe = forest.succeeds(last, forest.tree[:, None])
+    time_s = np.where(safe, forest.cleared_s[last], np.inf)
     prior = np.array([CALM.get(a, 1.0) for a in dataset.actions])
-    weight = np.where(safe, prior * np.exp(-np.nan_to_num(delay_s) / SOFTNESS_S), 0.0)
-    weight = np.where(safe.any(axis=1, keepdims=True), weight, 1.0)
+    with np.errstate(invalid="ignore"):  # inf - inf, where no action is safe
+        weight = prior * np.exp((time_s.min(axis=1, keepdims=True) - time_s) / SOFTNESS_S)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def taught(dataset: Dataset) -> list[Scene]:
     """The scenes that are learnt from, tree by tree."""
+    place, lost = dataset.forest.place, np.isnan(labels(dataset)[:, 0])
     ids = []
     for tree in dataset.trees:
         rng = noise.generator("taught", tree.episode_seed)
         for level in tree.levels:
-            drawn = sorted(rng.permutation(len(level))[:OF_A_LEVEL].tolist())
-            ids += [level[n].scene for n in drawn]
+            some = [point.scene for point in level if not lost[place[point.scene]]]
+            ids += [some[n] for n in sorted(rng.permutation(len(some))[:OF_A_LEVEL].tolist())]
     return dataset.scenes(ids)
 
 
