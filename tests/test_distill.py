@@ -226,7 +226,7 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         distill(few, VERSIONS, PLAN, student, stop, "cpu")
     with pytest.raises(Killed):
         distill(few, VERSIONS, PLAN, tmp_path / "m", stop, "cpu")
-    with pytest.raises(UserError, match=r"begun with another dataset, prompt, seed or samples"):
+    with pytest.raises(UserError, match=r"was begun with another seed"):
         distill(few, VERSIONS, replace(PLAN, seed=1), tmp_path / "m", stop, "cpu")
 
 
