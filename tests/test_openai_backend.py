@@ -510,6 +510,13 @@ def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert other.asked == []
 
 
+@pytest.mark.parametrize("location", ["javascript:1", "http://[::1", "//\u00e9\u00e9.xn--a"])
+def test_a_redirect_to_what_is_no_address_is_the_answers_error(location: str) -> None:
+    done = ask_one(lambda asked: asked.reply(b"", 302, location=location))
+    assert done.error
+    assert done.text == ""
+
+
 def echo(asked: Asked) -> None:
     """Say the Authorization header back, another way each time."""
     header = asked.headers["Authorization"]

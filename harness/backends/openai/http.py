@@ -95,6 +95,11 @@ class Client:
                 reply = await self._once("POST", path, content, self._server.timeout_s)
             except TimeoutError:
                 reply = Reply(fault=f"no whole answer within {self._server.timeout_s:g} s", again=True)
+            except (
+                httpx.InvalidURL,
+                UnicodeError,
+            ):  # httpx reads where a redirect leads though none is followed
+                reply = Reply(fault="a redirect to what is no address, which is not followed")
             except httpx.RequestError as error:
                 reply = Reply(fault=self._shown(_said(error)), again=True)
             if not reply.again or retries == self._server.retries:
