@@ -86,3 +86,9 @@ def test_bad_input_is_one_line_and_exits_with_two(arguments: list[str], line: st
     assert done.stdout == b""
     assert done.stderr.decode().startswith(line)
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_device_without_an_end_is_one_line() -> None:
+    done = harness("/dev/zero")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, b"", 1)
+    assert done.stderr.startswith(b"harness: ")

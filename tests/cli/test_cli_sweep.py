@@ -58,6 +58,7 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
     [
         (("--over", "speed"), "unknown --over 'speed'"),
         (("--over", "tau", "--grid", "a"), "--grid a: give numbers"),
+        (("--over", "tau", "--grid", ""), "--grid"),
         (("--over", "tau", "--grid", "1", "--grid", "2"), "--grid: 2 given for 1 of --over"),
         (("--over", "tau", "--condition", "6g:tau=1"), "unknown setting of operating point 6g 'tau'"),
         (("--over", "tau", "--condition", "single-local"), "has no channel; nothing of it can be varied"),

@@ -1,0 +1,50 @@
+"""A command that somebody or the machine stops says so in one line, and how to go on."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+EVAL = ("eval", "--model", "proxy", "--seeds", "0:1", "--out", "stopped")
+
+
+def started(*args: str, cwd: Path, limit: Callable[[], None] | None = None) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "harness", *args], cwd=cwd, text=True, stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, preexec_fn=limit,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_who_stops_a_command_hears_that_the_same_one_goes_on(
+    tmp_path: Path, number: int, code: int, word: str
+) -> None:
+    process = started(*EVAL, cwd=tmp_path)
+    kept = tmp_path / "stopped/.work/answers.jsonl"
+    while not kept.is_file() and process.poll() is None:
+        time.sleep(0.01)
+    os.kill(process.pid, number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code
+    how = f"the same command goes on: harness {' '.join(EVAL)}"
+    assert said.splitlines()[-1] == f"harness: {word}; stopped keeps what is done; {how}"
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
+    """No file may grow beyond 1000 bytes, which ends a write as a full disk does."""
+    process = started(
+        *EVAL, "--limit", "1", cwd=tmp_path,
+        limit=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+    )  # fmt: skip
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, len(said.splitlines())) == (2, 1)
+    assert said.startswith("harness: ")
+    assert "File too large" in said
