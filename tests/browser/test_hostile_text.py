@@ -18,7 +18,7 @@ from harness.report.runs import gather
 
 WRITTEN = """
   html head meta title style body nav a button noscript main section h1 h2 h3 p strong code span small br
-  table thead tbody tr th td details summary div figure figcaption pre script
+  table thead tbody tr th td dl dt dd details summary div figure figcaption pre script
 """
 WATCH = """
 window.ran = [];

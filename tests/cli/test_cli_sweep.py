@@ -60,7 +60,7 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
         (("--over", "tau", "--grid", "a"), "--grid a: give numbers"),
         (("--over", "tau", "--grid", ""), "--grid"),
         (("--over", "tau", "--grid", "1", "--grid", "2"), "--grid: 2 given for 1 of --over"),
-        (("--over", "tau", "--condition", "6g:tau=1"), "unknown setting of operating point 6g 'tau'"),
+        (("--over", "tau", "--condition", "6g:taus=1"), "unknown setting of operating point 6g 'taus'"),
         (("--over", "tau", "--condition", "single-local"), "has no channel; nothing of it can be varied"),
         (("--over", "consensus", "--grid", "ego-prompt"), "proxy is no language model"),
         (("--latency", "mine"), "unknown --latency 'mine'"),

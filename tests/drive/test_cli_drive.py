@@ -40,7 +40,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
         ("--batch-size 0", "--batch-size 0: give 1 or more"),
         ("--answer readout", "proxy is no language model; use json"),
         ("--device cpu", "proxy has no weights here"),
-        ("--out EMPTY/file --episodes 1", "exists and is no run"),
+        ("--out EMPTY/file --episodes 1", "is no folder; choose an empty or a new one"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(harness, tmp_path, words, says):

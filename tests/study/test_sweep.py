@@ -59,7 +59,7 @@ def test_every_axis_gives_its_panels(source: Stored, tmp_path: Path) -> None:
     summary = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
     assert set(summary.panel) == set(AXES)
     names = {f"{table}.{kind}" for table in ("conditions", "episodes") for kind in ("csv", "jsonl")}
-    names |= {f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png")}
+    names |= {"index.html", *(f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png"))}
     assert {p.name for p in tmp_path.iterdir()} == names
     assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
 
