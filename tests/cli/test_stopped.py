@@ -14,7 +14,7 @@ import pytest
 EVAL = ("eval", "--model", "proxy", "--seeds", "0:1", "--out", "stopped")
 
 
-def started(*args: str, cwd: Path, limit: Callable[[], None] | None = None) -> "subprocess.Popen[str]":
+def started(*args: str, cwd: Path, limit: Callable[[], object] | None = None) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "harness", *args], cwd=cwd, text=True, stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL, preexec_fn=limit,
@@ -27,7 +27,8 @@ def started(*args: str, cwd: Path, limit: Callable[[], None] | None = None) -> "
 def test_who_stops_a_command_hears_that_the_same_one_goes_on(
     tmp_path: Path, number: int, code: int, word: str
 ) -> None:
-    process = started(*EVAL, cwd=tmp_path)
+    # A shell starts what runs in the background with Ctrl-C ignored.
+    process = started(*EVAL, cwd=tmp_path, limit=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     kept = tmp_path / "stopped/.work/answers.jsonl"
     while not kept.is_file() and process.poll() is None:
         time.sleep(0.01)
