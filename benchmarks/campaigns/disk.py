@@ -9,9 +9,7 @@ import random
 import subprocess
 from pathlib import Path
 
-from judging import Tally, counted, dataset, typed, workshop
-
-SCENARIO = "occluded-intersection"
+from judging import Tally, counted, typed, workshop, writing
 
 
 def main() -> None:
@@ -20,27 +18,8 @@ def main() -> None:
     rng = random.Random(given.seed)
     tally = Tally()
     with workshop() as here:
-        small, run = dataset(here / "small", 1), here / "run"
-        one = ("--dataset", small, "--seeds", "0")
-        assert typed("eval", *one, "--out", run).code == 0
-        drive = ("drive", "--episodes", 2, "--condition", "6g", "--seeds", "0", "--workers", 2, "--out")
-        assert typed(*drive, here / "driven").code == 0
-        commands: dict[str, tuple[object, ...]] = {
-            "eval": ("eval", *one, "--out", "locked/it"),
-            "drive": (*drive, "locked/it"),
-            "dataset build": ("dataset", "build", SCENARIO, "--episodes", 1, "--out", "locked/it"),
-            "sweep": ("sweep", run, "--over", "tau", "--grid", "0.2,0.7", "--out", "locked/it"),
-            "report": ("report", run, "--out", "locked/it.html"),
-            "export": ("export", run, "--csv", "--out", "locked"),
-            "fidelity": ("fidelity", run, here / "driven", "--out", "locked/it"),
-            "video": ("video", here / "driven", 0, "--out", "locked/it.gif"),
-            "campaign paper": (
-                "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2",
-                "--out", "locked/it",
-            ),
-            "dataset show": ("dataset", "show", small, "00000-0", "--out", "locked/it.svg"),
-            "init": ("init", "locked/it"),
-        }  # fmt: skip
+        commands = writing(here, Path("locked/it"))
+        commands["dataset show"] = ("dataset", "show", here / "small", "00000-0", "--out", "locked/it.svg")
         locked = here / "locked"
         locked.mkdir()
         for n in range(given.count):

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from harness import cli
 
+SCENARIO = "occluded-intersection"
 LIMIT_S = 120.0
 MEMORY = 8 << 30  # bytes of address space
 TESTS = Path(__file__).parents[2] / "tests"
@@ -164,7 +165,31 @@ def workshop() -> Iterator[Path]:
 
 def dataset(out: Path, episodes: int = 2) -> Path:
     """A small dataset."""
-    ended = typed("dataset", "build", "occluded-intersection", "--episodes", episodes, "--out", out)
+    ended = typed("dataset", "build", SCENARIO, "--episodes", episodes, "--out", out)
     if ended.code:
         sys.exit(ended.err)
     return out
+
+
+def writing(here: Path, out: Path) -> dict[str, tuple[object, ...]]:
+    """The commands that write, to `out` or a file of that name, of a dataset and runs made first."""
+    small, run, driven = dataset(here / "small", 1), here / "run", here / "driven"
+    one = ("--dataset", small, "--seeds", "0")
+    drive = ("drive", "--episodes", 2, "--condition", "6g", "--seeds", "0", "--workers", 2)
+    for ended in (typed("eval", *one, "--out", run), typed(*drive, "--out", driven)):
+        if ended.code:
+            sys.exit(ended.err)
+    return {
+        "eval": ("eval", *one, "--out", out),
+        "drive": (*drive, "--out", out),
+        "dataset build": ("dataset", "build", SCENARIO, "--episodes", 1, "--out", out),
+        "sweep": ("sweep", run, "--over", "tau", "--grid", "0.2,0.7", "--out", out),
+        "report": ("report", run, "--out", out.with_suffix(".html")),
+        "export": ("export", run, "--csv", "--out", out),
+        "fidelity": ("fidelity", run, driven, "--out", out),
+        "video": ("video", driven, 0, "--out", out.with_suffix(".gif")),
+        "campaign paper": (
+            "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2", "--out", out,
+        ),
+        "init": ("init", out),
+    }  # fmt: skip

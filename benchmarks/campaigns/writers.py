@@ -8,8 +8,9 @@ The second begins up to a second after the first. One of the two may be refused 
 import random
 import shutil
 import time
+from pathlib import Path
 
-from judging import Running, Tally, counted, dataset, typed, workshop
+from judging import Running, Tally, counted, workshop, writing
 
 from harness.dataset import verify
 from harness.runs import folder
@@ -21,28 +22,9 @@ def main() -> None:
     rng = random.Random(given.seed)
     tally = Tally()
     with workshop() as here:
-        small, run = dataset(here / "small", 1), here / "run"
-        one = ("--dataset", small, "--seeds", "0")
-        assert typed("eval", *one, "--out", run).code == 0
-        drive = ("drive", "--episodes", 2, "--condition", "6g", "--seeds", "0", "--workers", 2, "--out")
-        assert typed(*drive, here / "driven").code == 0
-        commands: dict[str, tuple[object, ...]] = {
-            "eval": ("eval", *one, "--out", "it"),
-            "eval, no --out": ("eval", *one),
-            "drive": (*drive, "it"),
-            "dataset build": ("dataset", "build", "occluded-intersection", "--episodes", 1, "--out", "it"),
-            "sweep": ("sweep", run, "--over", "tau", "--grid", "0.2,0.7", "--out", "it"),
-            "report": ("report", run, "--out", "it.html"),
-            "export": ("export", run, "--csv", "--out", "it"),
-            "fidelity": ("fidelity", run, here / "driven", "--out", "it"),
-            "video": ("video", here / "driven", 0, "--out", "it.gif"),
-            "campaign paper": (
-                "campaign", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2",
-                "--out", "it",
-            ),
-            "compare": ("compare", run, run),
-            "init": ("init", "it"),
-        }  # fmt: skip
+        commands = writing(here, Path("it"))
+        commands["eval, no --out"] = ("eval", "--dataset", here / "small", "--seeds", "0")
+        commands["compare"] = ("compare", here / "run", here / "run")
         for n in range(given.count):
             name = list(commands)[n % len(commands)]
             first = Running(commands[name])

@@ -9,7 +9,7 @@ from harness.cli import options
 from harness.cli.estimates import WIDTH
 from harness.cli.progress import bar
 from harness.cli.run import file_name
-from harness.cli.sweep import tables
+from harness.cli.sweep import show_tables
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose
 
@@ -107,5 +107,5 @@ def closed_loop(
     if as_json:
         typer.echo(summary.to_json(orient="records"))
     if not silent:
-        tables(summary)
+        show_tables(summary)
         typer.echo(f"wrote {printable(where / 'figure-a.svg')} and {printable(where / 'figure-b.svg')}")

@@ -69,7 +69,7 @@ def command(
     if as_json:
         typer.echo(summary.to_json(orient="records"))
     if not silent:
-        tables(summary)
+        show_tables(summary)
         for source in stored:
             if left := source.left_out:
                 typer.echo(
@@ -79,7 +79,7 @@ def command(
         typer.echo(f"wrote {printable(where / 'index.html')}")
 
 
-def tables(summary: "pd.DataFrame") -> None:
+def show_tables(summary: "pd.DataFrame") -> None:
     """Print a study's success, trigger rate, messages, latency and deadline misses, a line a grid point."""
     from harness.studies.sweep import tables
 

@@ -175,7 +175,7 @@ def named_point(text: str) -> OperatingPoint:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
         given = setting_of(field, value)
         changed[field] = given * scale if isinstance(given, float) else given
-    for key in ("loss", "latency_s", "density_coupled", "roadside_edge"):
+    for key in OVERRIDES:
         if key in changed and point.profile is None:
             raise UserError(
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes nothing; "

@@ -1,6 +1,6 @@
 """One palette for charts, pictures and videos: a colour has one meaning, and a sign or a name says it again.
 
-Blues are conditions, green to red is what came of something, purples are vehicles and their roles, browns are
+Blues are conditions, green to red is how something ended, purples are vehicles and their roles, browns are
 actions. Conditions, outcomes and roles stand out from white and from dark paper (3 to 1 at least); actions,
 from light to dark as they get faster, have an outline instead.
 """

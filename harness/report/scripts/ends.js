@@ -1,4 +1,4 @@
-// What came of a decision, in signs and words.
+// How a decision ended, in signs and words.
 
 const ENDS = { s: ["good", "✓"], d: ["slow", "◷"], u: ["bad", "✗"], n: ["", "○"], "-": ["quiet", ""] };
 const endWords = (live) => (live
