@@ -53,7 +53,7 @@ def network():
 def ground(far_m):
     plus = np.array([(HALF_M, far_m), (HALF_M, HALF_M), (far_m, HALF_M), (far_m, -HALF_M)])
     streets = [np.array([(-x, -y), (x, y)]) for x, y in ((HALF_M, far_m), (far_m, HALF_M))]
-    return Ground(np.vstack([plus, -plus]), (), (), tuple(streets))
+    return Ground((np.vstack([plus, -plus]),), (), (), tuple(streets))
 
 
 def layout(seed, parameters):

@@ -138,7 +138,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         ],
         "meanings": {str(one): one.meaning for one in (*Status, *Repair)},
         "ground": {
-            "view_m": VIEW_M, "outline": surface.outline.round(2).tolist(),
+            "view_m": VIEW_M, "outlines": [o.round(2).tolist() for o in surface.outlines],
             "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.world.road import Ground, Lane, Path, PathKey, Road, crossings
+from harness.world.road import STEP_M, Ground, Lane, Path, PathKey, Road, crossings
 
 LANE_WIDTH_M = 4.0
 JUNCTION_M = 11.0  # from the centre to where approach lanes end
 ARM_M = 100.0  # length of an approach or exit lane
 LEFT_TURN_RADIUS_M = 13.0
-STEP_M = 0.25
 SECTOR_REACH_M = (8.0, 50.0)  # stretch of the approach lane, from the conflict point, that is looked at
 
 APPROACHES = ("own", "left", "oncoming", "right")  # south, west, north, east: highway-env's nodes o0..o3
@@ -33,7 +32,8 @@ PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left":
 def road() -> Road:
     """The intersection. Its conflict zone is the centroid of the conflict points of three dangers."""
     ways, ego = paths(), ("own", "straight")
-    meetings = crossings(ways, ego)
+    # A path that merges into the ego's lane brings no danger here.
+    meetings = {key: at for key, at in crossings(ways, ego).items() if at.kind == "crossing"}
     points = [meetings[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
     return Road(
         facts={
@@ -121,7 +121,7 @@ def ground(far_m: float) -> Ground:
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])  # clockwise, for row vectors
     turns = [np.linalg.matrix_power(quarter, n) for n in range(4)]
     return Ground(
-        outline=np.vstack([corner @ turn for turn in turns]),
+        outlines=(np.vstack([corner @ turn for turn in turns]),),
         marks=tuple(np.array([[0.0, JUNCTION_M], [0.0, far_m]]) @ turn for turn in turns),
         stops=tuple(np.array([[0.0, JUNCTION_M], [-half, JUNCTION_M]]) @ turn for turn in turns),
         boxes=tuple(np.array([[-x, -y], [x, y]]) for x, y in ((half, far_m), (far_m, half))),

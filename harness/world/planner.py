@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.world.road import Road
+from harness.world.road import Path, Road
 from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
 
@@ -94,22 +94,22 @@ def rollouts(
 def least_gap(road: Road, travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
     """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
     key = (conflict["sector"], conflict["route"])
-    mine, its, crossing = road.ego_path, road.paths[key], road.crossings[key]
+    crossing = road.crossings[key]
     time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
     ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
     other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
-    ego_y = np.interp(ego_arc, mine.arc_m, mine.points[:, 1])
-    heading = its.headings_rad[np.searchsorted(its.arc_m, other_arc).clip(0, len(its.arc_m) - 1)]
-    other_x, other_y = (np.interp(other_arc, its.arc_m, along) for along in its.points.T)
-    # The ego's path is a line of constant x, so its discs differ in y alone. Of each of the other's discs the
-    # nearest is kept as it goes: arrays of all pairs would not fit into the processor's cache.
-    discs_y = [ego_y + disc for disc in DISCS_M]
-    squared = np.full(ego_y.shape, np.inf)
-    for disc in DISCS_M:
-        y = other_y + np.sin(heading) * disc
-        apart = np.abs(discs_y[0] - y)
-        for mine_y in discs_y[1:]:
-            np.minimum(apart, np.abs(mine_y - y), out=apart)
-        np.minimum(squared, apart**2 + (crossing.x_m - (other_x + np.cos(heading) * disc)) ** 2, out=squared)
-    nearest = np.sqrt(squared.min(axis=1))
-    return np.asarray(nearest - 2 * DISC_RADIUS_M - MARGIN_M)
+    mine, its = _discs(road.ego_path, ego_arc), _discs(road.paths[key], other_arc)
+    squared = np.full(ego_arc.shape, np.inf)
+    # The nearest pair is kept as it goes: arrays of all pairs would not fit into the processor's cache.
+    for x, y in mine:
+        for its_x, its_y in its:
+            np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
+    return np.asarray(np.sqrt(squared.min(axis=1)) - 2 * DISC_RADIUS_M - MARGIN_M)
+
+
+def _discs(path: Path, arc_m: Floats) -> list[tuple[Floats, Floats]]:
+    """x and y of the discs of a car at arc lengths along a path."""
+    heading = path.headings_rad[np.searchsorted(path.arc_m, arc_m).clip(0, len(path.arc_m) - 1)]
+    x, y = (np.interp(arc_m, path.arc_m, along) for along in path.points.T)
+    cos, sin = np.cos(heading), np.sin(heading)
+    return [(x + cos * disc, y + sin * disc) for disc in DISCS_M]

@@ -1,22 +1,27 @@
 """A road as paths: where vehicles can go on it, where their ways cross, and what lies around.
 
 Frame: metres, x to the east, y to the *south* (highway-env's screen frame), headings in radians from +x
-towards +y. The ego's path runs straight to the north.
+towards +y.
 """
 
+import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import shapely
 from shapely import LineString, intersection
 
 from harness.core.arrays import Floats
 
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's name of it: two nodes, and a number from the left
+STEP_M = 0.25  # between the points of a path
+STRIPED = 1  # highway-env's LineType of a line that may be crossed
+NORTH = np.array([1.0, -1.0])  # from this frame to that of pictures
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,19 @@ class Path:
     roles: tuple[str, ...]
     lanes: tuple[Lane, ...]
     priority: int
+
+    @classmethod
+    def along(
+        cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str], priority: int
+    ) -> "Path":
+        """The middle of some of highway-env's lanes, each of which goes on where the one before it ends."""
+        middles = [_middle(network.get_lane(lane)) for lane in lanes]
+        corners = np.concatenate(middles)
+        arc = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
+        ends = arc[np.cumsum([len(middle) for middle in middles])[:-1]]
+        even = np.linspace(0.0, arc[-1], math.ceil(arc[-1] / STEP_M) + 1)
+        points = np.column_stack([np.interp(even, arc, along) for along in corners.T])
+        return cls(approach, route, points, even, tuple(ends.tolist()), tuple(roles), tuple(lanes), priority)
 
     @cached_property
     def headings_rad(self) -> Floats:
@@ -77,14 +95,28 @@ class Path:
         return self.roles[self.section(arc_m)]
 
 
+def _middle(lane: Any) -> Floats:
+    """(n, 2) m, points of the middle of one of highway-env's lanes, its ends among them."""
+    return np.array([lane.position(s, 0.0) for s in np.linspace(0, lane.length, math.ceil(lane.length) + 1)])
+
+
 @dataclass(frozen=True)
 class Crossing:
-    """Where another path meets the ego's: position and arc lengths along both, in metres."""
+    """Where another path meets the ego's: position and arc lengths along both, in metres.
+
+    Attributes:
+        x_m: m to the east.
+        y_m: m to the south.
+        ego_arc_m: along the ego's path.
+        other_arc_m: along the other path.
+        kind: whether it goes across, or into a lane that the ego takes as well.
+    """
 
     x_m: float
     y_m: float
     ego_arc_m: float
     other_arc_m: float
+    kind: Literal["crossing", "merging"] = "crossing"
 
 
 @dataclass(frozen=True)
@@ -92,13 +124,13 @@ class Ground:
     """What a picture shows of a road, in m to the east and to the *north*.
 
     Attributes:
-        outline: (n, 2) its edge.
+        outlines: (n, 2) each, its edges: the outer one, and those of what it goes round.
         marks: centre lines, (n, 2) each.
         stops: stop lines, (n, 2) each.
         boxes: west-south and east-north corners (2, 2) of what labels keep off.
     """
 
-    outline: Floats
+    outlines: tuple[Floats, ...]
     marks: tuple[Floats, ...]
     stops: tuple[Floats, ...]
     boxes: tuple[Floats, ...]
@@ -145,14 +177,49 @@ class Road:
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
-    """Where paths from elsewhere cross the ego's, by the other's approach and route."""
+    """Where paths from elsewhere first meet the ego's, by the other's approach and route."""
     mine = paths[ego]
     found = {}
     for key, path in paths.items():
         if key[0] == ego[0]:
             continue
+        shared = [lane for lane in mine.lanes if lane in path.lanes]
+        if shared:
+            begin, its_begin = ((0.0, *p.ends_m)[p.lanes.index(shared[0])] for p in (mine, path))
+            found[key] = Crossing(*mine.at(begin)[:2], begin, its_begin, "merging")
+            continue
         point = intersection(LineString(mine.points), LineString(path.points))
-        if point.geom_type == "Point":  # a path that merges into the ego's lane shares a line with it
+        if point.geom_type == "Point":
             x, y = float(point.x), float(point.y)
             found[key] = Crossing(x, y, mine.project(x, y)[0], path.project(x, y)[0])
     return found
+
+
+def ground(network: Any, far_m: float) -> Ground:
+    """What a picture shows of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
+    lanes = network.lanes_list()
+    view = shapely.box(-far_m, -far_m, far_m, far_m)
+    strips = [LineString(_middle(lane)).buffer(lane.width / 2 + 0.05, cap_style="flat") for lane in lanes]
+    surface = shapely.union_all(strips).buffer(1.0).buffer(-1.0).intersection(view)
+    pieces = [piece for piece in shapely.get_parts(surface) if piece.geom_type == "Polygon"]
+    rings = [ring for piece in pieces for ring in (piece.exterior, *piece.interiors)]
+    outlines = tuple(np.asarray(ring.simplify(0.05).coords) * NORTH for ring in rings)
+    return Ground(outlines, tuple(_marks(lanes, view)), (), tuple(_boxes(strips, view)))
+
+
+def _marks(lanes: Sequence[Any], view: Any) -> Iterator[Floats]:
+    """Lines between lanes that lie side by side."""
+    for lane in lanes:
+        if lane.line_types[0] == STRIPED:  # on its left; what is on its right is another's left, or an edge
+            along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
+            line = LineString([lane.position(s, -lane.width / 2) for s in along]).intersection(view)
+            yield from (np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1)
+
+
+def _boxes(strips: Sequence[Any], view: Any) -> Iterator[Floats]:
+    """Boxes around the lanes within the view."""
+    for strip in strips:
+        seen = strip.intersection(view)
+        if not seen.is_empty:
+            west, north, east, south = seen.bounds
+            yield np.array([[west, -south], [east, -north]])

@@ -5,7 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import PathPatch, Polygon
+from matplotlib.path import Path
 
 from harness.core.errors import printable
 from harness.report.drawing.colours import INK
@@ -32,7 +33,8 @@ def ground(
         x, y = np.sign(corners.mean(axis=0)) * (VIEW_M - 13.0)
         axes.text(x, y, printable(building.id), color="#877E68", size=TEXT_PT, ha="center", va="center")
     surface = ground_of(scenario)
-    axes.add_patch(Polygon(surface.outline, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
+    edges = Path.make_compound_path(*(Path(edge, closed=True) for edge in surface.outlines))
+    axes.add_patch(PathPatch(edges, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
     for mark in surface.marks:
         axes.plot(*mark.T, color="white", linewidth=1.0, dashes=(5, 4))
     for stop in surface.stops:

@@ -69,7 +69,7 @@ function birdsEye(world, ground, viewer, messages, zoom) {
     + `occluded sectors: ${listed(sees.occluded)}${beyond.length ? `; beyond the picture: ${listed(beyond)}` : ""}`;
   const picture = svg("svg", { viewBox: `${west} ${north} ${side} ${side}`, class: "scene", role: "img", "aria-label": told });
   picture.append(
-    svg("polygon", { points: points(ground.outline), class: "road" }),
+    svg("path", { d: ground.outlines.map((o) => `M${points(o)}Z`).join(""), class: "road", "fill-rule": "evenodd" }),
     ...ground.marks.map((m) => svg("polyline", { points: points(m), class: "mark" })),
     ...ground.stops.map((s) => svg("polyline", { points: points(s), class: "stop" })),
     shadows(world, eye, 4 * most),
