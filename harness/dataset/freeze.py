@@ -2,7 +2,7 @@
 
 From the first decision point on every meta-action is taken, each a lag after its moment, and the decision
 points that come are frozen. Those in the same state are one, whatever led there; actions that set the same
-target speed are one edge. So the tree of six decisions has some hundred decision points, and every leaf of it
+target are one edge. So the tree of six decisions has some hundred decision points, and every leaf of it
 is an episode that is decided.
 """
 
@@ -19,7 +19,7 @@ from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
-from harness.world.world import World
+from harness.world.world import Target, World
 
 Record = dict[str, Any]
 
@@ -49,10 +49,10 @@ def _edges(world: World, episode: int, following: dict[str, World]) -> Iterator[
     waiting.outcome, waiting.hard_brakings = Outcome(), 0  # what happens from here on
     p = world.scenario.parameters
     waiting.advance(p.due_frame(world.step) + p.lag_frames)
-    by_target: dict[int, list[str]] = {}
+    by_target: dict[Target, list[str]] = {}
     for action in world.actions:
-        index = waiting.speed_index if waiting.outcome.ended else waiting.speed_index_after(action)
-        by_target.setdefault(index, []).append(action)
+        target = waiting.target if waiting.outcome.ended else waiting.target_after(action)
+        by_target.setdefault(target, []).append(action)
     for left, actions in zip(reversed(range(len(by_target))), by_target.values(), strict=True):
         branch = waiting.branch() if left else waiting
         branch.act(actions[0])

@@ -49,6 +49,7 @@ class Vehicle(Closed, frozen=True):
     approach: str
     route: str
     crashed: bool
+    braking: bool = False
 
 
 class Building(Closed, frozen=True):
@@ -106,13 +107,14 @@ class Ego(Closed, frozen=True):
     forward_m: Number
     left_m: Number
     age_s: Number
+    route: str | None = None
 
 
 class Node(Closed, frozen=True):
     """A vehicle that the viewer's sensors report."""
 
     id: VehicleId
-    type: Literal["vehicle", "car", "truck"]
+    type: Literal["vehicle", "car", "van", "truck"]
     forward_m: Number
     left_m: Number
     heading_deg: Number | None
@@ -121,6 +123,7 @@ class Node(Closed, frozen=True):
     lane: str
     indicator: str | None
     sensors: list[Literal["camera", "lidar", "radar"]]
+    braking: bool | None = None
 
 
 class Point(Closed, frozen=True):
@@ -138,13 +141,14 @@ class EgoArrival(Closed, frozen=True):
 
 
 class Arrival(EgoArrival, frozen=True):
-    """How far another vehicle is from a conflict, and how fast it is."""
+    """How far another vehicle is from a conflict, how fast it is, and whether it is seen to brake."""
 
     speed_mps: Number
+    braking: bool | None = None
 
 
 class Conflict(Closed, frozen=True):
-    """A vehicle whose path crosses the ego's."""
+    """A vehicle whose path meets the ego's: the one it is on, or one beside, `lane`."""
 
     vehicle: VehicleId = field(name="with")
     sector: str
@@ -152,6 +156,8 @@ class Conflict(Closed, frozen=True):
     point: Point
     ego: EgoArrival
     other: Arrival
+    kind: Literal["crossing", "merging", "ahead", "behind", "oncoming"] = "crossing"
+    lane: Literal["own", "left", "right"] = "own"
 
 
 class SectorSeen(Closed, frozen=True):
@@ -297,7 +303,7 @@ def record_type(scenario: Scenario) -> type[Record]:
     graph = _narrowed(
         Graph,
         nodes=_list(_narrowed(Node, indicator=signal | None)),
-        conflicts=_list(_narrowed(Conflict, sector=sector, route=route)),
+        conflicts=_list(_narrowed(Conflict, sector=approach, route=route)),
         sectors=_list(_narrowed(SectorSeen, sector=sector)),
     )
     kind: type[Record] = _narrowed(

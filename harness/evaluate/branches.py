@@ -8,7 +8,7 @@ branches. A branch continues exactly as the whole would, to the last bit.
 from dataclasses import dataclass
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.world.world import World
+from harness.world.world import Target, World
 
 
 @dataclass
@@ -75,23 +75,23 @@ class Trajectory:
         return arrived
 
     def _act(self) -> list["Trajectory"]:
-        """Let what is ready act; one trajectory for each target speed that the egos have then."""
-        now = self.world.speed_index
+        """Let what is ready act; one trajectory for each target that the egos have then."""
+        now = self.world.target
         worlds, parted = {now: self.world}, {now: list[Course]()}
-        after: dict[str, int] = {}
+        after: dict[str, Target] = {}
         for course in self.courses:
             ready = course.open
             if ready is None or ready.frame > self.world.frame:
                 parted[now].append(course)
                 continue
             if ready.action not in after:
-                after[ready.action] = self.world.speed_index_after(ready.action)
+                after[ready.action] = self.world.target_after(ready.action)
             parted.setdefault(after[ready.action], []).append(course)
             ready.acted = True
             course.open = None
-        new = {index: action for action, index in after.items() if index != now}
-        for n, (index, action) in enumerate(new.items(), 1):
+        new = {target: action for action, target in after.items() if target != now}
+        for n, (target, action) in enumerate(new.items(), 1):
             nobody_stays = n == len(new) and not parted[now]
-            worlds[index] = self.world if nobody_stays else self.world.branch()
-            worlds[index].take(action)
-        return [Trajectory(self.number, worlds[index], some) for index, some in parted.items() if some]
+            worlds[target] = self.world if nobody_stays else self.world.branch()
+            worlds[target].take(action)
+        return [Trajectory(self.number, worlds[target], some) for target, some in parted.items() if some]

@@ -49,6 +49,7 @@ def road() -> Road:
         sectors={sector: _approach(ways[sector, "straight"]) for sector in SECTORS},
         network=network,
         ground=ground,
+        form=1,
     )
 
 

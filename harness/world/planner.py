@@ -1,67 +1,100 @@
-"""The reference planner behind `local-view` and `full-view`: looks ahead along the ego's path.
+"""The reference planner behind `local-view` and `full-view`: looks ahead along the ego's ways.
 
 It knows what a scene graph says, and nothing else. It plays every sequence of meta-actions over the next
 decisions, then FASTER, against the conflicts of the graph at constant speed, and takes the first action of
-the sequence that clears the conflict points soonest without meeting anyone. It does not guess at what it
-cannot see, which is what makes occlusion cost something.
+the sequence that passes the conflict zone soonest without meeting anyone. Who is seen to brake is taken to
+brake until it stands. It does not guess at what it cannot see, which is what makes occlusion cost something.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.world.road import Path, Road
 from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
 
-SHIFT = {"FASTER": 1, "SLOWER": -1, "IDLE": 0}  # what it plays through; it never changes lane
+SPEED = {"FASTER": 1, "SLOWER": -1}  # levels that an action changes the target speed by
+SIDE = {"LANE_LEFT": -1, "LANE_RIGHT": 1}  # ways that it changes over, to the right
+# Among equals the calmest: compared decision by decision.
+CALM = {"IDLE": 0, "FASTER": 1, "SLOWER": 2, "LANE_RIGHT": 3, "LANE_LEFT": 4}
 HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
 LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
 MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
-RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC)
+RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC), and of its steering
+EMERGENCY_MPS2 = 6.0  # how hard one that is seen to brake is taken to brake
+AWAY_S = 0.5  # what it costs to end beside one's way
 STEP_S = 0.1
-# A car is covered by three discs on its long axis: a third of its length apart, reaching its corners.
-DISCS_M = np.array([-1.0, 0.0, 1.0]) * SIZES_M["car"][0] / 3
-DISC_RADIUS_M = float(np.hypot(SIZES_M["car"][0] / 6, SIZES_M["car"][1] / 2))
+LANE_M = 4.0  # between two ways
+Point = tuple[Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Sequences of actions, played through.
+
+    Attributes:
+        actions: the sequences, (n,).
+        travelled_m: distance along the ego's way, (n, steps).
+        right_m: distance to the right of the way that the ego is on now, (n, steps); None if it stays.
+        ends: ways to the right of it, (n,).
+    """
+
+    actions: Sequence[tuple[str, ...]]
+    travelled_m: Floats
+    right_m: Floats | None
+    ends: Ints
 
 
 def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     """The planner's meta-action for a scene graph."""
     p, road, ego = scenario.parameters, scenario.road(), graph["ego"]
-    actions = tuple(a for a in scenario.actions if a in SHIFT)
-    left = p.decisions - graph["step"]
-    sequences, travelled = _all_rollouts(actions, ego["speed_mps"], ego["target_speed_mps"], left, p)
-    gap = np.full(len(sequences), np.inf)
+    beside = road.beside(_way(road, ego))
+    sides = int("left" in beside), int("right" in beside)
+    tried = _rollouts(
+        scenario.actions, ego["speed_mps"], ego["target_speed_mps"], p.decisions - graph["step"], sides, p
+    )
+    gap = np.full(len(tried.actions), np.inf)
     for conflict in graph["conflicts"]:
-        gap = np.minimum(gap, least_gap(road, travelled, conflict))
+        gap = np.minimum(gap, least_gap(road, tried, graph, conflict))
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
-    to_go = graph["ego"]["zone_m"] + 15.0
-    arrival = (travelled < to_go).sum(axis=1) * STEP_S - 1e-3 * travelled[:, -1]
+    to_go = ego["zone_m"] + 15.0
+    arrival = (tried.travelled_m < to_go).sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
+    if road.ways:
+        arrival += AWAY_S * (road.ways.index(beside["own"]) + tried.ends != road.ways.index(road.ego))
     safe = gap > 0
     score = np.where(safe, -arrival, -1e3 + np.minimum(gap, 0.0))
     best = np.flatnonzero(score >= score.max() - 1e-9)
-    # Among equals the calmest: IDLE before FASTER before SLOWER, compared decision by decision.
-    calm = {"IDLE": 0, "FASTER": 1, "SLOWER": 2}
-    return min((sequences[i] for i in best), key=lambda s: [calm[a] for a in s])[0]
+    return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
+
+
+def _way(road: Road, ego: Mapping[str, Any]) -> tuple[str, str]:
+    """The ego's way."""
+    return (road.ego[0], ego["route"]) if "route" in ego else road.ego
 
 
 # Every viewer of a scene is told the ego's speed, so they share one set of rollouts.
 @lru_cache(maxsize=64)
-def _all_rollouts(
-    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, parameters: Parameters
-) -> tuple[list[tuple[str, ...]], Floats]:
-    """Every sequence that is played through, and its rollout. Shared: not to be written to."""
-    sequences = list(product(actions, repeat=min(HORIZON, left)))
-    travelled = rollouts(sequences, speed_mps, target_mps, left, parameters)
-    travelled.flags.writeable = False
-    return sequences, travelled
+def _rollouts(
+    actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, sides: tuple[int, int],
+    parameters: Parameters,
+) -> Rollouts:  # fmt: skip
+    """Every sequence that is played through. Shared: not to be written to."""
+    known = [a for a in actions if a in CALM and (a not in SIDE or sides[SIDE[a] > 0])]
+    sequences = list(product(known, repeat=min(HORIZON, left)))
+    ends = np.cumsum([[SIDE.get(a, 0) for a in s] for s in sequences], axis=1)
+    stays = (ends.min(axis=1) >= -sides[0]) & (ends.max(axis=1) <= sides[1])
+    sequences, ends = [s for s, fits in zip(sequences, stays, strict=True) if fits], ends[stays]
+    travelled = travelled_m(sequences, speed_mps, target_mps, left, parameters)
+    return Rollouts(sequences, travelled, _right_m(ends, parameters) if any(sides) else None, ends[:, -1])
 
 
-def rollouts(
+def travelled_m(
     sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
 ) -> Floats:
     """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
@@ -71,7 +104,7 @@ def rollouts(
     """
     levels = np.array(parameters.target_speeds_mps)
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
-    moves = np.array([[SHIFT[a] for a in s] for s in sequences])
+    moves = np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
     speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
     travelled = np.empty((len(sequences), steps))
     gone = np.zeros(len(sequences))
@@ -91,25 +124,62 @@ def rollouts(
     return travelled
 
 
-def least_gap(road: Road, travelled: Floats, conflict: Mapping[str, Any]) -> Floats:
-    """Smallest gap (m) to another vehicle that keeps path and speed, per sequence; below zero they meet."""
-    key = (conflict["sector"], conflict["route"])
-    crossing = road.crossings[key]
-    time_s = (np.arange(travelled.shape[1]) + 1) * STEP_S
-    ego_arc = crossing.ego_arc_m - conflict["ego"]["arc_m"] + travelled
-    other_arc = crossing.other_arc_m - conflict["other"]["arc_m"] + conflict["other"]["speed_mps"] * time_s
-    mine, its = _discs(road.ego_path, ego_arc), _discs(road.paths[key], other_arc)
-    squared = np.full(ego_arc.shape, np.inf)
+def _right_m(ends: Ints, parameters: Parameters) -> Floats:
+    """How far to the right of its way the ego is (n, steps), ways over after each decision being (n, k)."""
+    steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
+    right = np.empty((len(ends), steps))
+    now = np.zeros(len(ends))
+    for k in range(steps):
+        now = now + (ends[:, min(k // every, ends.shape[1] - 1)] * LANE_M - now) * STEP_S / RESPONSE_S
+        right[:, k] = now
+    return right
+
+
+def least_gap(road: Road, tried: Rollouts, graph: Mapping[str, Any], conflict: Mapping[str, Any]) -> Floats:
+    """Smallest gap (m) to another vehicle that keeps its path, per sequence; below zero they meet."""
+    key, way = (conflict["sector"], conflict["route"]), _way(road, graph["ego"])
+    kind, mine, other = conflict.get("kind", "crossing"), road.paths[way], conflict["other"]
+    time_s = (np.arange(tried.travelled_m.shape[1]) + 1) * STEP_S
+    if kind in ("crossing", "merging"):
+        crossing = road.crossings[key]
+        begin, its = crossing.ego_arc_m - conflict["ego"]["arc_m"], road.paths[key]
+        its_begin = crossing.other_arc_m - other["arc_m"]
+    else:
+        if kind == "behind" and conflict["lane"] == "own":
+            return np.full(len(tried.actions), np.inf)  # it keeps off the ego by itself
+        begin = road.zone_arc_m - graph["ego"]["zone_m"]
+        its = road.paths[road.beside(way)[conflict["lane"]]]
+        its_begin = begin + conflict["ego"]["arc_m"] + other["arc_m"] * (-1 if kind == "behind" else 1)
+    braked_s = other["speed_mps"] / EMERGENCY_MPS2 if other.get("braking") else np.inf
+    until_s = np.minimum(time_s, braked_s)
+    its_m = other["speed_mps"] * until_s
+    if other.get("braking"):
+        its_m = its_m - EMERGENCY_MPS2 / 2 * until_s**2
+    type_of = {node["id"]: node["type"] for node in graph["nodes"]}
+    length, width = SIZES_M.get(type_of.get(conflict["with"], ""), SIZES_M["car"])
+    away, reach = cover(length, width)
+    own, own_reach = cover(*SIZES_M["car"])
+    ego = _discs(mine, begin + tried.travelled_m, own, tried.right_m)
+    squared = np.full(tried.travelled_m.shape, np.inf)
     # The nearest pair is kept as it goes: arrays of all pairs would not fit into the processor's cache.
-    for x, y in mine:
-        for its_x, its_y in its:
+    for its_x, its_y in _discs(its, its_begin + (-its_m if kind == "oncoming" else its_m), away):
+        for x, y in ego:
             np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
-    return np.asarray(np.sqrt(squared.min(axis=1)) - 2 * DISC_RADIUS_M - MARGIN_M)
+    return np.asarray(np.sqrt(squared.min(axis=1)) - reach - own_reach - MARGIN_M)
 
 
-def _discs(path: Path, arc_m: Floats) -> list[tuple[Floats, Floats]]:
-    """x and y of the discs of a car at arc lengths along a path."""
+def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
+    """Discs that cover a vehicle: where they are on its long axis, and their radius."""
+    count = max(3, round(length_m / width_m))
+    places = (np.arange(count) - (count - 1) / 2) * length_m / count
+    return places, float(np.hypot(length_m / count / 2, width_m / 2))
+
+
+def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> list[Point]:
+    """X and y of a vehicle's discs at arc lengths along a path, or to the right of it."""
     heading = path.headings_rad[np.searchsorted(path.arc_m, arc_m).clip(0, len(path.arc_m) - 1)]
     x, y = (np.interp(arc_m, path.arc_m, along) for along in path.points.T)
     cos, sin = np.cos(heading), np.sin(heading)
-    return [(x + cos * disc, y + sin * disc) for disc in DISCS_M]
+    if right_m is not None:
+        x, y = x - sin * right_m, y + cos * right_m
+    return [(x + cos * away, y + sin * away) for away in away_m]

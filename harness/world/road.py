@@ -51,8 +51,9 @@ class Path:
 
     @classmethod
     def along(
-        cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str], priority: int
-    ) -> "Path":
+        cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str],
+        priority: int,
+    ) -> "Path":  # fmt: skip
         """The middle of some of highway-env's lanes, each of which goes on where the one before it ends."""
         middles = [_middle(network.get_lane(lane)) for lane in lanes]
         corners = np.concatenate(middles)
@@ -144,6 +145,10 @@ class Road:
         facts: what a frozen record says of it: texts, and numbers with their unit in the name.
         paths: every path, by approach and route.
         ego: the ego's path.
+        ways: paths that the ego changes between by changing lane, from left to right, `ego` among them: side
+            by side, and as long.
+        form: of its scene graphs; 2 lists every relation to the ego's ways, 1 crossings alone, as
+            `occluded-intersection-v2` is frozen.
         crossings: where the ego's path meets others, and so where conflicts are looked for.
         zone_m: position of the conflict zone; distances to it weigh messages.
         sectors: where danger can come from, and the points (k, 2) m that must be seen to know of it.
@@ -159,6 +164,25 @@ class Road:
     sectors: Mapping[str, Floats]
     network: Callable[[], Any]
     ground: Callable[[float], Ground]
+    ways: tuple[PathKey, ...] = ()
+    form: Literal[1, 2] = 2
+
+    def beside(self, key: PathKey) -> dict[str, PathKey]:
+        """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such."""
+        if key not in self.ways:
+            return {"own": key}
+        place = self.ways.index(key)
+        places = {"own": place, "left": place - 1, "right": place + 1}
+        return {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
+
+    @cached_property
+    def forks(self) -> frozenset[tuple[PathKey, int]]:
+        """Sections, by path and number, that several paths of one approach share: an indicator tells them."""
+        of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
+        for key, path in self.paths.items():
+            for section, lane in enumerate(path.lanes):
+                of_lane.setdefault((path.approach, lane), []).append((key, section))
+        return frozenset(place for places in of_lane.values() if len(places) > 1 for place in places)
 
     @cached_property
     def ego_path(self) -> Path:

@@ -95,7 +95,19 @@ BEACON_DIALS = tuple(
 
 @dataclass(frozen=True)
 class Spawn:
-    """One vehicle at the start: where on which path, how fast, and its id."""
+    """One vehicle at the start: where on which path, how fast, and its id.
+
+    Attributes:
+        id: `v1`, `v2`, …
+        kind: what it looks like.
+        part: `ego`, `helper` or `other`.
+        approach: where its path comes from.
+        route: what its path does.
+        arc_m: where on the path.
+        speed_mps: how fast.
+        brakes_at_s: when it begins to brake, of itself, until it stands; None if it does not.
+        brakes_mps2: how hard.
+    """
 
     id: str
     kind: Kind
@@ -104,6 +116,8 @@ class Spawn:
     route: str
     arc_m: float
     speed_mps: float
+    brakes_at_s: float | None = None
+    brakes_mps2: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -137,6 +151,7 @@ class Scenario:
         cleared: whether the ego has reached its goal, asked after every frame, `(vehicles, parameters)`:
             highway-env's vehicles, the ego first.
         words: what prompts may say of it, by name; templates read `words.<name>`.
+        brake_lamps: whether vehicles show that they brake.
     """
 
     name: str
@@ -147,6 +162,7 @@ class Scenario:
     layout: Callable[[int, Any], Layout]
     cleared: Callable[[Sequence[Any], Any], bool]
     words: Mapping[str, str]
+    brake_lamps: bool = False
 
     @property
     def summary(self) -> str:

@@ -7,8 +7,10 @@ functions in its own order, with Python's comparisons in place of `np.clip` and 
 cost more than all of its arithmetic. A test drives both side by side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,17 +19,26 @@ from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
+from harness.world.road import Lane
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, VehicleState
 
 NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highway-env finds no collision
 NOBODY_DRAWS = np.random.RandomState(0)  # highway-env wants one, and would seed it by the clock
 DECIMALS = 6  # of a state's metres, radians and m/s
+LAMPS_MPS2 = 1.0  # braking harder than this shows
+STANDS_WITHIN_HZ = 20.0  # who brakes by itself comes to a stand, and not backwards
 FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
 
 
 class _Road(Road):  # type: ignore[misc]
-    """Looks closer only at vehicles that are near enough to touch within the frame."""
+    """Looks closer only at vehicles that are near enough to touch within the frame.
+
+    Attributes:
+        time_s: simulated time at the beginning of the frame.
+    """
+
+    time_s = 0.0
 
     def step(self, dt: float) -> None:
         """`Road.step`; no scenario has objects that are no vehicles."""
@@ -58,6 +69,7 @@ class _OnRoute:
     """A vehicle knows its lane from its route; highway-env's search over all lanes is not needed."""
 
     spawn: Spawn
+    braking = False
     towards: tuple[float, Any] = (np.nan, None)  # a heading and its direction
 
     def on_state_update(self: Any) -> None:
@@ -79,6 +91,7 @@ class _OnRoute:
             "steering": self._steering(lane, along, lateral),
             "acceleration": self.speed_control(self.target_speed),
         }
+        self.braking = self.action["acceleration"] < -LAMPS_MPS2
 
     def _steering(self: Any, lane: Any, along: float, lateral: float) -> float:
         """`ControlledVehicle.steering_control`, where the vehicle's place in its lane is known."""
@@ -110,13 +123,18 @@ def _within(limit: float, value: float) -> float:
 
 
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
-    """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane."""
+    """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane.
+
+    Where its layout says so it brakes by itself until it stands.
+    """
 
     braking_mps2 = 4.0
     standoff_m = 2.0
 
     def speed_control(self, target_speed: float) -> float:
         """Acceleration in m/s²: brakes once the room left calls for its braking; never speeds up."""
+        if self.spawn.brakes_at_s is not None and self.road.time_s >= self.spawn.brakes_at_s:
+            return float(-min(self.spawn.brakes_mps2, max(self.speed, 0.0) * STANDS_WITHIN_HZ))
         for other in self.road.vehicles:
             if other.lane_index == self.lane_index and self.speed > other.speed:
                 ahead = float(np.dot(other.position - self.position, self.direction))
@@ -126,16 +144,43 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
         return 0.0
 
 
+class Van(Traffic):
+    """High enough to hide what is before it, or behind it."""
+
+    LENGTH, WIDTH = SIZES_M["van"]
+
+
 class Truck(Traffic):
     """Long and wide enough to hide a car behind it."""
 
     LENGTH, WIDTH = SIZES_M["truck"]
 
 
+KINDS = {"car": Traffic, "van": Van, "truck": Truck}
+
+
 class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
     """Follows a target speed within physical limits (highway-env's own controller brakes without bound)."""
 
     limits_mps2 = (-8.0, 3.0)
+    ways: Mapping[Lane, str] = MappingProxyType({})  # routes of the lanes that it may change between
+
+    def act(self, action: str | None = None) -> None:
+        """Drive on, or take a meta-action; a change of lane is a change of route."""
+        super().act(action)
+        route = self.ways.get(self.target_lane_index, self.spawn.route)
+        if route != self.spawn.route:
+            self.spawn, self.route = replace(self.spawn, route=route), [self.target_lane_index]
+
+    def on_state_update(self) -> None:
+        """It is in the nearest of its lanes."""
+        super().on_state_update()
+        if self.ways:
+            self.lane_index = min(self.ways, key=self._off_m)
+            self.lane = self.road.network.get_lane(self.lane_index)
+
+    def _off_m(self, lane: Lane) -> float:
+        return abs(float(self.road.network.get_lane(lane).local_coordinates(self.position)[1]))
 
     def speed_control(self, target_speed: float) -> float:
         """Acceleration in m/s²."""
@@ -178,26 +223,31 @@ def vehicle_on(
     if spawn.part == "ego":
         vehicle = Ego(None, position, target_speeds=p.target_speeds_mps, **arguments)
         vehicle.limits_mps2 = (-p.braking_mps2, p.acceleration_mps2)
+        static = scenario.road()
+        vehicle.ways = {static.paths[key].lanes[0]: key[1] for key in static.ways}
     else:
-        vehicle = (Truck if spawn.kind == "truck" else Traffic)(None, position, **arguments)
+        vehicle = KINDS[spawn.kind](None, position, **arguments)
     vehicle.road = road  # only now: a vehicle that is made on a road first searches all of its lanes
     vehicle.spawn = spawn
     vehicle.on_state_update()
     return vehicle
 
 
-def spawn_of(scenario: Scenario, v: VehicleState) -> Spawn:
+def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
     """A vehicle in the midst of an episode, as if it began there."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
-    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps)
+    begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
+    plans = (begun.brakes_at_s, begun.brakes_mps2) if begun else ()
+    return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans)
 
 
-def state_of(v: ControlledVehicle) -> VehicleState:
+def state_of(v: ControlledVehicle, lamps: bool = False) -> VehicleState:
     """A vehicle as the rest of the program knows it, to the micrometre: the last bits are the machine's."""
     s = v.spawn
     x_m, y_m, heading_rad, speed_mps = (
         round(float(number), DECIMALS) + 0.0 for number in (*v.position, v.heading, v.speed)
     )
     return VehicleState(
-        s.id, s.kind, s.part, x_m, y_m, heading_rad, speed_mps, s.approach, s.route, bool(v.crashed)
-    )
+        s.id, s.kind, s.part, x_m, y_m, heading_rad, speed_mps, s.approach, s.route, bool(v.crashed),
+        lamps and bool(v.braking),
+    )  # fmt: skip

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
 
-Kind = Literal["car", "truck"]
+Kind = Literal["car", "van", "truck"]
 Part = Literal["ego", "helper", "other"]
 
-SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "truck": (10.0, 2.6)}  # length, width
+# Length and width; a van's and a lorry's are SUMO's defaults, a truck's lie between them.
+SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
 
 
 def indicator(route: str) -> str:
@@ -36,6 +37,7 @@ class VehicleState:
         approach: where its path comes from.
         route: what its path does, such as `straight` or `left`.
         crashed: whether it has collided.
+        braking: whether its brake lamps show; never where the scenario has none.
     """
 
     id: str
@@ -48,6 +50,7 @@ class VehicleState:
     approach: str
     route: str
     crashed: bool = False
+    braking: bool = False
 
     @property
     def indicator(self) -> str:
@@ -175,8 +178,12 @@ class WorldState:
         raise KeyError(vehicle_id)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready mapping."""
-        return asdict(self)
+        """JSON-ready mapping; of `braking` only what is true."""
+        record = asdict(self)
+        for vehicle in record["vehicles"]:
+            if not vehicle["braking"]:
+                del vehicle["braking"]
+        return record
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "WorldState":

@@ -20,6 +20,7 @@ from harness.world.simulator import NOBODY_DRAWS, new_road, populated, spawn_of,
 from harness.world.state import Beacon, WorldState, rectangle
 
 Snapshot = Mapping[str, Any]
+Target = tuple[str, int]  # route, and index of the scenario's target speeds
 HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 
@@ -87,9 +88,9 @@ class World:
         """The world that `state` and `snapshot` were taken from, before its episode was decided."""
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
-            spawn = spawn_of(scenario, v)
+            spawn = spawn_of(scenario, layout, v)
             vehicle = vehicle_on(road, scenario, spawn, section, (v.x_m, v.y_m), v.heading_rad)
-            vehicle.crashed = v.crashed
+            vehicle.crashed, vehicle.braking = v.crashed, v.braking
             road.vehicles.append(vehicle)
         vehicles = road.vehicles
         ego = vehicles[0]
@@ -110,7 +111,8 @@ class World:
         vehicles = self.road.vehicles
         return WorldState(
             self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
-            tuple(map(state_of, vehicles)), self.layout.buildings, self.beacons,
+            tuple(state_of(v, self.scenario.brake_lamps) for v in vehicles), self.layout.buildings,
+            self.beacons,
         )  # fmt: skip
 
     def act(self, action: str) -> None:
@@ -130,18 +132,19 @@ class World:
         self.road.vehicles[0].act(action)
 
     @property
-    def speed_index(self) -> int:
-        """Which of the scenario's target speeds the ego aims at."""
-        return int(self.road.vehicles[0].speed_index)
+    def target(self) -> Target:
+        """What the ego aims at."""
+        ego = self.road.vehicles[0]
+        return ego.spawn.route, int(ego.speed_index)
 
-    def speed_index_after(self, action: str) -> int:
-        """Which target speed the ego would aim at if it took an action now."""
+    def target_after(self, action: str) -> Target:
+        """What the ego would aim at if it took an action now."""
         ego = self.road.vehicles[0]
         kept = dict(vars(ego))
         self.take(action)
-        index = self.speed_index
+        target = self.target
         vars(ego).update(kept)
-        return index
+        return target
 
     def advance(self, until_frame: int) -> None:
         """Simulate until so many frames have passed or the episode is decided."""
@@ -178,6 +181,7 @@ class World:
     def _step(self) -> None:
         p, road = self.scenario.parameters, self.road
         standing = {v.spawn.id for v in road.vehicles if v.crashed}
+        road.time_s = self.time_s
         road.act()
         road.step(1 / p.simulation_hz)
         self.frame += 1

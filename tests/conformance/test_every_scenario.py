@@ -56,10 +56,9 @@ def test_its_paths_run_along_the_middle_of_their_lanes(scenario: Scenario) -> No
             assert place == pytest.approx((along, 0.0), abs=0.01)
 
 
-def test_its_ego_drives_straight_to_the_north_through_every_crossing(scenario: Scenario) -> None:
+def test_its_ego_comes_through_every_crossing(scenario: Scenario) -> None:
     road = scenario.road()
-    assert np.ptp(road.ego_path.points[:, 0]) == pytest.approx(0.0)
-    assert (np.diff(road.ego_path.points[:, 1]) < 0).all()
+    assert not road.ways or road.ego in road.ways
     for key, at in road.crossings.items():
         assert road.ego_path.at(at.ego_arc_m)[:2] == pytest.approx((at.x_m, at.y_m), abs=0.05)
         assert road.paths[key].at(at.other_arc_m)[:2] == pytest.approx((at.x_m, at.y_m), abs=0.05)

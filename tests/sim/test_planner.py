@@ -7,13 +7,15 @@ import pytest
 
 from harness.world.drivers import DRIVERS, choose
 from harness.world.perception.graph import truth_graph
-from harness.world.planner import DISC_RADIUS_M, MARGIN_M, STEP_S, least_gap, plan, rollouts
+from harness.world.planner import MARGIN_M, STEP_S, Rollouts, cover, least_gap, plan, travelled_m
 from harness.world.scenarios.occluded_intersection import SCENARIO
-from harness.world.state import VehicleState, WorldState
+from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
 
 P, ACTIONS = SCENARIO.parameters, SCENARIO.actions
 EGO = VehicleState("v1", "car", "ego", 2.0, 44.0, -np.pi / 2, 14.0, "own", "straight")  # 42 m before (2, 2)
+
+TOUCHING_M = 2 * cover(*SIZES_M["car"])[1] + MARGIN_M  # between the middles of two discs that touch
 
 CLOSE = replace(EGO, y_m=24.0)  # 22 m before
 
@@ -24,6 +26,12 @@ def graph(*others, ego=EGO, target_mps=14.0, step=1):
 
 def from_left(x_m, speed_mps=10.0):
     return VehicleState("v5", "car", "other", x_m, 2.0, 0.0, speed_mps, "left", "straight")
+
+
+def gap(travelled_m, scene):
+    """The least gap of an ego that keeps its lane to the only other vehicle of a graph."""
+    tried = Rollouts([], travelled_m, None, np.zeros(len(travelled_m), dtype=int))
+    return least_gap(SCENARIO.road(), tried, scene, scene["conflicts"][0])
 
 
 def test_on_an_empty_road_it_keeps_going():
@@ -54,8 +62,7 @@ def test_it_does_not_guess_at_what_the_graph_does_not_list():
 def test_where_every_way_ends_in_a_collision_it_takes_the_one_with_the_widest_gap():
     # 14 m before the crossing, with a car 10 m from it: too late for anything but the least of evils.
     scene = graph(from_left(2.0 - 10.0), ego=replace(EGO, y_m=16.0))
-    (conflict,) = scene["conflicts"]
-    gaps = {a: least_gap(SCENARIO.road(), rollouts([(a,)], 14.0, 14.0, 5, P), conflict)[0] for a in ACTIONS}
+    gaps = {a: gap(travelled_m([(a,)], 14.0, 14.0, 5, P), scene)[0] for a in ACTIONS}
     assert max(gaps.values()) < 0.0
     assert gaps[plan(SCENARIO, scene)] == max(gaps.values())
 
@@ -66,7 +73,7 @@ def test_its_model_of_motion_follows_the_simulator(first, second):
     """Where a decision acts at once: the model has no lag."""
     world = World.start(replace(SCENARIO, parameters=replace(P, decision_lag_s=0.0)), 0)
     start = world.state().ego.y_m
-    (travelled,) = rollouts([(first, second)], 14.0, 14.0, P.decisions, P)
+    (travelled,) = travelled_m([(first, second)], 14.0, 14.0, P.decisions, P)
     for seconds, action in enumerate((first, second, "FASTER"), 1):
         world.act(action)
         model = travelled[round(seconds / STEP_S) - 1]
@@ -75,18 +82,15 @@ def test_its_model_of_motion_follows_the_simulator(first, second):
 
 def test_the_gap_to_a_car_standing_on_the_crossing_is_what_the_discs_leave():
     # An ego that stays 20 m short of a car standing at the crossing; discs reach 5/3 m plus their radius.
-    (conflict,) = graph(from_left(2.0, speed_mps=0.0))["conflicts"]
-    travelled = np.full((1, 90), conflict["ego"]["arc_m"] - 20.0)
-    expected = 20.0 - 5.0 / 3 - 2 * DISC_RADIUS_M - MARGIN_M
-    assert least_gap(SCENARIO.road(), travelled, conflict) == pytest.approx([expected], abs=0.1)
+    scene = graph(from_left(2.0, speed_mps=0.0))
+    travelled = np.full((1, 90), scene["conflicts"][0]["ego"]["arc_m"] - 20.0)
+    assert gap(travelled, scene) == pytest.approx([20.0 - 5.0 / 3 - TOUCHING_M], abs=0.1)
 
 
 def test_an_ego_on_top_of_another_has_a_gap_below_zero():
-    (conflict,) = graph(from_left(2.0, speed_mps=0.0))["conflicts"]
-    travelled = np.full((1, 90), conflict["ego"]["arc_m"])
-    assert least_gap(SCENARIO.road(), travelled, conflict) == pytest.approx(
-        [-2 * DISC_RADIUS_M - MARGIN_M], abs=0.1
-    )
+    scene = graph(from_left(2.0, speed_mps=0.0))
+    travelled = np.full((1, 90), scene["conflicts"][0]["ego"]["arc_m"])
+    assert gap(travelled, scene) == pytest.approx([-TOUCHING_M], abs=0.1)
 
 
 def test_only_the_full_view_driver_reads_the_truth():

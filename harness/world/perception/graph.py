@@ -6,6 +6,7 @@ for every viewer, since helpers judge what the ego should do; a helper knows the
 from the last beacon that it heard, not from its sensors.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -21,6 +22,7 @@ from harness.world.state import SIZES_M, VehicleState, WorldState, indicator
 
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
+ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 
 Graph = dict[str, Any]
 
@@ -32,35 +34,42 @@ def scene_graph(scenario: Scenario, state: WorldState, viewer_id: str) -> Graph:
     # What no sensor reports must not show by what it hides.
     reported = {viewer.id, *(d.id for d in detections)}
     known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
-    return _graph(road, state, viewer, detections, _sectors(road, known, viewer))
+    return _graph(scenario, state, viewer, detections, _sectors(road, known, viewer))
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> Graph:
     """The ego's graph with everything in view and no noise: what only `full-view` may read."""
     exact = [
         Detection(
-            v.id, ("truth",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None
+            v.id, ("truth",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
         )
         for v in state.vehicles[1:]
     ]  # fmt: skip
-    return _graph(scenario.road(), state, state.ego, exact, [])
+    return _graph(scenario, state, state.ego, exact, [])
 
 
 def _graph(
-    road: Road, state: WorldState, viewer: VehicleState, detections: list[Detection], sectors: list[Graph]
-) -> Graph:
+    scenario: Scenario, state: WorldState, viewer: VehicleState, detections: list[Detection],
+    sectors: list[Graph],
+) -> Graph:  # fmt: skip
+    road = scenario.road()
     ego, zone = known(state, state.ego.id, viewer.id), road.zone_m
     beacon = last_heard(state, ego.id, viewer.id)
-    ego_arc = road.ego_path.project(ego.x_m, ego.y_m)[0]
+    ego_arc = road.paths[ego.approach, ego.route].project(ego.x_m, ego.y_m)[0]
     own = road.paths[viewer.approach, viewer.route]
     nodes, conflicts = [], []
     for d in detections:
         path = _path_of(road, d)
         arc = path.project(d.x_m, d.y_m)[0] if path else None
-        nodes.append(_node(viewer, d, path.lane_role(arc) if path and arc is not None else "off-lane"))
+        lamps = {"braking": d.braking} if scenario.brake_lamps else {}
+        lane = path.lane_role(arc) if path and arc is not None else "off-lane"
+        nodes.append({**_node(viewer, d, lane), **lamps})
         if path and arc is not None and d.id != ego.id:
-            conflict = _conflict(road, viewer, d, path, arc, ego, ego_arc)
-            conflicts += [conflict] if conflict else []
+            met = [_meeting(road, viewer, d, path, arc, ego, ego_arc)]
+            if road.form == 2:
+                along = list(_along(road, viewer, d, path, arc, ego, ego_arc))
+                met = along or met
+            conflicts += [{**c, "other": {**c["other"], **lamps}} for c in met if c]
     return {
         "viewer": viewer.id,
         "role": "ego" if viewer.part == "ego" else "helper",
@@ -77,6 +86,7 @@ def _graph(
             "age_s": round(state.time_s - beacon.time_s, 2) if beacon else 0.0,
             "zone_m": _tenths(road.zone_arc_m - ego_arc),
             **_relative(viewer, ego.x_m, ego.y_m),
+            **({"route": ego.route} if road.ways else {}),
         },
         "nodes": nodes,
         "conflicts": conflicts,
@@ -119,19 +129,21 @@ def _path_of(road: Road, d: Detection) -> Path | None:
     for path in road.paths.values():
         arc, lateral, heading = path.project(d.x_m, d.y_m)
         turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
-        if d.heading_rad is not None and turned < np.cos(np.radians(40.0)):
+        if d.heading_rad is not None and turned < np.cos(ALIGNED_RAD):
             continue
-        # On a shared approach lane all routes fit alike: a turn shows by the indicator, or under way.
-        unlikely = path.section(arc) == 0 and indicator(path.route) != (d.indicator or "off")
+        # Where routes part later they fit alike: a turn shows by the indicator, or under way.
+        forks = ((path.approach, path.route), path.section(arc)) in road.forks
+        unlikely = forks and indicator(path.route) != (d.indicator or "off")
         cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
         if lateral < ON_PATH_M and (best is None or cost < least):
             best, least = path, cost
     return best
 
 
-def _conflict(
+def _meeting(
     road: Road, viewer: VehicleState, d: Detection, path: Path, arc: float, ego: VehicleState, ego_arc: float
 ) -> Graph | None:
+    """Where another's path crosses the ego's or merges into it, unless one of them is past it."""
     crossing = road.crossings.get((path.approach, path.route))
     if crossing is None:
         return None
@@ -146,7 +158,42 @@ def _conflict(
         "point": _relative(viewer, crossing.x_m, crossing.y_m),
         "ego": _arrival(ego_to_go, ego.speed_mps),
         "other": {**_arrival(to_go, d.speed_mps), "speed_mps": _tenths(d.speed_mps)},
+        **({"kind": crossing.kind, "lane": "own"} if road.form == 2 else {}),
     }
+
+
+def _along(
+    road: Road, viewer: VehicleState, d: Detection, path: Path, arc: float, ego: VehicleState, ego_arc: float
+) -> Iterator[Graph]:
+    """Where another meets the ego in a lane that both are in or the ego may change to, at their speeds now.
+
+    Of who is behind whom only the one behind has a way to go; of two that meet head-on, both.
+    """
+    its_heading = path.at(arc)[2]
+    for side, key in road.beside((ego.approach, ego.route)).items():
+        way = road.paths[key]
+        at, lateral, heading = way.project(d.x_m, d.y_m)
+        turned, gap = float(np.cos(its_heading - heading)), at - ego_arc
+        if lateral > ON_PATH_M or abs(turned) < np.cos(ALIGNED_RAD) or (turned < 0 and gap < 0):
+            continue
+        ego_mps, its_mps = ego.speed_mps, d.speed_mps * np.sign(turned)
+        kind = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
+        closing_mps = (ego_mps - its_mps) * (1 if gap > 0 else -1)
+        share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
+        time_s = _tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
+        x, y, _ = way.at(ego_arc + max(gap, 0.0) * share)
+        yield {
+            "with": d.id,
+            "sector": path.approach,
+            "route": path.route,
+            "point": _relative(viewer, x, y),
+            "ego": {"arc_m": _tenths(abs(gap) * share), "time_s": time_s},
+            "other": {
+                "arc_m": _tenths(abs(gap) * (1 - share)), "time_s": time_s, "speed_mps": _tenths(d.speed_mps)
+            },
+            "kind": kind,
+            "lane": side,
+        }  # fmt: skip
 
 
 def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:

@@ -36,6 +36,7 @@ class Detection:
         heading_rad: estimated heading; None where only the radar saw it.
         speed_mps: estimated speed.
         range_rate_mps: closing is negative; by radar, else None.
+        braking: whether it is seen to brake; by camera, else None.
     """
 
     id: str
@@ -47,6 +48,7 @@ class Detection:
     heading_rad: float | None
     speed_mps: float
     range_rate_mps: float | None
+    braking: bool | None = None
 
 
 def detect(state: WorldState, viewer: VehicleState, view: Sweep) -> list[Detection]:
@@ -100,4 +102,5 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
         heading_rad=float(v.heading_rad + np.radians(2.0) * z[3]) if seen["lidar"] else None,
         speed_mps=float(max(v.speed_mps + (0.2 if seen["radar"] else 0.8) * z[4], 0.0)),
         range_rate_mps=rate,
+        braking=v.braking if seen["camera"] else None,
     )
