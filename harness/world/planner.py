@@ -69,7 +69,7 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
         arrival += AWAY_S * (road.ways.index(beside["own"]) + tried.ends != road.ways.index(road.ego))
     safe = gap > 0
     score = np.where(safe, -arrival, -1e3 + np.minimum(gap, 0.0))
-    best = np.flatnonzero(score >= score.max() - 1e-9)
+    best: list[int] = np.flatnonzero(score >= score.max() - 1e-9).tolist()
     return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
 
 

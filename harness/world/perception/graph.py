@@ -65,11 +65,10 @@ def _graph(
         lane = path.lane_role(arc) if path and arc is not None else "off-lane"
         nodes.append({**_node(viewer, d, lane), **lamps})
         if path and arc is not None and d.id != ego.id:
-            met = [_meeting(road, viewer, d, path, arc, ego, ego_arc)]
-            if road.form == 2:
-                along = list(_along(road, viewer, d, path, arc, ego, ego_arc))
-                met = along or met
-            conflicts += [{**c, "other": {**c["other"], **lamps}} for c in met if c]
+            met = list(_along(road, viewer, d, path, arc, ego, ego_arc)) if road.form == 2 else []
+            if not met and (meeting := _meeting(road, viewer, d, path, arc, ego, ego_arc)):
+                met = [meeting]
+            conflicts += [{**c, "other": {**c["other"], **lamps}} for c in met]
     return {
         "viewer": viewer.id,
         "role": "ego" if viewer.part == "ego" else "helper",
