@@ -95,6 +95,7 @@ class Viewer(Closed, frozen=True):
     speed_mps: Number
     lane: str
     zone_m: Number
+    type: Kind | None = None
 
 
 class Ego(Closed, frozen=True):

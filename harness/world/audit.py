@@ -101,7 +101,10 @@ def audit(
 
 
 def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:
-    """The sector of a layout's danger, and the ego's numbers at every step until it is in sight."""
+    """The sector of a layout's danger, and the ego's numbers at every step until it is in sight.
+
+    So it is where somebody who brakes for it is in sight; and who brakes for something else counts alike.
+    """
     start = World.start(scenario, seed)
     going: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
     found = []
@@ -110,7 +113,12 @@ def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[st
         if world.outcome.ended or world.step >= scenario.parameters.decisions:
             continue
         graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
-        if world.layout.danger_id in {node["id"] for node in graph["nodes"]}:
+        shown = {
+            node["id"]
+            for node in graph["nodes"]
+            if node["id"] == world.layout.danger_id or node.get("braking")
+        }
+        if shown:
             continue
         found.append((world.step, dict(numbers(graph, scenario.road()))))
         ways: dict[str, tuple[str, ...]] = {}

@@ -60,8 +60,8 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
         scenario.actions, ego["speed_mps"], ego["target_speed_mps"], p.decisions - graph["step"], sides, p
     )
     gap = np.full(len(tried.actions), np.inf)
-    for conflict in graph["conflicts"]:
-        gap = np.minimum(gap, least_gap(road, tried, graph, conflict))
+    for motion in predicted(road, graph, tried.travelled_m.shape[1]):
+        gap = np.minimum(gap, least_gap(tried, motion))
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
     to_go = ego["zone_m"] + 15.0
     arrival = (tried.travelled_m < to_go).sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
@@ -135,34 +135,76 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
     return right
 
 
-def least_gap(road: Road, tried: Rollouts, graph: Mapping[str, Any], conflict: Mapping[str, Any]) -> Floats:
-    """Smallest gap (m) to another vehicle that keeps its path, per sequence; below zero they meet."""
-    key, way = (conflict["sector"], conflict["route"]), _way(road, graph["ego"])
-    kind, mine, other = conflict.get("kind", "crossing"), road.paths[way], conflict["other"]
-    time_s = (np.arange(tried.travelled_m.shape[1]) + 1) * STEP_S
-    if kind in ("crossing", "merging"):
-        crossing = road.crossings[key]
-        begin, its = crossing.ego_arc_m - conflict["ego"]["arc_m"], road.paths[key]
-        its_begin = crossing.other_arc_m - other["arc_m"]
-    else:
-        if kind == "behind" and conflict["lane"] == "own":
-            return np.full(len(tried.actions), np.inf)  # it keeps off the ego by itself
-        begin = road.zone_arc_m - graph["ego"]["zone_m"]
-        its = road.paths[road.beside(way)[conflict["lane"]]]
-        its_begin = begin + conflict["ego"]["arc_m"] + other["arc_m"] * (-1 if kind == "behind" else 1)
-    braked_s = other["speed_mps"] / EMERGENCY_MPS2 if other.get("braking") else np.inf
-    until_s = np.minimum(time_s, braked_s)
-    its_m = other["speed_mps"] * until_s
-    if other.get("braking"):
-        its_m = its_m - EMERGENCY_MPS2 / 2 * until_s**2
+@dataclass(frozen=True)
+class Motion:
+    """How another vehicle is taken to move on, and how the ego would meet it.
+
+    Attributes:
+        way: the ego's.
+        begin_m: where on it the ego is now.
+        path: the other's.
+        arc_m: where on its path it is, (steps,).
+        size_m: length and width.
+    """
+
+    way: Path
+    begin_m: float
+    path: Path
+    arc_m: Floats
+    size_m: tuple[float, float]
+
+
+def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
+    """How those whom the ego could meet move on: they keep path and speed, and their place in the queue."""
+    time_s: Floats = (np.arange(steps) + 1) * STEP_S
+    key = _way(road, graph["ego"])
+    way = road.paths[key]
     type_of = {node["id"]: node["type"] for node in graph["nodes"]}
-    length, width = SIZES_M.get(type_of.get(conflict["with"], ""), SIZES_M["car"])
-    away, reach = cover(length, width)
+    type_of[graph["viewer"]] = graph["self"].get("type", "car")
+    motions, queue = [], dict[str, Motion]()
+    for conflict in sorted(
+        graph["conflicts"], key=lambda c: -c["ego"]["arc_m"]
+    ):  # the first in a queue first
+        kind, ego, other = conflict.get("kind", "crossing"), conflict["ego"], conflict["other"]
+        size = SIZES_M.get(type_of.get(conflict["with"], ""), SIZES_M["car"])
+        its_m = _travelled_m(other, time_s)
+        if kind in ("crossing", "merging"):
+            its = conflict["sector"], conflict["route"]
+            crossing = road.crossings[its]
+            arc = crossing.other_arc_m - other["arc_m"] + its_m
+            motions.append(Motion(way, crossing.ego_arc_m - ego["arc_m"], road.paths[its], arc, size))
+            continue
+        begin, lane = road.zone_arc_m - graph["ego"]["zone_m"], conflict["lane"]
+        if kind == "behind" and lane == "own":
+            continue  # it keeps off the ego by itself
+        arc = begin + ego["arc_m"] - other["arc_m"] + its_m
+        if kind == "oncoming":
+            arc = begin + ego["arc_m"] + other["arc_m"] - its_m
+        elif before := queue.get(lane):
+            arc = np.minimum(arc, before.arc_m - (before.size_m[0] + size[0]) / 2 - 2.0)
+        motion = Motion(way, begin, road.paths[road.beside(key)[lane]], arc, size)
+        motions.append(motion)
+        if kind == "ahead":
+            queue[lane] = motion
+    return motions
+
+
+def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
+    """How far a vehicle gets at its speed, or braking until it stands."""
+    if not other.get("braking"):
+        return np.asarray(other["speed_mps"] * time_s)
+    until_s = np.minimum(time_s, other["speed_mps"] / EMERGENCY_MPS2)
+    return np.asarray(other["speed_mps"] * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
+
+
+def least_gap(tried: Rollouts, motion: Motion) -> Floats:
+    """Smallest gap (m) to another vehicle, per sequence; below zero they meet."""
+    away, reach = cover(*motion.size_m)
     own, own_reach = cover(*SIZES_M["car"])
-    ego = _discs(mine, begin + tried.travelled_m, own, tried.right_m)
+    ego = _discs(motion.way, motion.begin_m + tried.travelled_m, own, tried.right_m)
     squared = np.full(tried.travelled_m.shape, np.inf)
     # The nearest pair is kept as it goes: arrays of all pairs would not fit into the processor's cache.
-    for its_x, its_y in _discs(its, its_begin + (-its_m if kind == "oncoming" else its_m), away):
+    for its_x, its_y in _discs(motion.path, motion.arc_m, away):
         for x, y in ego:
             np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
     return np.asarray(np.sqrt(squared.min(axis=1)) - reach - own_reach - MARGIN_M)

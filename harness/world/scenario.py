@@ -105,8 +105,9 @@ class Spawn:
         route: what its path does.
         arc_m: where on the path.
         speed_mps: how fast.
-        brakes_at_s: when it begins to brake, of itself, until it stands; None if it does not.
+        brakes_at_s: when it begins to brake by itself; None if it does not.
         brakes_mps2: how hard.
+        brakes_to_mps: down to which speed.
     """
 
     id: str
@@ -118,6 +119,7 @@ class Spawn:
     speed_mps: float
     brakes_at_s: float | None = None
     brakes_mps2: float = 0.0
+    brakes_to_mps: float = 0.0
 
 
 @dataclass(frozen=True)

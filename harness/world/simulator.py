@@ -27,7 +27,7 @@ NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highwa
 NOBODY_DRAWS = np.random.RandomState(0)  # highway-env wants one, and would seed it by the clock
 DECIMALS = 6  # of a state's metres, radians and m/s
 LAMPS_MPS2 = 1.0  # braking harder than this shows
-STANDS_WITHIN_HZ = 20.0  # who brakes by itself comes to a stand, and not backwards
+BRAKES_OFF_HZ = 20.0  # how fast who brakes by itself lets go of the brake in the end
 FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
 
 
@@ -125,7 +125,7 @@ def _within(limit: float, value: float) -> float:
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane.
 
-    Where its layout says so it brakes by itself until it stands.
+    Where its layout says so it brakes by itself.
     """
 
     braking_mps2 = 4.0
@@ -134,7 +134,9 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     def speed_control(self, target_speed: float) -> float:
         """Acceleration in m/s²: brakes once the room left calls for its braking; never speeds up."""
         if self.spawn.brakes_at_s is not None and self.road.time_s >= self.spawn.brakes_at_s:
-            return float(-min(self.spawn.brakes_mps2, max(self.speed, 0.0) * STANDS_WITHIN_HZ))
+            above = max(self.speed - self.spawn.brakes_to_mps, 0.0)
+            if above > 0:
+                return float(-min(self.spawn.brakes_mps2, above * BRAKES_OFF_HZ))
         for other in self.road.vehicles:
             if other.lane_index == self.lane_index and self.speed > other.speed:
                 ahead = float(np.dot(other.position - self.position, self.direction))
@@ -237,7 +239,7 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
     """A vehicle in the midst of an episode, as if it began there."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
-    plans = (begun.brakes_at_s, begun.brakes_mps2) if begun else ()
+    plans = (begun.brakes_at_s, begun.brakes_mps2, begun.brakes_to_mps) if begun else ()
     return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans)
 
 

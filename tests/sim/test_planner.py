@@ -7,7 +7,7 @@ import pytest
 
 from harness.world.drivers import DRIVERS, choose
 from harness.world.perception.graph import truth_graph
-from harness.world.planner import MARGIN_M, STEP_S, Rollouts, cover, least_gap, plan, travelled_m
+from harness.world.planner import MARGIN_M, STEP_S, Rollouts, cover, least_gap, plan, predicted, travelled_m
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import SIZES_M, VehicleState, WorldState
 from harness.world.world import World
@@ -31,7 +31,8 @@ def from_left(x_m, speed_mps=10.0):
 def gap(travelled_m, scene):
     """The least gap of an ego that keeps its lane to the only other vehicle of a graph."""
     tried = Rollouts([], travelled_m, None, np.zeros(len(travelled_m), dtype=int))
-    return least_gap(SCENARIO.road(), tried, scene, scene["conflicts"][0])
+    (motion,) = predicted(SCENARIO.road(), scene, travelled_m.shape[1])
+    return least_gap(tried, motion)
 
 
 def test_on_an_empty_road_it_keeps_going():

@@ -39,13 +39,14 @@ def scene_graph(scenario: Scenario, state: WorldState, viewer_id: str) -> Graph:
 
 def truth_graph(scenario: Scenario, state: WorldState) -> Graph:
     """The ego's graph with everything in view and no noise: what only `full-view` may read."""
-    exact = [
-        Detection(
-            v.id, ("truth",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
-        )
-        for v in state.vehicles[1:]
-    ]  # fmt: skip
+    exact = list(map(_exact, state.vehicles[1:]))
     return _graph(scenario, state, state.ego, exact, [])
+
+
+def _exact(v: VehicleState) -> Detection:
+    return Detection(
+        v.id, ("truth",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
+    )
 
 
 def _graph(
@@ -57,18 +58,24 @@ def _graph(
     beacon = last_heard(state, ego.id, viewer.id)
     ego_arc = road.paths[ego.approach, ego.route].project(ego.x_m, ego.y_m)[0]
     own = road.paths[viewer.approach, viewer.route]
-    nodes, conflicts = [], []
-    for d in detections:
+    itself = {} if road.form == 1 else {"type": viewer.kind}
+    nodes, conflicts = [], list[Graph]()
+
+    def lamps(d: Detection) -> Graph:
+        return {"braking": d.braking} if scenario.brake_lamps else {}
+
+    # Another one's place is in the ego's way too.
+    for d in [*detections, *([] if road.form == 1 or viewer.id == ego.id else [_exact(viewer)])]:
         path = _path_of(road, d)
         arc = path.project(d.x_m, d.y_m)[0] if path else None
-        lamps = {"braking": d.braking} if scenario.brake_lamps else {}
-        lane = path.lane_role(arc) if path and arc is not None else "off-lane"
-        nodes.append({**_node(viewer, d, lane), **lamps})
+        if d.id != viewer.id:
+            lane = path.lane_role(arc) if path and arc is not None else "off-lane"
+            nodes.append({**_node(viewer, d, lane), **lamps(d)})
         if path and arc is not None and d.id != ego.id:
             met = list(_along(road, viewer, d, path, arc, ego, ego_arc)) if road.form == 2 else []
             if not met and (meeting := _meeting(road, viewer, d, path, arc, ego, ego_arc)):
                 met = [meeting]
-            conflicts += [{**c, "other": {**c["other"], **lamps}} for c in met]
+            conflicts += [{**c, "other": {**c["other"], **lamps(d)}} for c in met]
     return {
         "viewer": viewer.id,
         "role": "ego" if viewer.part == "ego" else "helper",
@@ -77,6 +84,7 @@ def _graph(
             "speed_mps": _tenths(viewer.speed_mps),
             "lane": own.lane_role(own.project(viewer.x_m, viewer.y_m)[0]),
             "zone_m": _tenths(np.hypot(viewer.x_m - zone[0], viewer.y_m - zone[1])),
+            **itself,
         },
         "ego": {
             "id": ego.id,

@@ -1,0 +1,160 @@
+"""Scenario `hard-brake-ahead`: a car brakes hard beyond the van that the ego follows.
+
+The ego follows a van on the right lane of a motorway at a short headway; the van hides the car before it. In
+most episodes that car brakes until it stands. The van brakes late and hard, and only then does the ego see
+that anything is wrong. A car beside the ego keeps it from swerving: who knows early drops back, changes lane
+behind that car and passes. Three helpers know more than the ego: the van, which sees the car before it, the
+car beside, and one farther ahead on the left lane.
+
+This is the emergency electronic brake light of V2V (EEBL). Traffic keeps its lane, and its speed unless it
+would run into the vehicle ahead in its lane; its brake lamps show, to whom a camera sees.
+
+What the ego can see (van, headway, cars on the left) is drawn without knowing of the danger. So is a car on
+the left lane, far ahead, which slows down in some episodes and concerns nobody on the right.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.world.road import Path, PathKey, Road, ground
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import SIZES_M, Kind
+
+NAME = "hard-brake-ahead"
+LANE_WIDTH_M = 4.0
+BEGIN_M, END_M = -150.0, 350.0  # of the motorway, to the east
+LEFT, RIGHT = "left lane", "right lane"
+
+
+@dataclass(frozen=True)
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        target_speeds_mps: 72 km/h, half of it, and standing.
+        speed_mps: everybody's at the start: motorway traffic that has come close together.
+        ego_start_m: where the ego starts, m before the conflict zone.
+        cleared_m: where it has passed, m behind the conflict zone.
+        danger_share: probability that the car beyond the van brakes.
+        headway_s: of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense
+            traffic; at 1.5 s the van's own lamps come in time, and no message is needed.
+        lead_headway_s: of the van to the car before it: it needs 1.3 s and more not to crash itself.
+        brakes_at_s: when that car begins to brake.
+        brakes_mps2: how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g).
+        beside_m: how far ahead of the ego's middle the car beside is.
+        front_m: how far ahead of the ego the helper on the left lane is.
+        slow_share: probability that the farthest car on the left lane slows down.
+        slow_m: how far ahead of the ego that car is.
+        slows_at_s: when it does.
+        slows_to_mps: down to which speed.
+    """
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)
+    time_limit_s: float = 14.0
+    delay_allowance_s: float = 1.0
+    speed_mps: float = 20.0
+    ego_start_m: tuple[float, float] = (88.0, 92.0)
+    cleared_m: float = 45.0
+    danger_share: float = 0.65
+    headway_s: tuple[float, float] = (0.55, 0.75)
+    lead_headway_s: tuple[float, float] = (1.7, 2.0)
+    brakes_at_s: tuple[float, float] = (0.1, 1.4)
+    brakes_mps2: tuple[float, float] = (6.0, 8.0)
+    beside_m: tuple[float, float] = (-3.0, 4.0)
+    front_m: tuple[float, float] = (48.0, 60.0)
+    slow_share: float = 0.4
+    slow_m: tuple[float, float] = (85.0, 100.0)
+    slows_at_s: tuple[float, float] = (0.5, 2.5)
+    slows_to_mps: tuple[float, float] = (14.0, 16.0)
+
+
+@cache
+def road() -> Road:
+    """Two lanes to the east; the conflict zone is where a car that brakes hard comes to stand."""
+    lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
+    paths: dict[PathKey, Path] = {
+        ("own", name): Path.along(network(), "own", name, [lane], [name], 0) for name, lane in lanes.items()
+    }
+    ahead = np.linspace(-60.0, 40.0, 11)
+    return Road(
+        facts={"kind": "motorway of two lanes", "lane_width_m": LANE_WIDTH_M},
+        paths=paths,
+        ego=("own", RIGHT),
+        crossings={},
+        zone_m=(0.0, LANE_WIDTH_M),
+        sectors={
+            "ahead": np.column_stack([ahead, np.full(11, LANE_WIDTH_M)]),
+            "left ahead": np.column_stack([ahead, np.zeros(11)]),
+        },
+        network=network,
+        ground=lambda far_m: ground(network(), far_m),
+        ways=(("own", LEFT), ("own", RIGHT)),
+    )
+
+
+@cache
+def network() -> Any:
+    """highway-env's own straight road, of `HighwayEnv`."""
+    from highway_env.road.road import RoadNetwork
+
+    return RoadNetwork.straight_road_network(2, start=BEGIN_M, length=END_M - BEGIN_M)
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p = parameters
+
+    def draw(what: str) -> float:
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    def spawn(id_: str, kind: Kind, part: Any, lane: str, arc_m: float, *brakes: float) -> Spawn:
+        return Spawn(id_, kind, part, "own", lane, arc_m, p.speed_mps, *brakes)
+
+    car, van = SIZES_M["car"][0], SIZES_M["van"][0]
+    ego = -BEGIN_M - between("ego_start", p.ego_start_m)
+    before = ego + (car + van) / 2 + p.speed_mps * between("headway", p.headway_s)
+    lead = before + (car + van) / 2 + p.speed_mps * between("lead_headway", p.lead_headway_s)
+    danger = draw("danger") < p.danger_share
+    slows = draw("slow") < p.slow_share
+    brakes = between("brakes_at", p.brakes_at_s), between("brakes", p.brakes_mps2)
+    eases = between("slows_at", p.slows_at_s), 2.0, between("slows_to", p.slows_to_mps)
+    beside, front, slow = (
+        ego + between(what, bounds)
+        for what, bounds in (("beside", p.beside_m), ("front", p.front_m), ("slow_m", p.slow_m))
+    )
+    spawns = (
+        spawn("v1", "car", "ego", RIGHT, ego),
+        spawn("v2", "van", "helper", RIGHT, before),
+        spawn("v3", "car", "helper", LEFT, beside),
+        spawn("v4", "car", "helper", LEFT, front),
+        spawn("v5", "car", "other", RIGHT, lead, *(brakes if danger else ())),
+        spawn("v6", "car", "other", LEFT, slow, *(eases if slows else ())),
+    )
+    return Layout(spawns, (), "ahead" if danger else None, "v5" if danger else None)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego's centre is far enough behind the conflict zone."""
+    return bool(vehicles[0].position[0] > parameters.cleared_m)
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "follow a motorway", "hiding": "the van ahead"},
+    brake_lamps=True,
+)
