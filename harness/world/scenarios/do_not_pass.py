@@ -1,0 +1,175 @@
+"""Scenario `do-not-pass`: a slow truck to pass, and what comes towards the ego hidden by it.
+
+The ego follows a slow truck on a two-way road. It may change to the oncoming lane, pass the truck and come
+back. The truck hides that lane: from behind it the ego sees no farther than some forty metres. In part of the
+episodes a car comes there in time to meet an ego that passes at once; else none comes, or one comes long
+after. Three helpers know more: the truck, a car that drives ahead of it, and one that comes behind the ego.
+
+This is the do-not-pass warning of V2V (DNPW, see-through). Traffic keeps its lane and speed and yields to
+nobody. The ego has cleared the episode when it is back on its lane ahead of the truck, or when what came
+towards it has gone by while it kept its lane behind the truck; so one that waits where nothing comes never
+does.
+
+What the ego can see (truck, gap, the car behind) is drawn without knowing of the danger.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.world.road import Path, PathKey, Road, ground
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import SIZES_M, Kind
+
+NAME = "do-not-pass"
+LANE_WIDTH_M = 4.0
+BEGIN_M, END_M = -150.0, 350.0  # of the road, to the east
+OWN, BESIDE = "own lane", "oncoming lane"  # the ego's ways
+CAR, TRUCK = SIZES_M["car"][0], SIZES_M["truck"][0]
+
+
+@dataclass(frozen=True)
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        target_speeds_mps: up to 54 km/h.
+        speed_mps: of the ego and the truck at the start, and of the car behind: one of the target speeds.
+        ego_start_m: where the ego starts, m before the conflict zone, which is where it would be beside the
+            truck.
+        ahead_m: gap to the truck's front that the ego needs when it is back on its lane.
+        behind_m: an ego that has let go by what came is no farther behind the truck's rear.
+        danger_share: probability that a car comes in time to meet an ego that passes at once.
+        gap_m: from the ego to the truck, bumper to bumper.
+        oncoming_mps: speed of what comes, dangerous or not.
+        danger_s: when a danger would meet an ego that stays where it is.
+        late_share: probability of a harmless car that comes later.
+        late_s: when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning
+            takes for safe (Open-V2X).
+        leader_m: how far ahead of the truck the helper there is, bumper to bumper.
+        leader_mps: its speed: it has just passed.
+        follower_m: how far behind the ego the helper there is.
+    """
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)
+    time_limit_s: float = 12.0
+    delay_allowance_s: float = 1.0
+    speed_mps: float = 5.0
+    ego_start_m: tuple[float, float] = (28.0, 32.0)
+    ahead_m: float = 6.0
+    behind_m: float = 40.0
+    danger_share: float = 0.6
+    gap_m: tuple[float, float] = (8.0, 11.0)
+    oncoming_mps: tuple[float, float] = (12.0, 16.0)
+    danger_s: tuple[float, float] = (4.0, 6.2)
+    late_share: float = 0.4
+    late_s: tuple[float, float] = (12.0, 15.0)
+    leader_m: tuple[float, float] = (20.0, 35.0)
+    leader_mps: tuple[float, float] = (11.0, 14.0)
+    follower_m: tuple[float, float] = (12.0, 20.0)
+
+
+@cache
+def road() -> Road:
+    """A lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
+    paths: dict[PathKey, Path] = {
+        ("own", BESIDE): Path.along(network(), "own", BESIDE, [("a", "b", 0)], [BESIDE], 0),
+        ("own", OWN): Path.along(network(), "own", OWN, [("a", "b", 1)], [OWN], 1),
+        ("oncoming", "straight"): Path.along(network(), "oncoming", "straight", [("b", "a", 0)], [BESIDE], 2),
+    }
+    ahead = np.linspace(-10.0, 100.0, 12)
+    return Road(
+        facts={"kind": "two-way road", "lane_width_m": LANE_WIDTH_M},
+        paths=paths,
+        ego=("own", OWN),
+        crossings={},
+        zone_m=(0.0, LANE_WIDTH_M),
+        sectors={"oncoming": np.column_stack([ahead, np.zeros(len(ahead))])},
+        network=network,
+        ground=lambda far_m: ground(network(), far_m),
+        ways=(("own", BESIDE), ("own", OWN)),
+    )
+
+
+@cache
+def network() -> Any:
+    """Lanes as `TwoWayEnv` has them: the left one is there twice, once in each direction."""
+    from highway_env.road.lane import LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    net = RoadNetwork()
+    own, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE
+    left, right = ([BEGIN_M, 0.0], [END_M, 0.0]), ([BEGIN_M, LANE_WIDTH_M], [END_M, LANE_WIDTH_M])
+    net.add_lane("a", "b", StraightLane(*left, line_types=(edge, none)))
+    net.add_lane("a", "b", StraightLane(*right, line_types=(own, edge)))
+    net.add_lane("b", "a", StraightLane(*reversed(left), line_types=(none, none)))
+    return net
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p = parameters
+
+    def draw(what: str) -> float:
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    def own(id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps) -> Spawn:
+        return Spawn(id_, kind, part, "own", OWN, arc_m, speed_mps)
+
+    ego = -BEGIN_M - between("ego_start", p.ego_start_m)
+    truck = ego + (CAR + TRUCK) / 2 + between("gap", p.gap_m)
+    leader = truck + (CAR + TRUCK) / 2 + between("leader", p.leader_m)
+    spawns = [
+        own("v1", "car", "ego", ego),
+        own("v2", "truck", "helper", truck),
+        own("v3", "car", "helper", leader, between("leader_mps", p.leader_mps)),
+        own("v4", "car", "helper", ego - CAR - between("follower", p.follower_m)),
+    ]
+
+    def oncoming(id_: str, after_s: float) -> Spawn:
+        speed = between(f"{id_} speed", p.oncoming_mps)
+        arc = END_M - BEGIN_M - ego - speed * after_s
+        return Spawn(id_, "car", "other", "oncoming", "straight", arc, speed)
+
+    # Both have a number whether they are there or not: a gap between two ids tells nothing.
+    numbers = noise.generator(NAME, seed, "ids").permutation(2)
+    danger_id, late_id = (f"v{5 + int(n)}" for n in numbers)
+    danger = draw("danger") < p.danger_share
+    others = [oncoming(danger_id, between("danger_s", p.danger_s))] if danger else []
+    if draw("late") < p.late_share:
+        others.append(oncoming(late_id, between("late_s", p.late_s)))
+    spawns += sorted(others, key=lambda spawn: spawn.id)
+    return Layout(tuple(spawns), (), "oncoming" if danger else None, danger_id if danger else None)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego is back ahead of the truck, or has let go by what came towards it."""
+    ego, truck = vehicles[0], vehicles[1]
+    if abs(ego.position[1] - LANE_WIDTH_M) > LANE_WIDTH_M / 4:
+        return False
+    ahead_m = float(ego.position[0] - truck.position[0])
+    if ahead_m > (CAR + TRUCK) / 2 + parameters.ahead_m:
+        return True
+    passed = any(v.spawn.approach == "oncoming" and v.position[0] < ego.position[0] for v in vehicles)
+    return passed and -(CAR + TRUCK) / 2 - parameters.behind_m < ahead_m < -(CAR + TRUCK) / 2
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "follow a truck that you may pass on the oncoming lane", "hiding": "the truck"},
+    brake_lamps=True,
+)
