@@ -66,7 +66,7 @@ class Parameters(Common):
     danger_share: float = 0.6
     gap_m: tuple[float, float] = (8.0, 11.0)
     oncoming_mps: tuple[float, float] = (12.0, 16.0)
-    danger_s: tuple[float, float] = (4.0, 6.2)
+    danger_s: tuple[float, float] = (4.2, 5.9)
     late_share: float = 0.4
     late_s: tuple[float, float] = (12.0, 15.0)
     leader_m: tuple[float, float] = (20.0, 35.0)

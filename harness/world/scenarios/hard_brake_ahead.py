@@ -44,7 +44,8 @@ class Parameters(Common):
         danger_share: probability that the car beyond the van brakes.
         headway_s: of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense
             traffic; at 1.5 s the van's own lamps come in time, and no message is needed.
-        lead_headway_s: of the van to the car before it: it needs 1.3 s and more not to crash itself.
+        lead_headway_s: of the van to the car before it: from 1.7 s on the van,
+            which brakes late, does not crash itself.
         brakes_at_s: when that car begins to brake.
         brakes_mps2: how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g).
         beside_m: how far ahead of the ego's middle the car beside is.
