@@ -64,7 +64,7 @@ def show(
     if viewer is not None and viewer not in at.viewers:
         raise unknown("viewer", viewer, at.viewers)
     viewers = at.viewers if viewer is None else [viewer]
-    words = data.scenario.words
+    words = data.scenario.prompt_words
     sent = {v: prompt.render(at.record["graphs"][v], data.actions, words=words) for v in viewers}
     if as_json:
         echo_json(sent)
@@ -101,7 +101,7 @@ def check(
 
     def render(scene: "Scene", viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
         graph = scene.record["graphs"][viewer]
-        rendered = prompt.render(graph, data.actions, messages, data.scenario.words)
+        rendered = prompt.render(graph, data.actions, messages, data.scenario.prompt_words)
         if count:
             n = count(rendered)
             sizes[FUSION if messages else graph["role"]].append(n)

@@ -254,7 +254,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     viewers = {v.id for v in state.vehicles if v.part != "other"}
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
-    speeds = manifest.parameters["target_speeds_mps"]
+    speeds, road = manifest.parameters["target_speeds_mps"], scenario.road()
     holds = {
         "it is the scene of another decision point": record.scene == name,
         "there is no target speed of that index": isinstance(speeds, list)
@@ -270,8 +270,10 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "graphs are not those of the ego and the helpers": graphs.keys() == viewers,
         "a graph is of another viewer": all(graph.viewer == viewer for viewer, graph in graphs.items()),
         "distances are not those of the ego and the helpers": record.distance_m.keys() == viewers,
-        "a conflict is on a path that does not cross the ego's": {(c.sector, c.route) for c in conflicts}
-        <= scenario.road().crossings.keys(),
+        "a conflict is on a path that does not meet the ego's": all(
+            (c.sector, c.route) in (road.crossings if c.kind in ("crossing", "merging") else road.paths)
+            for c in conflicts
+        ),
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),

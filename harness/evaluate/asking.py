@@ -57,7 +57,7 @@ def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
 
 
 def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.words)
+    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.prompt_words)
     return readout.asked(rendered, spec.actions) if spec.answer == "readout" else rendered
 
 
@@ -69,7 +69,7 @@ def fusion_request(
     return Request(
         id=_fusion_id(scene, senders),
         role="ego",
-        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.words),
+        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.prompt_words),
         actions=spec.actions,
         max_tokens=most_tokens(spec, "ego"),
         form=spec.prompt.helper_answer,

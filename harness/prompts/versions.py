@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
+import numpy as np
 from jinja2 import StrictUndefined, Template, TemplateSyntaxError
 from jinja2.exceptions import SecurityError
 from jinja2.nodes import EvalContext
@@ -96,6 +97,7 @@ class Prompt:
         max_answer_tokens: most tokens an answer may have, by role.
         changed: what is new in it.
         known_failures: what it is known to provoke.
+        max_conflicts: how many conflicts the variable `conflicts` has, the soonest first; None for all.
         reasons_first: roles asked for reasons before the answer, which are then no fault of the answer.
         texts: template text by role.
     """
@@ -112,6 +114,7 @@ class Prompt:
     known_failures: str
     texts: Mapping[str, str]
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
+    max_conflicts: Count | None = None
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -160,6 +163,7 @@ class Prompt:
             "graph": graph,
             "actions": actions,
             "objects": objects,
+            "conflicts": soonest(graph["conflicts"])[: self.max_conflicts],
             "more": len(graph["nodes"]) - len(objects),
             "messages": messages,
             "words": words,
@@ -174,8 +178,8 @@ class Prompt:
         except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
-                "it needs the blocks system and user, and may use graph, actions, objects, more, messages, "
-                "words"
+                "it needs the blocks system and user, and may use graph, actions, objects, more, "
+                "conflicts, messages, words"
             ) from None
 
 
@@ -196,6 +200,16 @@ def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
         return node["id"] not in in_conflict, node["forward_m"] ** 2 + node["left_m"] ** 2
 
     return sorted(graph["nodes"], key=order)[:most]
+
+
+def soonest(conflicts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Conflicts, those first that the ego comes to first at present speeds; those it never comes to last."""
+
+    def order(conflict: Mapping[str, Any]) -> tuple[float, float]:
+        ego_s, distance_m = conflict["ego"]["time_s"], conflict["ego"]["arc_m"] + conflict["other"]["arc_m"]
+        return np.inf if ego_s is None else ego_s, distance_m
+
+    return sorted(conflicts, key=order)
 
 
 def names(where: Path | None = None) -> list[str]:

@@ -45,7 +45,7 @@ def prompts_of(run: Run) -> Sent | None:
         return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
-        words = scenarios.get(scene.state.scenario).words
+        words = scenarios.get(scene.state.scenario).prompt_words
         messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
         return readout.asked(messages, actions) if run.manifest.answer == "readout" else messages
 

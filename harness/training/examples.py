@@ -77,7 +77,7 @@ def alone(dataset: Dataset, scenes: Sequence[Scene], prompts: Sequence[Prompt]) 
     for scene, label in _labelled(dataset, scenes):
         for viewer, graph in scene.record["graphs"].items():
             for prompt in prompts:
-                sent = prompt.render(graph, dataset.actions, words=dataset.scenario.words)
+                sent = prompt.render(graph, dataset.actions, words=dataset.scenario.prompt_words)
                 yield Question(_key(scene, viewer, prompt), prompt, graph, sent, label)
 
 
@@ -106,7 +106,7 @@ def with_messages(
                 if u < ARRIVES
             ]
             if heard:
-                sent = prompt.render(graphs[ego], dataset.actions, heard, dataset.scenario.words)
+                sent = prompt.render(graphs[ego], dataset.actions, heard, dataset.scenario.prompt_words)
                 yield Question(f"{_key(scene, ego, prompt)}+m", prompt, graphs[ego], sent, label)
 
 

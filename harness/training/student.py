@@ -98,7 +98,7 @@ class Student:
     def samples(self, stage: str) -> list[Sample]:
         """What a stage learns from; the last two rehearse the read-outs of earlier ones."""
         if stage == "excerpts":
-            return self.reading(list(excerpts(self.questions, self.actions, self.data.scenario.words)))
+            return self.reading(list(excerpts(self.questions, self.actions, self.data.scenario.prompt_words)))
         if stage == "alone":
             return self.asked
         with_heard = self.reading(self.heard)

@@ -152,7 +152,8 @@ class Scenario:
         layout: the start of the episode of a seed, `(seed, parameters)`.
         cleared: whether the ego has reached its goal, asked after every frame, `(vehicles, parameters)`:
             highway-env's vehicles, the ego first.
-        words: what prompts may say of it, by name; templates read `words.<name>`.
+        words: what prompts say of it: `task`, after "You drive car v1:", and `hiding`, after "Others may be
+            hidden by". Templates read `words.<name>`.
         brake_lamps: whether vehicles show that they brake.
     """
 
@@ -165,6 +166,12 @@ class Scenario:
     cleared: Callable[[Sequence[Any], Any], bool]
     words: Mapping[str, str]
     brake_lamps: bool = False
+
+    @property
+    def prompt_words(self) -> dict[str, str]:
+        """What prompts may say of it: `words`, and the `speeds` that actions step through, from the top."""
+        speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
+        return {**self.words, "speeds": speeds}
 
     @property
     def summary(self) -> str:

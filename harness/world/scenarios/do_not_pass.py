@@ -170,6 +170,6 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
-    words={"task": "follow a truck that you may pass on the oncoming lane", "hiding": "the truck"},
+    words={"task": "pass a slow truck, or stay behind it", "hiding": "the truck"},
     brake_lamps=True,
 )

@@ -156,6 +156,6 @@ SCENARIO = Scenario(
     road=road,
     layout=layout,
     cleared=cleared,
-    words={"task": "follow a motorway", "hiding": "the van ahead"},
+    words={"task": "drive on along a motorway", "hiding": "the van ahead"},
     brake_lamps=True,
 )
