@@ -104,6 +104,10 @@ def _message(view: Mapping[str, Any], intent: dict[str, float], form: str) -> di
 
 
 def _reason(view: Mapping[str, Any]) -> str:
+    for conflict in view["conflicts"]:
+        if conflict["other"].get("braking") and conflict["kind"] == "ahead":
+            away_m, lane = conflict["ego"]["arc_m"], conflict["lane"]
+            return f"{conflict['with']} brakes {away_m:.0f} m ahead of the ego, {lane} lane."
     if view["conflicts"]:
         first = min(view["conflicts"], key=lambda c: abs(c["other"]["arc_m"]))
         return (

@@ -15,10 +15,13 @@ HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which ris
 
 
 def evidence(view: Mapping[str, Any]) -> str:
-    """What a viewer reports: who comes closest to the ego where their paths cross, or what it cannot see.
+    """What a viewer reports: who brakes ahead of the ego, or comes closest to it, or what it cannot see.
 
-    The gap is by how many seconds that vehicle is later there than the ego.
+    The gap is by how many seconds that vehicle is later than the ego where their ways meet.
     """
+    for conflict in view["conflicts"]:
+        if conflict["other"].get("braking") and conflict["kind"] == "ahead":
+            return f"{conflict['with']} brakes, {conflict['lane']} lane, {conflict['ego']['arc_m']:.0f} m"
     gaps = [(_gap_s(c), c) for c in view["conflicts"]]
     moving = [(gap, c) for gap, c in gaps if gap is not None]
     if moving:
@@ -39,7 +42,7 @@ def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> 
     """A helper's message that states an intent, with what any prompt may show of it."""
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
-    braking = stated[0]  # meta-actions come in the environment's order, the most careful first
+    braking = stated[0]  # the most careful action comes first
     return {
         "evidence": evidence(view),
         "risk": "high" if braking > HIGH else "medium" if braking > MEDIUM else "low",

@@ -146,7 +146,7 @@ class Scenario:
     Attributes:
         name: how users, manifests and frozen states call it.
         description: its first line is `Scenario <name>: <summary>`.
-        actions: names of highway-env's meta-actions that the ego chooses from, in highway-env's order.
+        actions: names of highway-env's meta-actions that the ego chooses from, the most careful first.
         parameters: its dials.
         road: gives the road, always the same one.
         layout: the start of the episode of a seed, `(seed, parameters)`.

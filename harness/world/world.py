@@ -63,7 +63,7 @@ class World:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions by name, in highway-env's order."""
+        """Meta-actions by name, the most careful first."""
         return self.scenario.actions
 
     @property

@@ -165,7 +165,7 @@ def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
 SCENARIO = Scenario(
     name=NAME,
     description=__doc__,
-    actions=("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER"),
+    actions=("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT"),
     parameters=Parameters(),
     road=road,
     layout=layout,
