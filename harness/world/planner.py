@@ -156,7 +156,7 @@ class Motion:
 
 def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
     """How those whom the ego could meet move on: they keep path and speed, and their place in the queue."""
-    time_s: Floats = (np.arange(steps) + 1) * STEP_S
+    time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph["ego"])
     way = road.paths[key]
     type_of = {node["id"]: node["type"] for node in graph["nodes"]}

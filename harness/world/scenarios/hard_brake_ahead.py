@@ -29,6 +29,7 @@ from harness.world.state import SIZES_M, Kind
 NAME = "hard-brake-ahead"
 LANE_WIDTH_M = 4.0
 BEGIN_M, END_M = -150.0, 350.0  # of the motorway, to the east
+ZONE_M = 18.0  # the conflict zone, where a car that brakes hard comes to stand
 LEFT, RIGHT = "left lane", "right lane"
 
 
@@ -77,18 +78,18 @@ class Parameters(Common):
 
 @cache
 def road() -> Road:
-    """Two lanes to the east; the conflict zone is where a car that brakes hard comes to stand."""
+    """Two lanes to the east."""
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
     paths: dict[PathKey, Path] = {
         ("own", name): Path.along(network(), "own", name, [lane], [name], 0) for name, lane in lanes.items()
     }
-    ahead = np.linspace(-60.0, 40.0, 11)
+    ahead = ZONE_M + np.linspace(-60.0, 40.0, 11)
     return Road(
         facts={"kind": "motorway of two lanes", "lane_width_m": LANE_WIDTH_M},
         paths=paths,
         ego=("own", RIGHT),
         crossings={},
-        zone_m=(0.0, LANE_WIDTH_M),
+        zone_m=(ZONE_M, LANE_WIDTH_M),
         sectors={
             "ahead": np.column_stack([ahead, np.full(11, LANE_WIDTH_M)]),
             "left ahead": np.column_stack([ahead, np.zeros(11)]),
@@ -121,7 +122,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         return Spawn(id_, kind, part, "own", lane, arc_m, p.speed_mps, *brakes)
 
     car, van = SIZES_M["car"][0], SIZES_M["van"][0]
-    ego = -BEGIN_M - between("ego_start", p.ego_start_m)
+    ego = ZONE_M - BEGIN_M - between("ego_start", p.ego_start_m)
     before = ego + (car + van) / 2 + p.speed_mps * between("headway", p.headway_s)
     lead = before + (car + van) / 2 + p.speed_mps * between("lead_headway", p.lead_headway_s)
     danger = draw("danger") < p.danger_share
@@ -145,7 +146,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
     """Whether the ego's centre is far enough behind the conflict zone."""
-    return bool(vehicles[0].position[0] > parameters.cleared_m)
+    return bool(vehicles[0].position[0] > ZONE_M + parameters.cleared_m)
 
 
 SCENARIO = Scenario(
