@@ -32,16 +32,19 @@ def world(scene: Scene) -> dict[str, Any]:
                 "role": graph["role"],
                 "seen": [node["id"] for node in graph["nodes"]],
                 "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
-                "conflicts": [
-                    {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
-                    for c, (x, y) in zip(
-                        graph["conflicts"], conflict_points(scene, viewer).round(1).tolist(), strict=True
-                    )
-                ],
+                "conflicts": _conflicts(scene, viewer),
             }
             for viewer, graph in scene.record["graphs"].items()
         },
     }  # fmt: skip
+
+
+def _conflicts(scene: Scene, viewer: str) -> list[dict[str, Any]]:
+    conflicts, points = conflict_points(scene, viewer)
+    return [
+        {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
+        for c, (x, y) in zip(conflicts, points.round(1).tolist(), strict=True)
+    ]
 
 
 def outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:

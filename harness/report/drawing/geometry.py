@@ -3,6 +3,8 @@
 The frame of `harness.world.road` has south instead, so every position is flipped on its way in.
 """
 
+from typing import Any
+
 import numpy as np
 
 from harness.core.arrays import Floats
@@ -19,13 +21,18 @@ def north_up(points: Floats) -> Floats:
     return points * [1.0, -1.0]
 
 
-def conflict_points(scene: Scene, viewer: str) -> Floats:
-    """Where a viewer sees paths cross, (n, 2) m to the east and north, as its graph orders them."""
+def conflict_points(scene: Scene, viewer: str) -> tuple[list[dict[str, Any]], Floats]:
+    """Conflicts that a viewer sees, and where, (n, 2) m to the east and north.
+
+    Not of who is ahead or behind: there the other vehicle itself is the place.
+    """
     eye = scene.state.vehicle(viewer)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
-    conflicts = scene.record["graphs"][viewer]["conflicts"]
+    every = scene.record["graphs"][viewer]["conflicts"]
+    conflicts = [c for c in every if c.get("kind") not in ("ahead", "behind")]
     relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
-    return north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
+    points = north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
+    return conflicts, points
 
 
 def ground_of(scenario: Scenario) -> Ground:

@@ -137,8 +137,7 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
 
 def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
     ego = printable(scene.state.ego.id)
-    conflicts = scene.record["graphs"][viewer]["conflicts"]
-    points = conflict_points(scene, viewer)
+    conflicts, points = conflict_points(scene, viewer)
     for conflict, point in zip(conflicts, points, strict=True):
         axes.plot(*point, markeredgewidth=0.7, zorder=4, **CROSS)
         labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))

@@ -2,6 +2,9 @@
 
 const STRIPS = 12; // shown until all are asked for
 
+// Of an action: the side of a change of lane, else the first letter.
+const initial = (action) => action.split("_").at(-1)[0];
+
 // What an episode came to under one condition with one seed.
 function course(list, scenes, run, condition, seed) {
   const path = scenes.filter((n) => list.action(n, run, condition, seed) != null);
@@ -67,6 +70,6 @@ class Episodes {
     return h("a", {
       class: `cell end-${end}`, href: list.link(n, { run, seed, condition }), title: told, "aria-label": told,
       style: end === "n" ? null : `background:${colour};color:${text}`,
-    }, end === "u" ? `${action[0]}✗` : end === "d" ? `${action[0]}◷` : action[0]);
+    }, initial(action) + ({ u: "✗", d: "◷" }[end] ?? ""));
   }
 }
