@@ -80,4 +80,5 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     words={"task": "cross a one-way street"},
+    prompt="v2",
 )

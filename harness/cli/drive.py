@@ -29,7 +29,7 @@ COLUMNS = (
 def command(
     model: options.Model = "proxy",
     engine: options.Engine = None,
-    prompt: options.Prompt = "v2",
+    prompt: options.ScenarioPrompt = None,
     condition: options.Conditions = None,
     scenario: str = typer.Option(
         "occluded-intersection", help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons."
@@ -75,10 +75,10 @@ def command(
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
-    scenarios.get(scenario)
+    driven = scenarios.get(scenario)
     spec = Spec(
         card=cards.resolve(model, engine),
-        prompt=versions.load(prompt),
+        prompt=versions.load(prompt or driven.prompt),
         source=LiveSource(first_seed, episodes, scenario),
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),

@@ -31,7 +31,7 @@ def command(
         "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
     ),
     engine: options.Engine = None,
-    prompt: options.Prompt = "v2",
+    prompt: options.ScenarioPrompt = None,
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
     seeds: options.Seeds = "0:5",
@@ -69,7 +69,7 @@ def command(
     frozen = selection.of(load.load(load.find(dataset), None if selection.given else limit))
     spec = Spec(
         card=cards.resolve(model, engine),
-        prompt=versions.load(prompt),
+        prompt=versions.load(prompt or frozen.scenario.prompt),
         source=FrozenSource(frozen, selection),
         points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
         seeds=options.parse_seeds(seeds),

@@ -21,6 +21,9 @@ Model = Annotated[str, Option(help="Card, checkpoint directory, .gguf file or hu
 Scenario = Annotated[str, Argument(help="Scenario.")]
 Engine = Annotated[str | None, Option(help="Another engine that the card names, such as llama-cpp.")]
 Prompt = Annotated[str, Option(help="Prompt version. `harness prompt list`.")]
+ScenarioPrompt = Annotated[
+    str | None, Option(help="Prompt version. Default: the scenario's. `harness prompt list`.")
+]
 Dataset = Annotated[str, Option(help="Shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
     list[str] | None,

@@ -155,6 +155,7 @@ class Scenario:
         words: what prompts say of it: `task`, after "You drive car v1:", and `hiding`, after "Others may be
             hidden by". Templates read `words.<name>`.
         brake_lamps: whether vehicles show that they brake.
+        prompt: version that is taken where none is named.
     """
 
     name: str
@@ -166,6 +167,7 @@ class Scenario:
     cleared: Callable[[Sequence[Any], Any], bool]
     words: Mapping[str, str]
     brake_lamps: bool = False
+    prompt: str = "v4"
 
     @property
     def prompt_words(self) -> dict[str, str]:

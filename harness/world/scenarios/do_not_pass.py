@@ -68,7 +68,7 @@ class Parameters(Common):
     oncoming_mps: tuple[float, float] = (12.0, 16.0)
     danger_s: tuple[float, float] = (4.2, 5.9)
     late_share: float = 0.4
-    late_s: tuple[float, float] = (12.0, 15.0)
+    late_s: tuple[float, float] = (15.0, 19.0)
     leader_m: tuple[float, float] = (20.0, 35.0)
     leader_mps: tuple[float, float] = (11.0, 14.0)
     follower_m: tuple[float, float] = (12.0, 20.0)

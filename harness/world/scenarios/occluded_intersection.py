@@ -174,4 +174,5 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     words={"task": "go straight over an intersection", "hiding": "buildings and trucks"},
+    prompt="v2",
 )
