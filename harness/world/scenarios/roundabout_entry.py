@@ -110,7 +110,10 @@ def network() -> Any:
             return CircularLane(centre, ENTRY_M, turn + begin, turn + end, True, line_types=(edge, edge))
 
         far = ARC_Y_M + ARM_M
-        way_in, way_out = (at(BESIDE_M, y) for y in (far, ARC_Y_M)), (at(-BESIDE_M, y) for y in (ARC_Y_M, far))
+        way_in, way_out = (
+            (at(BESIDE_M, y) for y in (far, ARC_Y_M)),
+            (at(-BESIDE_M, y) for y in (ARC_Y_M, far)),
+        )
         streets.add_lane(f"{c}er", f"{c}es", StraightLane(*way_in, line_types=(edge, edge)))
         streets.add_lane(f"{c}es", f"{c}e", arc(1, math.pi, math.pi + TOUCH_RAD))
         streets.add_lane(f"{c}x", f"{c}xs", arc(-1, -TOUCH_RAD, 0.0))
