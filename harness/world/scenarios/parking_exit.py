@@ -1,17 +1,17 @@
-"""Scenario `parking-exit`: the ego pulls out of a kerbside space between vans into a lane that it cannot see.
+"""Scenario `parking-exit`: the ego pulls out between vans into a lane that it cannot see.
 
-The ego rolls at 4 m/s along a kerbside space of a street and pulls out to the left, into the lane beside it. A
-row of vans parked behind it hides who comes along that lane. In most episodes one vehicle is dangerous: it
+The ego rolls at 4 m/s along a kerbside space of a street and pulls out to the left, into the lane beside it.
+A row of vans parked behind it hides who comes along that lane. In most episodes one vehicle is dangerous: it
 comes from behind, timed to be where the ego comes into the lane. Three helpers see it: the last van of the
-row, a car parked on the other side of the street, and a car that has just driven past. Traffic keeps its lane
-and speed and yields to nobody: it brakes only for who is in its lane, ahead and slower. The ego alone decides.
+row, a car parked on the other side of the street, and a car that has just driven past. Traffic keeps its
+lane and speed and yields to nobody: it brakes only for who is in its lane, ahead and slower. The ego alone
+decides.
 
 This is the kerbside variant, in which the ego drives forwards; nobody reverses. What the ego can see before
 it is too late (vans, helpers, a car on the lane for the other direction, a car that comes later) is drawn
 without knowing of the danger.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from harness.core import noise
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind, Part
@@ -30,9 +30,7 @@ LANE_WIDTH_M = 3.5
 KERB_M = 3.4  # from the middle of the lane to the middle of the ego's space
 VANS_M = 3.0  # and to that of the row of vans, which are wide: 0.2 m off the lane
 BEGIN_M, END_M = -110.0, 110.0  # of the street, to the east
-PULL_OUT_M = 10.0  # along the street, from the space into the lane, in two arcs
-TURN_RAD = 2 * math.atan(KERB_M / PULL_OUT_M)  # of each of them
-ARC_M = PULL_OUT_M / 2 / math.sin(TURN_RAD)  # their radius: 8 m, what a car turns at
+PULL_OUT_M = 10.0  # along the street, from the space into the lane, in two arcs of 8 m
 OUT_M = 0.0  # where the ego's way has come into the lane
 SECTOR_REACH_M = (15.0, 45.0)  # stretch of the lane before that point that is looked at
 VAN = SIZES_M["van"][0]
@@ -85,11 +83,11 @@ class Parameters(Common):
 @cache
 def network() -> Any:
     """A lane to the east and one to the west, what is parked beside each, and the ego's way out."""
-    from highway_env.road.lane import CircularLane, LineType, StraightLane
+    from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
-    net, begins, quarter = RoadNetwork(), OUT_M - PULL_OUT_M, math.pi / 2
+    net, begins = RoadNetwork(), OUT_M - PULL_OUT_M
     for start, end, begin_m, end_m, y_m, lines in (
         ("west", "out", BEGIN_M, OUT_M, 0.0, (dashed, none)),
         ("out", "east", OUT_M, END_M, 0.0, (dashed, none)),
@@ -100,12 +98,9 @@ def network() -> Any:
     ):
         lane = StraightLane([begin_m, y_m], [end_m, y_m], LANE_WIDTH_M, line_types=lines)
         net.add_lane(start, end, lane)
-    for start, end, x_m, y_m, turn, clockwise in (
-        ("pull", "swing", begins, KERB_M - ARC_M, (quarter, quarter - TURN_RAD), False),
-        ("swing", "out", OUT_M, ARC_M, (-quarter - TURN_RAD, -quarter), True),
-    ):
-        lane = CircularLane([x_m, y_m], ARC_M, *turn, clockwise, LANE_WIDTH_M, line_types=(none, none))
-        net.add_lane(start, end, lane)
+    first, second = to_the_left((begins, KERB_M), (OUT_M, 0.0), LANE_WIDTH_M)
+    net.add_lane("pull", "swing", first)
+    net.add_lane("swing", "out", second)
     return net
 
 

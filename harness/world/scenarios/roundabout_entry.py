@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ def _path(approach: str, route: str, begin: str, end: str, priority: int) -> Pat
     first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
     nodes = [RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)]
     lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
-    lanes += [(a, b, 0) for a, b in zip(nodes, nodes[1:], strict=False)]
+    lanes += [(a, b, 0) for a, b in pairwise(nodes)]
     lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
     return Path.along(network(), approach, route, lanes, [_role(lane) for lane in lanes], priority)
 
