@@ -110,7 +110,10 @@ def road() -> Road:
             0,
         ),
     }
-    paths = {key: Path.along(network(), *key, *of) for key, of in ways.items()}
+    paths = {
+        key: Path.along(network(), *key, lanes, roles, priority)
+        for key, (lanes, roles, priority) in ways.items()
+    }
     back_m = np.linspace(*SECTOR_REACH_M, 16)
     return Road(
         facts={"kind": "ramp that merges", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},

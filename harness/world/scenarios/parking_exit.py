@@ -116,7 +116,10 @@ def road() -> Road:
         ("opposite", "parked"): ([("opposite", "far", 0)], ["opposite kerb"], 0),
         ego: (own, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
     }
-    paths = {key: Path.along(network(), *key, *of) for key, of in ways.items()}
+    paths = {
+        key: Path.along(network(), *key, lanes, roles, priority)
+        for key, (lanes, roles, priority) in ways.items()
+    }
     at = crossings(paths, ego)[behind]
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     return Road(
