@@ -219,6 +219,26 @@ def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Cros
     return found
 
 
+def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: float) -> tuple[Any, Any]:
+    """Two of highway-env's arcs, as long as their longitudinal coordinate, unlike its `SineLane`.
+
+    Both ends head east and the end lies farther north; metres. The first arc turns left, the second back.
+    """
+    from highway_env.road.lane import CircularLane, LineType
+
+    along, across = end[0] - begin[0], begin[1] - end[1]
+    turn, quarter = 2 * math.atan(across / along), math.pi / 2
+    radius = along / 2 / math.sin(turn)
+    centres = [begin[0], begin[1] - radius], [end[0], end[1] + radius]
+    angles = (quarter, quarter - turn), (-quarter - turn, -quarter)
+    lines = {"width": width_m, "line_types": (LineType.NONE, LineType.NONE)}
+    first, second = (
+        CircularLane(centre, radius, *at, clockwise, **lines)
+        for centre, at, clockwise in zip(centres, angles, (False, True), strict=True)
+    )
+    return first, second
+
+
 def ground(network: Any, far_m: float) -> Ground:
     """What a picture shows of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
     lanes = network.lanes_list()

@@ -93,6 +93,13 @@ class _OnRoute:
         }
         self.braking = self.action["acceleration"] < -LAMPS_MPS2
 
+    def follow_road(self: Any) -> None:
+        """Near the end of its lane it takes the next of its route, wherever on the route it began."""
+        if self.road.network.get_lane(self.target_lane_index).after_end(self.position):
+            rest = self.route[self.route.index(self.target_lane_index) + 1 :]
+            if rest:
+                self.route, self.target_lane_index = rest, rest[0]
+
     def _steering(self: Any, lane: Any, along: float, lateral: float) -> float:
         """`ControlledVehicle.steering_control`, where the vehicle's place in its lane is known."""
         speed = utils.not_zero(self.speed)

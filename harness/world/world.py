@@ -80,8 +80,15 @@ class World:
     def snapshot(self) -> Snapshot:
         """What `thaw` needs besides `state()` to go on exactly as this world would."""
         vehicles = self.road.vehicles
-        sections = [v.route.index(v.target_lane_index) for v in vehicles]
+        sections = [self._section(v) for v in vehicles]
         return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
+
+    def _section(self, v: Any) -> int:
+        """The section of its path that a vehicle is in; its route is what is left of its path's lanes."""
+        road, left = self.scenario.road(), v.route.index(v.target_lane_index)
+        if road.form == 1:  # counts from where the route now begins, and is set right in the next frame
+            return int(left)
+        return len(road.paths[v.spawn.approach, v.spawn.route].lanes) - len(v.route) + int(left)
 
     @classmethod
     def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":

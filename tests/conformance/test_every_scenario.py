@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import one_way_crossing
@@ -41,6 +42,17 @@ def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(s
         assert (found.danger is None) == (found.danger_id is None)
     layouts = [scenario.layout(seed, scenario.parameters) for seed in SEEDS]
     assert any(one != layouts[0] for one in layouts[1:])
+
+
+def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(scenario: Scenario) -> None:
+    p = scenario.parameters
+    if not hasattr(p, "danger_share"):
+        pytest.skip("no dial for dangers")
+    for seed in range(40):
+        found = scenario.layout(seed, p)
+        without = scenario.layout(seed, replace(p, danger_share=0.0))
+        rest = [{s for s in of.spawns if s.id != found.danger_id} for of in (found, without)]
+        assert (rest[0], found.buildings) == (rest[1], without.buildings)
 
 
 def test_its_paths_run_along_the_middle_of_their_lanes(scenario: Scenario) -> None:

@@ -22,6 +22,7 @@ from harness.world.state import SIZES_M, VehicleState, WorldState, indicator
 
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
+ALIKE = 0.05  # paths that share a lane cost the same but for rounding
 ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 
 Graph = dict[str, Any]
@@ -131,8 +132,12 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
 
 
 def _path_of(road: Road, d: Detection) -> Path | None:
-    """The path an object is taken to follow: the nearest that fits its heading and its indicator."""
+    """The path an object is taken to follow: the nearest that fits its heading and its indicator.
+
+    Of paths alike the road's first.
+    """
     best, least = None, ON_PATH_M
+    alike = ALIKE if road.form == 2 else 0.0
     for path in road.paths.values():
         arc, lateral, heading = path.project(d.x_m, d.y_m)
         turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
@@ -142,7 +147,7 @@ def _path_of(road: Road, d: Detection) -> Path | None:
         forks = ((path.approach, path.route), path.section(arc)) in road.forks
         unlikely = forks and indicator(path.route) != (d.indicator or "off")
         cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
-        if lateral < ON_PATH_M and (best is None or cost < least):
+        if lateral < ON_PATH_M and (best is None or cost < least - alike):
             best, least = path, cost
     return best
 

@@ -1,0 +1,191 @@
+"""Scenario `blind-merge`: the ego comes up a ramp behind a wall and merges into a lane that it cannot see.
+
+The ego comes at 14 m/s along a ramp whose lane runs into the right lane of the main road. A noise wall
+between them hides who drives there until shortly before. In most episodes one vehicle is dangerous: it is on
+the right lane, timed to be where the ego comes into it. A car on the left lane at the same time is harmless:
+the lane decides. Three helpers see both: a truck on the left lane, and a car ahead on either lane. Traffic
+keeps its lane and speed and makes room for nobody: it brakes only for who is in its lane, ahead and slower.
+The ego alone decides.
+
+What the ego can see before it is too late (wall, helpers, cars that pass before or come later) is drawn
+without knowing of the danger.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import Building
+
+NAME = "blind-merge"
+LANE_WIDTH_M = 4.0
+RAMP_M = 6.5  # from the middle of the right lane to that of the ramp, beside the wall
+CONVERGE_M = 40.0  # along the road, from the ramp's straight to where it has run into the right lane
+WALL_M = 2.7, 3.5  # from the middle of the right lane to the wall's faces
+BEGIN_M, END_M = -250.0, 250.0  # of the main road, to the east; the ramp has merged at 0
+SECTOR_REACH_M = (15.0, 60.0)  # stretch of the right lane before that point that is looked at
+
+
+@dataclass(frozen=True)
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        ego_speed_mps: speed at the start: 50 km/h.
+        ego_start_m: from the start to where the ego's way has run into the right lane.
+        cleared_m: where the ego has cleared, m beyond that point.
+        danger_share: probability that an episode holds a danger.
+        danger_offset_s: when a danger is where the ego comes into its lane, after a cruising ego.
+        main_mps: speed of cars on the main road, dangerous or not: 50 to 60 km/h.
+        left_share: probability of a car on the left lane at the same time.
+        before_share: probability of a car on the right lane that has passed.
+        before_offset_s: when it is where the ego comes into its lane, after a cruising ego.
+        late_share: probability of a car on the right lane that comes later than the critical headway of a
+            merge, 3.7 s (HCM 7, equation 31-50).
+        late_offset_s: when it is there, after a cruising ego.
+        wall_end_m: from the wall's end to where the ego's way has run into the right lane.
+        truck_offset_s: when the truck on the left lane is beside that point, after a cruising ego.
+        truck_mps: speed of the truck.
+        ahead_m: where a helper ahead starts, m beyond that point: within LiDAR's reach of a danger.
+        ahead_mps: its speed, not below that of who is behind it.
+    """
+
+    ego_speed_mps: float = 14.0
+    ego_start_m: tuple[float, float] = (58.0, 70.0)
+    cleared_m: float = 12.0
+    danger_share: float = 0.65
+    danger_offset_s: tuple[float, float] = (-0.1, 0.5)
+    main_mps: tuple[float, float] = (14.0, 16.5)
+    left_share: float = 0.5
+    before_share: float = 0.4
+    before_offset_s: tuple[float, float] = (-3.2, -2.2)
+    late_share: float = 0.4
+    late_offset_s: tuple[float, float] = (5.5, 7.5)
+    wall_end_m: tuple[float, float] = (30.0, 42.0)
+    truck_offset_s: tuple[float, float] = (2.6, 3.6)
+    truck_mps: tuple[float, float] = (13.0, 14.0)
+    ahead_m: tuple[float, float] = (-10.0, 5.0)
+    ahead_mps: tuple[float, float] = (16.5, 17.5)
+
+
+@cache
+def network() -> Any:
+    """As highway-env's `MergeEnv`, but shorter, and the ramp's lane runs into the right lane."""
+    from highway_env.road.lane import LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
+    net = RoadNetwork()
+    for start, end, begin_m, end_m, y_m, lines in (
+        ("a", "b", BEGIN_M, 0.0, -LANE_WIDTH_M, (edge, none)),
+        ("a", "b", BEGIN_M, 0.0, 0.0, (dashed, edge)),
+        ("b", "c", 0.0, END_M, -LANE_WIDTH_M, (edge, none)),
+        ("b", "c", 0.0, END_M, 0.0, (dashed, edge)),
+        ("j", "k", BEGIN_M, -CONVERGE_M, RAMP_M, (edge, edge)),
+    ):
+        net.add_lane(start, end, StraightLane([begin_m, y_m], [end_m, y_m], LANE_WIDTH_M, line_types=lines))
+    first, second = to_the_left((-CONVERGE_M, RAMP_M), (0.0, 0.0), LANE_WIDTH_M)
+    net.add_lane("k", "m", first)
+    net.add_lane("m", "b", second)
+    return net
+
+
+@cache
+def road() -> Road:
+    """The main road and its ramp. Their conflict zone is where the ramp has run into the right lane."""
+    ego, main = ("ramp", "merge"), ("main", "straight")
+    ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
+        main: ([("a", "b", 1), ("b", "c", 1)], ["right lane behind", "right lane"], 1),
+        ("main left", "straight"): ([("a", "b", 0), ("b", "c", 0)], ["left lane behind", "left lane"], 1),
+        ego: (
+            [("j", "k", 0), ("k", "m", 0), ("m", "b", 0), ("b", "c", 1)],
+            ["ramp", "merge", "merge", "right lane"],
+            0,
+        ),
+    }
+    paths = {
+        key: Path.along(network(), *key, lanes, roles, priority)
+        for key, (lanes, roles, priority) in ways.items()
+    }
+    back_m = np.linspace(*SECTOR_REACH_M, 16)
+    return Road(
+        facts={"kind": "ramp that merges", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
+        paths=paths,
+        ego=ego,
+        crossings=crossings(paths, ego),
+        zone_m=(0.0, 0.0),
+        sectors={"main": np.column_stack([-back_m, np.zeros(len(back_m))])},
+        network=network,
+        ground=partial(ground, network()),
+    )
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p, (at,) = parameters, road().crossings.values()
+
+    def draw(what: str) -> float:
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    start = between("ego_start", p.ego_start_m)
+
+    def back_m(speed: float, late_s: float) -> float:
+        """Arc length on the main road from which one is beside the merge so long after a cruising ego."""
+        return at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
+
+    truck = back_m(speed := between("truck_speed", p.truck_mps), between("truck_offset", p.truck_offset_s))
+    spawns = [
+        Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps),
+        Spawn("v2", "truck", "helper", "main left", "straight", truck, speed),
+    ]
+    for id_, approach in (("v3", "main"), ("v4", "main left")):
+        arc = at.other_arc_m + between(f"{id_}_ahead", p.ahead_m)
+        speed = between(f"{id_}_speed", p.ahead_mps)
+        spawns.append(Spawn(id_, "car", "helper", approach, "straight", arc, speed))
+    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
+    cars = {
+        "danger": ("main", p.danger_share, p.danger_offset_s),
+        "left": ("main left", p.left_share, p.danger_offset_s),
+        "before": ("main", p.before_share, p.before_offset_s),
+        "late": ("main", p.late_share, p.late_offset_s),
+    }
+    numbers = noise.generator(NAME, seed, "ids").permutation(len(cars))
+    ids = {what: f"v{5 + int(number)}" for what, number in zip(cars, numbers, strict=True)}
+    others = []
+    for what, (approach, share, offset_s) in cars.items():
+        if draw(what) < share:
+            speed = between(f"{what}_speed", p.main_mps)
+            arc = back_m(speed, between(f"{what}_offset", offset_s))
+            others.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
+    spawns += sorted(others, key=lambda spawn: spawn.id)
+
+    wall = Building("b1", BEGIN_M, WALL_M[0], -between("wall_end", p.wall_end_m), WALL_M[1])
+    danger_id = ids["danger"] if any(spawn.id == ids["danger"] for spawn in others) else None
+    return Layout(tuple(spawns), (wall,), "main" if danger_id else None, danger_id)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego's centre is far enough along the right lane."""
+    return bool(vehicles[0].position[0] > parameters.cleared_m)
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
+)

@@ -1,0 +1,205 @@
+"""Scenario `parking-exit`: the ego pulls out between vans into a lane that it cannot see.
+
+The ego rolls at 4 m/s along a kerbside space of a street and pulls out to the left, into the lane beside it.
+A row of vans parked behind it hides who comes along that lane. In most episodes one vehicle is dangerous: it
+comes from behind, timed to be where the ego comes into the lane. Three helpers see it: the last van of the
+row, a car parked on the other side of the street, and a car that has just driven past. Traffic keeps its
+lane and speed and yields to nobody: it brakes only for who is in its lane, ahead and slower. The ego alone
+decides.
+
+This is the kerbside variant, in which the ego drives forwards; nobody reverses. What the ego can see before
+it is too late (vans, helpers, a car on the lane for the other direction, a car that comes later) is drawn
+without knowing of the danger.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import SIZES_M, Kind, Part
+
+NAME = "parking-exit"
+LANE_WIDTH_M = 3.5
+KERB_M = 3.4  # from the middle of the lane to the middle of the ego's space
+VANS_M = 3.0  # and to that of the row of vans, which are wide: 0.2 m off the lane
+BEGIN_M, END_M = -110.0, 110.0  # of the street, to the east
+PULL_OUT_M = 10.0  # along the street, from the space into the lane, in two arcs of 8 m
+OUT_M = 0.0  # where the ego's way has come into the lane
+SECTOR_REACH_M = (15.0, 45.0)  # stretch of the lane before that point that is looked at
+VAN = SIZES_M["van"][0]
+
+
+@dataclass(frozen=True)
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        target_speeds_mps: up to a driver's pace in a car park.
+        ego_speed_mps: speed at the start.
+        ego_start_m: how far before the pull-out's beginning the ego starts.
+        cleared_m: where the ego has cleared, m beyond the pull-out's end.
+        danger_share: probability that an episode holds a danger.
+        danger_offset_s: when a danger is where the ego comes into the lane, after a cruising ego.
+        lane_mps: speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts
+            cover, 30 km/h and more what a street has.
+        late_share: probability of a harmless car that comes from behind as well, but later.
+        late_offset_s: when it is where the ego comes into the lane, after a cruising ego.
+        oncoming_share: probability of a car on the lane for the other direction.
+        oncoming_m: where it starts, m ahead of the ego.
+        behind_m: gap from the ego's rear to the van behind it, at the start.
+        vans_m: gap between two vans of the row.
+        ahead_m: gap from the pull-out's end to the van ahead.
+        opposite_m: where the car that is parked opposite stands, m before the pull-out's end.
+        passed_m: where the car that has just driven past is, m beyond the pull-out's end.
+        passed_mps: its speed.
+    """
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)
+    ego_speed_mps: float = 4.0
+    ego_start_m: tuple[float, float] = (2.0, 8.0)
+    cleared_m: float = 6.0
+    danger_share: float = 0.65
+    danger_offset_s: tuple[float, float] = (-0.5, 0.3)
+    lane_mps: tuple[float, float] = (8.0, 11.0)
+    late_share: float = 0.5
+    late_offset_s: tuple[float, float] = (8.0, 10.5)
+    oncoming_share: float = 0.5
+    oncoming_m: tuple[float, float] = (30.0, 60.0)
+    behind_m: tuple[float, float] = (0.8, 2.0)
+    vans_m: tuple[float, float] = (0.8, 1.6)
+    ahead_m: tuple[float, float] = (2.0, 8.0)
+    opposite_m: tuple[float, float] = (5.0, 20.0)
+    passed_m: tuple[float, float] = (10.0, 20.0)
+    passed_mps: tuple[float, float] = (8.0, 11.0)
+
+
+@cache
+def network() -> Any:
+    """A lane to the east and one to the west, what is parked beside each, and the ego's way out."""
+    from highway_env.road.lane import LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
+    net, begins = RoadNetwork(), OUT_M - PULL_OUT_M
+    for start, end, begin_m, end_m, y_m, lines in (
+        ("west", "out", BEGIN_M, OUT_M, 0.0, (dashed, none)),
+        ("out", "east", OUT_M, END_M, 0.0, (dashed, none)),
+        ("east", "west", END_M, BEGIN_M, -LANE_WIDTH_M, (none, none)),
+        ("kerb", "end", BEGIN_M, END_M, VANS_M, (none, edge)),
+        ("opposite", "far", END_M, BEGIN_M, -LANE_WIDTH_M - VANS_M, (none, edge)),
+        ("space", "pull", BEGIN_M, begins, KERB_M, (none, edge)),
+    ):
+        lane = StraightLane([begin_m, y_m], [end_m, y_m], LANE_WIDTH_M, line_types=lines)
+        net.add_lane(start, end, lane)
+    first, second = to_the_left((begins, KERB_M), (OUT_M, 0.0), LANE_WIDTH_M)
+    net.add_lane("pull", "swing", first)
+    net.add_lane("swing", "out", second)
+    return net
+
+
+@cache
+def road() -> Road:
+    """The street. Its conflict zone is where the ego's way has come into the lane."""
+    ego, behind = ("own", "pull-out"), ("behind", "straight")
+    own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
+    ways: dict[PathKey, tuple[list[Lane], list[str], int]] = {
+        behind: ([("west", "out", 0), own[-1]], ["lane behind", "lane ahead"], 1),
+        ("oncoming", "straight"): ([("east", "west", 0)], ["oncoming lane"], 1),
+        ("kerb", "parked"): ([("kerb", "end", 0)], ["kerb"], 0),
+        ("opposite", "parked"): ([("opposite", "far", 0)], ["opposite kerb"], 0),
+        ego: (own, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
+    }
+    paths = {
+        key: Path.along(network(), *key, lanes, roles, priority)
+        for key, (lanes, roles, priority) in ways.items()
+    }
+    at = crossings(paths, ego)[behind]
+    back_m = np.linspace(*SECTOR_REACH_M, 13)
+    return Road(
+        facts={"kind": "street with parked vehicles", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
+        paths=paths,
+        ego=ego,
+        crossings={behind: at},
+        zone_m=(OUT_M, 0.0),
+        sectors={"behind": np.column_stack([OUT_M - back_m, np.zeros(len(back_m))])},
+        network=network,
+        ground=partial(ground, network()),
+    )
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p, (at,) = parameters, road().crossings.values()
+
+    def draw(what: str) -> float:
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    start = OUT_M - PULL_OUT_M - between("ego_start", p.ego_start_m)
+    ego = start - BEGIN_M
+    rear = start - SIZES_M["car"][0] / 2 - between("behind", p.behind_m) - VAN / 2
+    row = [rear]
+    for n in range(2):
+        row.append(row[-1] - VAN - between(f"van_{n}", p.vans_m))
+    ahead = OUT_M + between("ahead", p.ahead_m) + VAN / 2
+
+    def standing(id_: str, kind: Kind, part: Part, x_m: float, side: str = "kerb") -> Spawn:
+        return Spawn(id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0)
+
+    def coming(id_: str, what: str, bounds: tuple[float, float]) -> Spawn:
+        """A car from behind that is where the ego comes into the lane so long after a cruising ego."""
+        speed = between(f"{what}_speed", p.lane_mps)
+        after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + between(f"{what}_offset", bounds)
+        return Spawn(id_, "car", "other", "behind", "straight", at.other_arc_m - speed * after_s, speed)
+
+    passed = at.other_arc_m + between("passed", p.passed_m)
+    spawns = [
+        Spawn("v1", "car", "ego", "own", "pull-out", ego, p.ego_speed_mps),
+        standing("v2", "van", "helper", row[-1]),
+        standing("v3", "car", "helper", OUT_M - between("opposite", p.opposite_m), "opposite"),
+        Spawn("v4", "car", "helper", "behind", "straight", passed, between("passed_speed", p.passed_mps)),
+    ]
+    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
+    numbers = noise.generator(NAME, seed, "ids").permutation(6)
+    danger_id, late_id, oncoming_id, *parked = (f"v{5 + int(n)}" for n in numbers)
+    others = [
+        standing(parked[0], "van", "other", row[0]),
+        standing(parked[1], "van", "other", row[1]),
+        standing(parked[2], "van", "other", ahead),
+    ]
+    danger = draw("danger") < p.danger_share
+    if danger:
+        others.append(coming(danger_id, "danger", p.danger_offset_s))
+    if draw("late") < p.late_share:
+        others.append(coming(late_id, "late", p.late_offset_s))
+    if draw("oncoming") < p.oncoming_share:
+        arc, speed = END_M - start - between("oncoming", p.oncoming_m), between("oncoming_speed", p.lane_mps)
+        others.append(Spawn(oncoming_id, "car", "other", "oncoming", "straight", arc, speed))
+    spawns += sorted(others, key=lambda spawn: int(spawn.id[1:]))
+    return Layout(tuple(spawns), (), "behind" if danger else None, danger_id if danger else None)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego's centre is far enough along the lane."""
+    return bool(vehicles[0].position[0] > OUT_M + parameters.cleared_m)
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "pull out of a kerbside space into the lane beside it", "hiding": "parked vans"},
+)

@@ -1,0 +1,261 @@
+"""Scenario `roundabout-entry`: the ego enters a roundabout past a hedge that hides who is on it.
+
+The ego comes from the south at 8 m/s and enters a roundabout of one lane to go straight on. A hedge on the
+splitter island beside it, and a planted mound in the middle, hide who comes round from the left. In most
+episodes one vehicle is dangerous: it has come from the west or the north arm, goes on past the ego's arm, and
+is timed to be where the ego enters. What matters is where it goes: a car just like it that leaves at the
+ego's arm is harmless. Three helpers, one that has just left at the ego's arm, one that has left at the west
+arm and one that has just entered ahead of the ego, see parts of the ring. Traffic keeps its lane and speed
+and yields to nobody; the ego alone decides.
+
+What the ego can see before it is too late (hedge, mound, helpers, a car that leaves first, a car that comes
+later) is drawn without knowing of the danger.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.world.road import Lane, Path, Road, crossings, ground
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Parameters as Common
+from harness.world.state import Building
+
+NAME = "roundabout-entry"
+LANE_WIDTH_M = 4.0
+RING_M = 20.0  # radius of the middle of the ring's lane: 44 m from kerb to kerb, 27 to 55 m are usual
+ENTRY_M = 18.0  # radius of the arcs by which cars enter and leave
+BESIDE_M = 4.0  # from an arm's centre line to the middle of its lanes, beside the splitter island
+ARM_M = 80.0  # length of the straight before and behind the arcs
+ARC_Y_M = math.sqrt((RING_M + ENTRY_M) ** 2 - (BESIDE_M + ENTRY_M) ** 2)  # where the south arm's arcs begin
+TOUCH_RAD = math.atan2(ARC_Y_M, BESIDE_M + ENTRY_M)  # where on the ring the south entry joins it
+ARMS = {"own": 0, "right": 1, "oncoming": 2, "left": 3}  # quarter turns from the south, the way cars go round
+SECTORS = ("left", "oncoming")  # the arm that a danger has come from
+SECTOR_REACH_M = (8.0, 45.0)  # stretch before the point of entry that is looked at
+RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")  # as in highway-env: entries and exits in order
+SEEN_AS = {"own": "south", "right": "east", "oncoming": "north", "left": "west"}
+
+
+@dataclass(frozen=True)
+class Parameters(Common):
+    """The scenario's own dials. Pairs are bounds of a uniform draw.
+
+    Attributes:
+        ego_speed_mps: speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386).
+        ego_start_m: from the start to where the ego's way joins the ring.
+        danger_share: probability that an episode holds a danger.
+        sector_shares: probability of left, oncoming, given a danger.
+        danger_offset_s: when a danger passes where the ego enters, after a cruising ego would.
+        ring_mps: speed of everybody on the ring (NCHRP 672: 7.7 m/s for a circle of 20 m).
+        leaver_share: probability, without a danger, of a car in its place that leaves at the ego's arm.
+        before_share: probability of a car that leaves there shortly before.
+        before_offset_s: when that car would pass where the ego enters if it went on.
+        late_share: probability of a car that comes as a danger would, but later than the critical headway of
+            4.98 s (HCM 7, equation 22-1) allows the ego to be in its way.
+        late_offset_s: when it passes where the ego enters, after a cruising ego would.
+        mound_m: radius of the planted part of the island.
+        hedge_end_m: from the ring's centre to the end of the hedge.
+        hedge_half_m: half its width; the splitter island is 4 m wide at its narrowest.
+        helper_south_m: how far behind the ring's edge the helper that left at the ego's arm starts.
+        helper_west_m: how far the one that left at the west arm is.
+        helper_ahead_m: how far beyond the point of entry the one that entered before the ego is.
+        helper_mps: speed of helpers.
+    """
+
+    target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
+    ego_speed_mps: float = 8.0
+    ego_start_m: tuple[float, float] = (33.0, 39.0)
+    danger_share: float = 0.65
+    sector_shares: tuple[float, float] = (0.5, 0.5)
+    danger_offset_s: tuple[float, float] = (0.0, 0.6)
+    ring_mps: tuple[float, float] = (6.8, 7.8)
+    leaver_share: float = 0.6
+    before_share: float = 0.4
+    before_offset_s: tuple[float, float] = (-1.8, -1.3)
+    late_share: float = 0.4
+    late_offset_s: tuple[float, float] = (5.0, 7.0)
+    mound_m: tuple[float, float] = (12.0, 15.0)
+    hedge_end_m: tuple[float, float] = (24.0, 32.0)
+    hedge_half_m: float = 1.5
+    helper_south_m: tuple[float, float] = (16.0, 22.0)
+    helper_west_m: tuple[float, float] = (6.0, 12.0)
+    helper_ahead_m: tuple[float, float] = (8.0, 14.0)
+    helper_mps: tuple[float, float] = (5.5, 7.0)
+
+
+@cache
+def network() -> Any:
+    """A ring with four arms, of highway-env's lanes, which meet without a gap; its own ring has gaps."""
+    from highway_env.road.lane import CircularLane, LineType, StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    none, edge = LineType.NONE, LineType.CONTINUOUS
+    streets = RoadNetwork()
+    for arm, quarters in ARMS.items():
+        turn, c = -math.pi / 2 * quarters, SEEN_AS[arm][0]
+        rotate = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]).round(12)
+
+        def at(x: float, y: float, rotate: Floats = rotate) -> Floats:
+            turned: Floats = rotate @ np.array([x, y])
+            return turned
+
+        def arc(side: int, begin: float, end: float, at: Any = at, turn: float = turn) -> Any:
+            centre = at(side * (BESIDE_M + ENTRY_M), ARC_Y_M)
+            return CircularLane(centre, ENTRY_M, turn + begin, turn + end, True, line_types=(edge, edge))
+
+        far = ARC_Y_M + ARM_M
+        way_in, way_out = (
+            (at(BESIDE_M, y) for y in (far, ARC_Y_M)),
+            (at(-BESIDE_M, y) for y in (ARC_Y_M, far)),
+        )
+        streets.add_lane(f"{c}er", f"{c}es", StraightLane(*way_in, line_types=(edge, edge)))
+        streets.add_lane(f"{c}es", f"{c}e", arc(1, math.pi, math.pi + TOUCH_RAD))
+        streets.add_lane(f"{c}x", f"{c}xs", arc(-1, -TOUCH_RAD, 0.0))
+        streets.add_lane(f"{c}xs", f"{c}xr", StraightLane(*way_out, line_types=(edge, edge)))
+    for n, (begin, end) in enumerate(zip(RING, RING[1:] + RING[:1], strict=True)):
+        start_rad, end_rad = _ring_rad(n), _ring_rad(n + 1)
+        lane = CircularLane((0.0, 0.0), RING_M, start_rad, end_rad, False, line_types=(none, edge))
+        streets.add_lane(begin, end, lane)
+    return streets
+
+
+def _ring_rad(node: int) -> float:
+    """Where the ring's nth node is; angles fall the way cars go round."""
+    exits = TOUCH_RAD if node % 2 == 0 else math.pi / 2 - TOUCH_RAD
+    return exits - math.pi / 2 * (node // 2)
+
+
+def _path(approach: str, route: str, begin: str, end: str, priority: int) -> Path:
+    """From the arm of `begin`, on the ring, and out at the arm of `end` (arms by their first letter)."""
+    first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
+    nodes = [RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)]
+    lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
+    lanes += [(a, b, 0) for a, b in pairwise(nodes)]
+    lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
+    return Path.along(network(), approach, route, lanes, [_role(lane) for lane in lanes], priority)
+
+
+def _role(lane: Lane) -> str:
+    """What a lane is called, from the ego's seat."""
+    where = {c[0]: arm for arm, c in SEEN_AS.items()}[lane[1][0]]
+    if lane[0] in RING and lane[1] in RING:
+        return f"ring-{where}"  # before the exit of that arm, or between its exit and its entry
+    return f"approach-{where}" if "e" in lane[1] else f"exit-{where}"
+
+
+@cache
+def road() -> Road:
+    """The roundabout. Its conflict zone is where the ego's way joins the ring."""
+    ego = ("own", "straight")
+    # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past it.
+    paths = {
+        ego: _path(*ego, "s", "n", 0),
+        ("own", "left"): _path("own", "left", "s", "w", 0),
+        ("left", "straight"): _path("left", "straight", "w", "e", 1),
+        ("left", "right"): _path("left", "right", "w", "s", 1),
+        ("oncoming", "straight"): _path("oncoming", "straight", "n", "e", 1),
+        ("oncoming", "right"): _path("oncoming", "right", "n", "s", 1),
+    }
+    meetings = crossings(paths, ego)
+    at = meetings["left", "straight"]
+    back_m = np.linspace(*SECTOR_REACH_M, 15)
+    watched = {
+        sector: np.array(
+            [paths[sector, "straight"].at(meetings[sector, "straight"].other_arc_m - b)[:2] for b in back_m]
+        )
+        for sector in SECTORS
+    }
+    return Road(
+        facts={"kind": "roundabout", "lane_width_m": LANE_WIDTH_M, "ring_m": RING_M, "ego": "/".join(ego)},
+        paths=paths,
+        ego=ego,
+        crossings=meetings,
+        zone_m=(at.x_m, at.y_m),
+        sectors=watched,
+        network=network,
+        ground=partial(ground, network()),
+    )
+
+
+def layout(seed: int, parameters: Parameters) -> Layout:
+    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    p, paths, meetings = parameters, road().paths, road().crossings
+
+    def draw(what: str) -> float:
+        return float(noise.uniforms((1,), NAME, seed, what)[0])
+
+    def between(what: str, bounds: tuple[float, float]) -> float:
+        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
+
+    def arm(what: str) -> str:
+        return SECTORS[int(draw(what) >= p.sector_shares[0])]
+
+    start, ring_mps = between("ego_start", p.ego_start_m), between("ring_speed", p.ring_mps)
+    spawns = [
+        Spawn("v1", "car", "ego", "own", "straight", road().zone_arc_m - start, p.ego_speed_mps),
+        Spawn("v2", "car", "helper", "oncoming", "right",
+              paths["oncoming", "right"].ends_m[-2] + between("helper_south", p.helper_south_m),
+              between("helper_south_speed", p.helper_mps)),
+        Spawn("v3", "car", "helper", "own", "left",
+              paths["own", "left"].ends_m[-2] + between("helper_west", p.helper_west_m),
+              between("helper_west_speed", p.helper_mps)),
+        Spawn("v4", "car", "helper", "own", "straight",
+              road().zone_arc_m + between("helper_ahead", p.helper_ahead_m),
+              between("helper_ahead_speed", p.helper_mps)),
+    ]  # fmt: skip
+
+    def car(what: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
+        """A car that is, or would be, where the ego enters so long after a cruising ego."""
+        late_s = between(f"{what}_offset", bounds)
+        back_m = ring_mps * (start / p.ego_speed_mps + late_s)
+        arc = meetings[sector, "straight"].other_arc_m - back_m
+        return Spawn(ids[what], "car", "other", sector, route, arc, ring_mps)
+
+    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
+    numbers = noise.generator(NAME, seed, "ids").permutation(3)
+    ids = {what: f"v{5 + int(n)}" for what, n in zip(("round", "before", "late"), numbers, strict=True)}
+    danger = arm("sector") if draw("danger") < p.danger_share else None
+    others = []
+    if danger:
+        others.append(car("round", danger, "straight", p.danger_offset_s))
+    elif draw("leaver") < p.leaver_share:
+        others.append(car("round", arm("sector"), "right", p.danger_offset_s))
+    if draw("before") < p.before_share:
+        others.append(car("before", arm("before_sector"), "right", p.before_offset_s))
+    if draw("late") < p.late_share:
+        others.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
+    spawns += sorted(others, key=lambda spawn: spawn.id)
+
+    half, mound = p.hedge_half_m, between("mound", p.mound_m)
+    hedge = -half, between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M
+    boxes = [hedge]
+    for degrees in (22.5, 45.0, 67.5):  # three boxes whose corners lie on a circle
+        x, y = mound * math.cos(math.radians(degrees)), mound * math.sin(math.radians(degrees))
+        boxes.append((-x, -y, x, y))
+    buildings = tuple(Building(f"b{n + 1}", *box) for n, box in enumerate(boxes))
+    return Layout(tuple(spawns), buildings, danger, ids["round"] if danger else None)
+
+
+def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+    """Whether the ego is past the first exit behind its entry."""
+    x, y = vehicles[0].position
+    return bool(x > 0 and math.atan2(y, x) < _ring_rad(1))
+
+
+SCENARIO = Scenario(
+    name=NAME,
+    description=__doc__,
+    actions=("SLOWER", "IDLE", "FASTER"),
+    parameters=Parameters(),
+    road=road,
+    layout=layout,
+    cleared=cleared,
+    words={"task": "enter a roundabout and go straight on", "hiding": "a hedge and a planted island"},
+)
