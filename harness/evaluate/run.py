@@ -123,7 +123,7 @@ def _frozen(
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     latency = _latency(spec, begun, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     begun = _begin(spec, out, begun, backend.identity(), latency)
-    with work.working(out, begun) as place:
+    with work.working(out, begun, "run.json") as place:
         asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", progress=progress, more=more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
@@ -140,7 +140,7 @@ def _closed_loop(
     # Engines are opened where they answer: a forked process has none of their threads.
     [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
     begun = _begin(spec, out, begun, identity, latency)
-    with work.working(out, begun) as place:
+    with work.working(out, begun, "run.json") as place:
         size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
         chunks = [range(at, min(at + size, source.episodes)) for at in range(0, source.episodes, size)]
         sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
