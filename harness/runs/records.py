@@ -4,6 +4,8 @@ from typing import Any, Literal
 
 from msgspec import Struct, field
 
+from harness.core.config import Seconds
+
 Role = Literal["ego", "helper", "merge"]
 
 
@@ -94,9 +96,9 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
     source: Literal["card", "paper", "declared", "measured"]
     basis: str
-    ego_s: float
-    helper_s: float
-    fusion_s: float
+    ego_s: Seconds
+    helper_s: Seconds
+    fusion_s: Seconds
     sample: dict[str, Times] = {}
 
 
@@ -277,6 +279,11 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
     episodes: int
     late_against: str
 
+    def __post_init__(self) -> None:
+        name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
+        if not isinstance(name, str) or not isinstance(parameters, dict):
+            raise ValueError("the scenario has no name, or no parameters")
+
 
 class Manifest(Struct, frozen=True, kw_only=True):
     """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
@@ -304,6 +311,21 @@ class Manifest(Struct, frozen=True, kw_only=True):
     engine_errors: int
     retries: int = 0
     versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        tables = {
+            "model": (self.model, "name", "engine"), "prompt": (self.prompt, "version", "sha256"),
+            **{f"conditions[{n}]": (point, "name") for n, point in enumerate(self.conditions)},
+        }  # fmt: skip
+        for where, (table, *keys) in tables.items():
+            if lacks := [key for key in keys if not isinstance(table.get(key), str)]:
+                raise ValueError(f"{where}.{lacks[0]} is no text")
+        if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
+            raise ValueError("conditions: a profile is no text")
+        names = tuple(point["name"] for point in self.conditions)
+        for what, several in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
+            if not 0 < len(several) == len(set(several)):
+                raise ValueError(f"{what}: none, or one twice")
 
     @property
     def variant(self) -> Variant:
