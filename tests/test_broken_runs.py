@@ -145,9 +145,10 @@ def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str
 @pytest.mark.parametrize(
     "values",
     [
-        {"world": "small"}, {"world": {}}, {"seeds": ["x"]}, {"seeds": [0, 0]}, {"actions": None}, {"actions": []},
-        {"conditions": []}, {"conditions": [{}]}, {"conditions": [{"name": "a", "profile": 3}]}, {"model": {}},
-        {"model": {"name": 3, "engine": "x"}}, {"prompt": {"version": "v2"}},
+        {"world": "small"}, {"world": {}}, {"seeds": ["x"]}, {"seeds": [0, 0]}, {"actions": None},
+        {"actions": []}, {"conditions": []}, {"conditions": [{}]}, {"model": {}},
+        {"prompt": {"version": "v2"}}, {"conditions": [{"name": "a", "profile": 3}]},
+        {"model": {"name": 3, "engine": "x"}},
     ],
 )  # fmt: skip
 def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) -> None:

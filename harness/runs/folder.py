@@ -141,7 +141,8 @@ class Run:
         if len(numbers) != world.episodes:
             raise ValueError(f"it has {len(numbers)} episodes, and run.json says {world.episodes}")
         if isinstance(world, ClosedLoop) and any(
-            e.episode not in range(world.episodes) or e.layout_seed != world.first_seed + e.episode
+            e.episode not in range(world.selection.get("of", world.episodes))
+            or e.layout_seed != world.first_seed + e.episode
             for e in episodes
         ):
             raise ValueError(f"a layout that is none of run.json's, whose first seed is {world.first_seed}")

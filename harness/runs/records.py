@@ -271,13 +271,17 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
     selection: dict[str, int | str] = {}
 
 
-class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True):
-    """A world that is simulated: episode e has layout seed `first_seed` + e."""
+class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True):
+    """A world that is simulated: episode e has layout seed `first_seed` + e.
+
+    Of so many `episodes`; where a sample was drawn, `selection` has how many it is `of`, and the draw.
+    """
 
     scenario: dict[str, Any]
     first_seed: int
     episodes: int
     late_against: str
+    selection: dict[str, int] = {}
 
     def __post_init__(self) -> None:
         name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
@@ -313,13 +317,12 @@ class Manifest(Struct, frozen=True, kw_only=True):
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        tables = {
-            "model": (self.model, "name", "engine"), "prompt": (self.prompt, "version", "sha256"),
-            **{f"conditions[{n}]": (point, "name") for n, point in enumerate(self.conditions)},
-        }  # fmt: skip
-        for where, (table, *keys) in tables.items():
+        for where, table, keys in (
+            ("model", self.model, ("name", "engine")), ("prompt", self.prompt, ("version", "sha256")),
+            *(("conditions", point, ("name",)) for point in self.conditions),
+        ):  # fmt: skip
             if lacks := [key for key in keys if not isinstance(table.get(key), str)]:
-                raise ValueError(f"{where}.{lacks[0]} is no text")
+                raise ValueError(f"{where}: {lacks[0]} is no text")
         if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
             raise ValueError("conditions: a profile is no text")
         names = tuple(point["name"] for point in self.conditions)

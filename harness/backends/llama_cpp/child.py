@@ -32,9 +32,9 @@ class _Died(Exception):
 class Child:
     """The backend that an opener returns, opened and asked in a child process.
 
-    Seconds are measured by the backend, where it is. One that stays stopped is killed. After a death what was under way is asked again
+    Seconds are measured by the backend, where it is. After a death what was under way is asked again
     together, as company may move an answer by rounding. If that kills the engine too, it is asked one at a
-    time, and the request that kills it then is a completion with an error.
+    time, and the request that kills it then is a completion with an error. One that stays stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
