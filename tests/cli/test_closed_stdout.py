@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from run_on_disk import made_up
@@ -13,7 +14,7 @@ SPEAK = (
 )  # fmt: skip
 
 
-def started(here: Path, command: tuple[str, ...], **out: object) -> "subprocess.Popen[str]":
+def started(here: Path, command: tuple[str, ...], **out: Any) -> "subprocess.Popen[str]":
     made_up(here / "run")
     return subprocess.Popen(
         [sys.executable, "-m", "harness", *command], cwd=here, text=True, stderr=subprocess.PIPE, **out
