@@ -25,7 +25,7 @@ from harness.studies.play import over_own_episodes
 
 SEEDS = 5  # of a set
 # Of the sweeps; other grid points have another's success, or lie between two of these.
-POINTS = {"size": (1, 2, 4, 8), "loss": (10, 40), "tau": (0.5, 0.8)}
+POINTS = {"size": (1, 2, 4, 8), "loss": (0.1, 0.4), "tau": (0.5, 0.8)}
 
 
 def main() -> None:

@@ -35,6 +35,8 @@ class Mortal:
             os.kill(os.getpid(), signal.SIGSEGV)
         if said == "die in company" and company > 1:
             os.kill(os.getpid(), signal.SIGKILL)
+        if said == "stop":
+            os.kill(os.getpid(), signal.SIGSTOP)
         if said == "exit":
             os._exit(3)
         if said == "dawdle":

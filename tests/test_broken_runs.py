@@ -1,7 +1,9 @@
 """A run that is broken, or of another version, is one line that names the file and what to do."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,9 @@ from run_on_disk import change, configure, made_up, rows_of
 
 import harness
 from harness.core.errors import UserError
+from harness.report.compare import text
+from harness.report.compare.difference import compare
+from harness.report.compare.pair import pair
 from harness.runs import folder
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -111,6 +116,7 @@ def test_a_wrong_table_of_decisions_says_what_is_wrong(
         (b'"ego"', b'"driver"', "role"),
         (b"[0.0,1.0,0.0]", b"[1.0]", "answer 00000-0/v1 has 1 probabilities"),
         (b'"status"', b'"state"', "status"),
+        (b'"v2"', b'"v1"', "an answer is there twice"),
     ],
 )
 def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, run: Path) -> None:
@@ -136,10 +142,79 @@ def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str
     assert said in refused(run, "episodes.csv")
 
 
-@pytest.mark.parametrize("values", [{"world": "small"}, {"seeds": ["x"]}, {"actions": None}, {"world": {}}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"world": "small"}, {"world": {}}, {"seeds": ["x"]}, {"seeds": [0, 0]}, {"actions": None},
+        {"actions": []}, {"conditions": []}, {"conditions": [{}]}, {"model": {}},
+        {"prompt": {"version": "v2"}}, {"conditions": [{"name": "a", "profile": 3}]},
+        {"model": {"name": 3, "engine": "x"}},
+    ],
+)  # fmt: skip
 def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) -> None:
     configure(run, **values)
     assert next(iter(values)) in refused(run, "run.json")
+
+
+WRONG = (None, -1, "x\x1b", [], {"a": 1})
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where each value of a JSON text stands."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in pairs:
+        yield (*at, key)
+        yield from places(inner, (*at, key))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed_loop", [False, True])
+def test_whatever_the_manifest_says_the_run_is_read_or_refused_in_a_line(
+    closed_loop: bool, tmp_path: Path
+) -> None:
+    """Each value of run.json gone or another: what is read can be compared."""
+    run = made_up(tmp_path / "run", closed_loop=closed_loop, episodes=1, steps=1)
+    stated = json.loads((run / "run.json").read_text())
+    compared = 0
+    for at in places(stated):
+        for wrong in ("gone", *WRONG):
+            changed = deepcopy(stated)
+            table = reduce(lambda table, key: table[key], at[:-1], changed)
+            if wrong == "gone":
+                del table[at[-1]]
+            else:
+                table[at[-1]] = wrong
+            (run / "run.json").write_text(json.dumps(changed))
+            try:
+                said = text.terminal(compare(pair(run, run)), [], 5)
+            except UserError as error:
+                said = str(error)
+            else:
+                compared += 1
+            assert said.replace("\n", "").isprintable()
+    assert compared > 50
+
+
+@pytest.mark.parametrize("episodes", [0, 1, 3, 5, 10**9])
+@pytest.mark.parametrize("closed_loop", [False, True])
+def test_another_number_of_episodes_is_refused(closed_loop: bool, episodes: int, tmp_path: Path) -> None:
+    run = made_up(tmp_path / "run", closed_loop=closed_loop)
+    world = json.loads((run / "run.json").read_text())["world"]
+    configure(run, world={**world, "episodes": episodes})
+    assert f"it has 4 episodes, and run.json says {episodes}" in refused(run, "episodes.csv")
+
+
+def test_a_first_seed_that_is_not_the_episodes_is_refused(tmp_path: Path) -> None:
+    run = made_up(tmp_path / "run", closed_loop=True)
+    world = json.loads((run / "run.json").read_text())["world"]
+    configure(run, world={**world, "first_seed": 7})
+    assert "a layout that is none of run.json's, whose first seed is 7" in refused(run, "episodes.csv")
+
+
+def test_a_summary_with_a_figure_twice_is_refused(run: Path) -> None:
+    with (run / "summary.csv").open("r+") as file:
+        file.write(file.readlines()[-1])
+    assert "a figure is there twice" in refused(run, "summary.csv")
 
 
 @pytest.mark.parametrize("old", ["swarmdrive-run/1", "swarmdrive-drive/1"])

@@ -1,6 +1,7 @@
 """A backend in a process of its own: really killed, and what becomes of the run."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -92,6 +93,34 @@ def test_an_engine_killed_while_idle_is_started_again(tmp_path: Path) -> None:
     child.close()
 
 
+def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.backends.llama_cpp.child.LOOK_S", 0.05)
+    child = mortal(tmp_path)
+    pid = child.call("pid")
+    os.kill(pid, signal.SIGSTOP)
+    assert [c.text for c in child.complete([ask("hello " * 200_000), ask("again")])][1] == "again"
+    assert child.call("pid") != pid
+    until_dead(pid)
+    stopped, last = child.complete([ask("stop", "a"), ask("last", "b")])
+    assert (stopped.error, last.text) == ("engine died: signal 9", "last")
+    child.close()
+
+
+def test_an_engine_that_is_stopped_for_a_moment_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.backends.llama_cpp.child.LOOK_S", 0.5)
+    child = mortal(tmp_path)
+    pid = child.call("pid")
+    os.kill(pid, signal.SIGSTOP)
+    os.kill(pid, signal.SIGCONT)
+    time.sleep(1.2)
+    assert (child.complete([ask("hello")])[0].text, child.call("pid")) == ("hello", pid)
+    child.close()
+
+
 def test_deaths_while_loading_are_tried_again_and_then_said(tmp_path: Path) -> None:
     child = mortal(tmp_path, deaths=LOADS - 1)
     assert born(tmp_path) == LOADS
@@ -169,6 +198,8 @@ def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Sign
     assert process.stdout is not None
     pid = int(process.stdout.readline())
     assert alive(pid)
+    [blocked] = re.findall(r"SigBlk:\s*(\w+)", Path(f"/proc/{pid}/status").read_text())
+    assert int(blocked, 16) >> (signal.SIGINT - 1) & 1
     if blow == signal.SIGINT:
         os.killpg(process.pid, blow)
     else:

@@ -104,8 +104,9 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     assert b'\\"idle\\"' in (out / "answers.jsonl").read_bytes()
 
 
-def test_damaged_answers_are_one_line(answers: bytes, small: Dataset, tmp_path: Path) -> None:
-    out = unfinished(spec_of(small), tmp_path / "run", b"[1\n" + answers)
+@pytest.mark.parametrize("line", [b"[1", b"\xff", b'{"scene": "\xae"}', b"[" * 100_000])
+def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Dataset, tmp_path: Path) -> None:
+    out = unfinished(spec_of(small), tmp_path / "run", line + b"\n" + answers)
     with pytest.raises(UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"):
         run(spec_of(small), out)
 

@@ -1,5 +1,7 @@
 """The transformers engine, played on a real tiny Qwen3 with random weights."""
 
+import os
+import pickle
 import shutil
 import socket
 from collections.abc import Callable
@@ -231,6 +233,25 @@ def grow_the_vocabulary(folder: Path) -> None:
     tokenizer = AutoTokenizer.from_pretrained(folder)
     tokenizer.add_tokens(["<boom>"])
     tokenizer.save_pretrained(folder)
+
+
+class Trap:
+    """Code in a pickle."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("caught",)
+
+
+def test_a_pickle_is_refused_in_one_line_and_runs_no_code(
+    tiny: Path, tmp_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    folder = shutil.copytree(tiny, tmp_path / "pickled")
+    remove("*.safetensors")(folder)
+    (folder / "pytorch_model.bin").write_bytes(pickle.dumps(Trap()))
+    code, out, err = harness("eval", "--model", folder, "--limit", 1, "--seeds", "0")
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert "does not load: Weights only load failed" in err
+    assert not list(tmp_path.rglob("caught"))
 
 
 @pytest.mark.parametrize(

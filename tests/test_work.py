@@ -75,6 +75,25 @@ def test_what_another_process_began_since_is_not_touched(tmp_path: Path) -> None
         pass
 
 
+def test_who_waited_until_another_had_finished_writes_nothing_over_it(tmp_path: Path) -> None:
+    with work.working(tmp_path, BEGUN, "run.json"):
+        (tmp_path / "run.json").write_text("finished")
+    with (
+        pytest.raises(UserError, match="being written by another process"),
+        work.working(tmp_path, BEGUN, "run.json"),
+    ):
+        (tmp_path / "run.json").write_text("again")
+    assert (tmp_path / "run.json").read_text() == "finished"
+
+
+def test_tidying_up_leaves_what_another_process_writes(tmp_path: Path) -> None:
+    left, written = (tmp_path / f".report.html.{pid}.part" for pid in (99998, 99999))
+    with work.working(tmp_path, BEGUN), alone(written):
+        left.write_text("half")
+        work.tidy(tmp_path)
+    assert list(tmp_path.iterdir()) == [written]
+
+
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "3", '{"settings": 3}', "{}", '{"settings": {"a": ' + "[" * 100_000, "\xff"]
 )

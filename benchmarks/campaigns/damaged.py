@@ -71,7 +71,8 @@ def made(here: Path) -> None:
     dataset(here / "small")
     seeds = ("--seeds", "0")
     assert typed("eval", "--dataset", here / "small", *seeds, "--out", here / "run").code == 0
-    assert typed("drive", "--episodes", 2, "--condition", "6g", *seeds, "--out", here / "driven").code == 0
+    drive = ("drive", "--episodes", 2, "--first-seed", 0, "--condition", "6g")
+    assert typed(*drive, *seeds, "--out", here / "driven").code == 0
     assert typed("init", here / "project").code == 0
     card = next((here / "project/models").glob("*.toml"))
     card.rename(card.with_stem("mine"))
@@ -138,6 +139,8 @@ def link(rng: random.Random, file: Path) -> str:
 
 def value(rng: random.Random, file: Path) -> str:
     """A value of another kind, or a key that is gone."""
+    if not file.stat().st_size:
+        return replaced(rng, file)
     if file.suffix in (".toml", ".csv"):
         lines = file.read_text().splitlines()
         at = rng.randrange(len(lines))

@@ -175,7 +175,7 @@ def writing(here: Path, out: Path) -> dict[str, tuple[object, ...]]:
     """The commands that write, to `out` or a file of that name, of a dataset and runs made first."""
     small, run, driven = dataset(here / "small", 1), here / "run", here / "driven"
     one = ("--dataset", small, "--seeds", "0")
-    drive = ("drive", "--episodes", 2, "--condition", "6g", "--seeds", "0", "--workers", 2)
+    drive = ("drive", "--episodes", 2, "--first-seed", 0, "--condition", "6g", "--seeds", "0", "--workers", 2)
     for ended in (typed("eval", *one, "--out", run), typed(*drive, "--out", driven)):
         if ended.code:
             sys.exit(ended.err)

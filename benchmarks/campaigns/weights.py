@@ -14,7 +14,7 @@ from judging import TESTS, Tally, dataset, typed, workshop
 
 from harness.training.gguf_export import export
 
-sys.path.insert(0, str(TESTS))
+sys.path.append(str(TESTS))
 import tiny_qwen3
 
 MARK = 1234.5  # in place of NaN while a GGUF file is exported, which refuses it

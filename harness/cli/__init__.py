@@ -74,6 +74,24 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 def main() -> None:
     """Entry point: what a user can mend is one line on stderr and exit code 2."""
+    out = sys.stdout
+    try:
+        try:
+            _typed()
+        finally:
+            out.flush()
+            if sys.stdout is not out:  # what typer does where a write finds nobody who reads
+                raise BrokenPipeError
+    except BrokenPipeError:  # as SIGPIPE ends a program: `| head` has left
+        sys.exit(141)
+    except OSError as error:
+        if error.errno not in MACHINE:
+            raise
+        where = f"{printable(error.filename)}: " if error.filename else ""
+        _fail(f"{where}{error.strerror}; mend that, and type the same command again")
+
+
+def _typed() -> None:
     signal.signal(signal.SIGTERM, _terminate)
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
     program = get_command(app)
@@ -94,11 +112,6 @@ def main() -> None:
                 f"the same command goes on: {printable(shlex.join(['harness', *sys.argv[1:]]), 2000)}"
             )
         _fail("; ".join(said), 143 if terminated else 130)
-    except OSError as error:
-        if error.errno not in MACHINE:
-            raise
-        where = f"{printable(error.filename)}: " if error.filename else ""
-        _fail(f"{where}{error.strerror}; mend that, and type the same command again")
     except _UsageError as error:
         message, context = error.format_message(), error.ctx
         if message.startswith("Usage:"):  # a group without a command shows its help

@@ -36,6 +36,8 @@ def command(
     ),
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
+    sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
+    sample_seed: int = typer.Option(0, help="Seed of the draw: those that eval draws of as many."),
     seeds: options.Seeds = "0:5",
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
@@ -71,15 +73,16 @@ def command(
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
-    options.in_range("--save-video", save_video, 0, episodes)
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
-    driven = scenarios.get(scenario)
+    source = LiveSource(first_seed, episodes, scenario, sample, sample_seed)
+    driven = len(source.numbers)
+    options.in_range("--save-video", save_video, 0, driven)
     spec = Spec(
         card=cards.resolve(model, engine),
-        prompt=versions.load(prompt or driven.prompt),
-        source=LiveSource(first_seed, episodes, scenario),
+        prompt=versions.load(prompt or source.scenario.prompt),
+        source=source,
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),
         thinking=thinking,
@@ -92,7 +95,7 @@ def command(
     )
     where = out or default_out(spec)
     silent = as_json or quiet
-    with bar(f"driving {printable(spec.card.name, 30)}", episodes, silent) as progress:
+    with bar(f"driving {printable(spec.card.name, 30)}", driven, silent) as progress:
         cache = None if no_cache else default_file()
         done = evaluate(spec, where, progress, cache, workers=workers)
     # They draw with matplotlib, which no episode waits for.
@@ -108,7 +111,8 @@ def command(
     if silent:
         return
     notes = (
-        f"n = {episodes} episodes × {len(spec.seeds)} channel seeds; {stated(first_seed, episodes)};\n"
+        f"n = {driven} episodes × {len(spec.seeds)} channel seeds; "
+        f"{'of ' if sample else ''}{stated(first_seed, episodes)};\n"
         "intervals over episodes; missed: decisions that outlast the window;\n"
         "gap: the least; clear: seconds to clear, where the ego did; both are means",
     )

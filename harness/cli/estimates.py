@@ -44,7 +44,11 @@ def console() -> "Console":
     """Plain text in 80 columns."""
     from rich.console import Console
 
-    return Console(width=WIDTH, markup=False, highlight=False)
+    class Plain(Console):
+        def on_broken_pipe(self) -> None:
+            raise  # to `main`, and not the end of the program here
+
+    return Plain(width=WIDTH, markup=False, highlight=False)
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], tight: bool = False) -> None:

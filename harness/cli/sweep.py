@@ -20,7 +20,7 @@ def command(
     runs: options.Runs,
     over: list[str] | None = typer.Option(
         None,
-        help="What varies: tau, loss (%), size (vehicles), latency (ms), window (ms), consensus, or any "
+        help="What varies: tau, loss (share), size (vehicles), latency (ms), window (ms), consensus, or any "
         "setting of an operating point by its name; repeatable. Default: the paper's panels.",
     ),
     grid: list[str] | None = typer.Option(

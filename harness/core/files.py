@@ -82,12 +82,10 @@ def digest(value: Any) -> str:
 def replacing(path: Path) -> Iterator[Path]:
     """A file to write to, which takes the place of `path` at the end; gone if that is not reached.
 
-    What killed processes left of such files goes as well: nobody holds them any more.
+    What killed processes left of such files goes as well.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(f".{escape(path.name)}.*.part"):
-        with suppress(OSError), alone(left):
-            left.unlink()
+    forget_halves(path.parent, escape(path.name))
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     part.unlink(missing_ok=True)  # a link, or of a process that had this number
     try:
@@ -98,6 +96,13 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def forget_halves(folder: Path, name: str = "*") -> None:
+    """Remove what killed processes left half written of the files of a name: nobody holds it any more."""
+    for left in folder.glob(f".{name}.*.part"):
+        with suppress(OSError), alone(left):
+            left.unlink()
 
 
 def write_whole(path: Path, data: str | bytes) -> None:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from harness.core.errors import UserError, printable
-from harness.core.files import alone, write_whole
+from harness.core.files import alone, forget_halves, write_whole
 from harness.core.formats import CONFIG, WORK
 
 LOCK = "lock"
@@ -45,7 +45,7 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
         if file.is_file():
             return msgspec.json.decode(file.read_bytes(), type=kind)
         others = out.is_dir() and any(path.name != WORK for path in out.iterdir())
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(file)} is damaged ({printable(error)}); delete --out {shown} and start again"
         ) from None
@@ -75,10 +75,11 @@ def held(out: Path) -> bool:
 
 
 @contextmanager
-def working(out: Path, begin: Begun) -> Iterator[Path]:
+def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
     """Hold the working folder, the one that was left or a new one that begins with this.
 
-    Where an error of the user's ends it before anything is done, what was made goes again.
+    Another process may have finished, and written the file named `last`, since this one looked: that is
+    refused. Where an error of the user's ends it before anything is done, what was made goes again.
     """
     work, made = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     try:
@@ -98,7 +99,7 @@ def working(out: Path, begin: Begun) -> Iterator[Path]:
                     if path.name != LOCK:
                         shutil.rmtree(path) if path.is_dir() else path.unlink()
                 write_whole(work / CONFIG, msgspec.json.encode(begin))
-            elif left != begin:
+            elif left != begin or (last and (out / last).exists()):
                 raise BlockingIOError
             yield work
     except BlockingIOError:
@@ -127,6 +128,4 @@ def tidy(out: Path) -> None:
     with suppress(OSError):  # first, so that nothing goes on with half of it
         os.unlink(out / WORK / CONFIG)
     shutil.rmtree(out / WORK, ignore_errors=True)
-    for part in out.glob(".*.part"):
-        with suppress(OSError):
-            os.unlink(part)
+    forget_halves(out)

@@ -101,7 +101,7 @@ def build(
         work.same(out, config, begun.settings)
     with work.working(out, begun or work.Begun(settings=config)) as place:
         manifest = _built(scenario, out, place, config, workers, progress, audits, more)
-    work.tidy(out)
+        work.tidy(out)
     return manifest
 
 

@@ -1,5 +1,6 @@
 """Which episodes of a dataset are evaluated."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from harness.core import noise
@@ -28,9 +29,8 @@ class Selection:
     sample_seed: int = 0
 
     def __post_init__(self) -> None:
-        for flag, value in (("--limit", self.limit), ("--sample", self.sample)):
-            if value is not None and value < 1:
-                raise UserError(f"{flag} {value}: give 1 or more episodes")
+        if self.limit is not None and self.limit < 1:
+            raise UserError(f"--limit {self.limit}: give 1 or more episodes")
 
     @property
     def given(self) -> dict[str, int | str]:
@@ -53,10 +53,7 @@ class Selection:
             of = {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
             numbers = [n for n in numbers if of[n] == self.danger]
         if self.sample is not None:
-            if self.sample > len(numbers):
-                raise UserError(f"--sample {self.sample}: there are {len(numbers)} episodes to draw from")
-            order = noise.generator("sample of episodes", self.sample_seed).random(max(dataset.episodes) + 1)
-            numbers = sorted(sorted(numbers, key=lambda n: order[n])[: self.sample])
+            numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
         if not numbers:
             shown = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
             raise UserError(f"{shown}: no episode of {printable(dataset.name)} is so; give others")
@@ -64,6 +61,14 @@ class Selection:
 
 
 ALL = Selection()
+
+
+def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
+    """Some of the episodes' numbers, all of which are below `end`. Raises UserError if there are too few."""
+    if not 1 <= sample <= len(numbers):
+        raise UserError(f"--sample {sample}: there are {len(numbers)} episodes to draw from; give 1 or more")
+    order = noise.generator("sample of episodes", seed).random(end)
+    return sorted(sorted(numbers, key=lambda n: order[n])[:sample])
 
 
 def _numbers(text: str, end: int) -> set[int]:

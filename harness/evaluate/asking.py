@@ -243,7 +243,7 @@ def read_kept(kept: Path) -> dict[str, Answer]:
             file.truncate(len(whole))
     try:
         answers = [_DECODER.decode(line) for line in whole.splitlines()]
-    except msgspec.MsgspecError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(kept)} is damaged ({printable(error)}); delete its folder and start again"
         ) from None

@@ -16,6 +16,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.freeze import moment
 from harness.dataset.load import Scene
+from harness.dataset.select import drawn
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.walk import Decided, Due, channel_draws
 from harness.runs import metrics
@@ -29,11 +30,16 @@ from harness.world.world import World
 
 @dataclass(frozen=True)
 class LiveSource:
-    """Layouts of a scenario that are driven: episode e has layout seed `first_seed` + e."""
+    """Layouts of a scenario that are driven: episode e has layout seed `first_seed` + e.
+
+    With a `sample` only so many of the episodes are: the same as `harness eval` draws of as many.
+    """
 
     first_seed: int
     episodes: int
     scenario_name: str = scenarios.DEFAULT
+    sample: int | None = None
+    sample_seed: int = 0
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
     command: ClassVar[str] = "drive"
@@ -42,6 +48,12 @@ class LiveSource:
     def scenario(self) -> Scenario:
         """What is driven."""
         return scenarios.get(self.scenario_name)
+
+    @cached_property
+    def numbers(self) -> Sequence[int]:
+        """Of the episodes that are driven. Raises UserError if there are fewer than the sample."""
+        every = range(self.episodes)
+        return every if self.sample is None else drawn(every, self.sample, self.sample_seed, self.episodes)
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -53,7 +65,10 @@ class LiveSource:
         parameters = asdict(self.scenario.parameters)
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
-            episodes=self.episodes, late_against="full-view driver, whose decisions act after decision_lag_s",
+            episodes=len(self.numbers),
+            late_against="full-view driver, whose decisions act after decision_lag_s",
+            selection={} if self.sample is None
+            else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
@@ -62,12 +77,14 @@ class LiveSource:
             ("--scenario", self.scenario_name),
             ("--episodes", self.episodes),
             ("--first-seed", self.first_seed),
+            ("--sample", self.sample),
+            ("--sample-seed", None if self.sample is None else self.sample_seed),
         ]
 
     def trial(self, most: int, ego_alone: bool) -> list[Scene]:
         """One decision point of each of some episodes, a while after its start."""
         scenes, p = [], self.scenario.parameters
-        for number in range(min(most, self.episodes)):
+        for number in self.numbers[:most]:
             trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
             trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
             scenes.append(look(trajectory, 0, ego_alone))

@@ -81,14 +81,15 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
         raise UserError(
             f"{printable(path)} was made by `harness eval`; give a folder made by `harness drive`"
         )
-    names, seeds, n = run.conditions, run.manifest.seeds, run.manifest.world.episodes
+    names, seeds, numbers = run.conditions, run.manifest.seeds, run.grid.episodes
     condition, seed = condition or names[-1], seeds[0] if seed is None else seed
     if condition not in names:
         raise unknown("condition", condition, names)
     if seed not in seeds:
         raise unknown("seed", str(seed), list(map(str, seeds)))
-    if not 0 <= episode < n:
-        raise UserError(f"episode {episode} is not in {printable(path)}; give 0 to {n - 1}")
+    if episode not in numbers:
+        listed = printable(", ".join(map(str, numbers)), 60)
+        raise UserError(f"episode {episode} is not in {printable(path)}; give one of {listed}")
     return played(run, episode, condition, seed)
 
 

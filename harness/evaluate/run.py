@@ -123,7 +123,7 @@ def _frozen(
     backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     latency = _latency(spec, begun, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     begun = _begin(spec, out, begun, backend.identity(), latency)
-    with work.working(out, begun) as place:
+    with work.working(out, begun, "run.json") as place:
         asked = cached(backend, spec.card, cache)
         asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", progress=progress, more=more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
@@ -140,9 +140,9 @@ def _closed_loop(
     # Engines are opened where they answer: a forked process has none of their threads.
     [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
     begun = _begin(spec, out, begun, identity, latency)
-    with work.working(out, begun) as place:
+    with work.working(out, begun, "run.json") as place:
         size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
-        chunks = [range(at, min(at + size, source.episodes)) for at in range(0, source.episodes, size)]
+        chunks = [source.numbers[at : at + size] for at in range(0, len(source.numbers), size)]
         sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
         drive = partial(_driven, spec, source.first_seed, latency, place, cache)
         parts = spread(drive, chunks, min(workers, len(chunks)), lambda done: progress(next(sizes)))
@@ -153,16 +153,16 @@ def _closed_loop(
                 [episode for _, episodes, _ in read for episode in episodes],
                 {answer.id: answer for _, _, answers in read for answer in answers},
             )
-            return _written(spec, out, begun, tuple(range(source.episodes)), walked, identity)
+            return _written(spec, out, begun, tuple(source.numbers), walked, identity)
 
 
 def _driven(
-    spec: Spec, first_seed: int, latency: Latency, place: Path, cache: Path | None, chunk: range
+    spec: Spec, first_seed: int, latency: Latency, place: Path, cache: Path | None, chunk: Sequence[int]
 ) -> Path:
     """Drive a chunk, unless a killed run did."""
     from harness.evaluate.live_world import LiveWorld
 
-    part = place / f"episodes-{chunk.start:06d}"
+    part = place / f"episodes-{chunk[0]:06d}"
     if not part.is_dir():
         asker = Asker(
             spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency

@@ -208,6 +208,15 @@ def uneven(runs: Runs) -> str | None:
     )
 
 
+def figures(found: Sequence[Line]) -> list[dict[str, str]]:
+    """The best run's success under each condition, with what it is and its interval."""
+    bests = [(line, success) for line in found if line.mark == BEST and (success := line.scores[SUCCESS])]
+    return [
+        {"what": f"success with {line.condition}, best: {line.name}", **shown(success)}
+        for line, success in bests
+    ]
+
+
 def headline(found: Sequence[Line]) -> str:
     """What came out of several runs: under each condition the best, and which cannot be told from it."""
     outcomes = []

@@ -89,7 +89,7 @@ def render(
         unread=len(unread),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
-        key_figures=words.figures(runs.runs[0]) if alone else [],
+        key_figures=words.figures(runs.runs[0]) if alone else matrix.figures(lines),
         palette=Markup(colours.variables()),
         actions=_actions(runs),
         lines=lines,

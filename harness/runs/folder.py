@@ -28,7 +28,7 @@ from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid, World
-from harness.runs.records import Answer, Episode, FrozenScenes, Manifest, Score, Variant
+from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Manifest, Score, Variant
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -87,7 +87,7 @@ class Run:
     @cached_property
     def scores(self) -> tuple[Score, ...]:
         """`summary.csv`."""
-        return self._read("summary.csv", lambda file: _records(file, Score))
+        return self._read("summary.csv", self._scores)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -128,9 +128,24 @@ class Run:
         ]
         return min(candidates, key=lambda s: s.interval != "episodes", default=None)
 
+    def _scores(self, file: Path) -> tuple[Score, ...]:
+        scores = _records(file, Score)
+        if len({(s.condition, s.metric, s.interval) for s in scores}) < len(scores):
+            raise ValueError("a figure is there twice")
+        return scores
+
     def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
         episodes = _records(file, Episode)
         numbers = tuple(dict.fromkeys(episode.episode for episode in episodes))
+        world = self.manifest.world
+        if len(numbers) != world.episodes:
+            raise ValueError(f"it has {len(numbers)} episodes, and run.json says {world.episodes}")
+        if isinstance(world, ClosedLoop) and any(
+            e.episode not in range(world.selection.get("of", world.episodes))
+            or e.layout_seed != world.first_seed + e.episode
+            for e in episodes
+        ):
+            raise ValueError(f"a layout that is none of run.json's, whose first seed is {world.first_seed}")
         grid = Grid(self.conditions, self.manifest.seeds, numbers)
         return grid, tuple(grid.ordered(episodes))
 
@@ -275,6 +290,8 @@ def _answers(file: Path, actions: int) -> list[Answer]:
     for answer in answers:
         if answer.intent is not None and len(answer.intent) != actions:
             raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
+    if len({answer.id for answer in answers}) < len(answers):
+        raise ValueError("an answer is there twice")
     return answers
 
 

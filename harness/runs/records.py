@@ -4,6 +4,8 @@ from typing import Any, Literal
 
 from msgspec import Struct, field
 
+from harness.core.config import Seconds
+
 Role = Literal["ego", "helper", "merge"]
 
 
@@ -94,9 +96,9 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
     source: Literal["card", "paper", "declared", "measured"]
     basis: str
-    ego_s: float
-    helper_s: float
-    fusion_s: float
+    ego_s: Seconds
+    helper_s: Seconds
+    fusion_s: Seconds
     sample: dict[str, Times] = {}
 
 
@@ -269,13 +271,22 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
     selection: dict[str, int | str] = {}
 
 
-class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True):
-    """A world that is simulated: episode e has layout seed `first_seed` + e."""
+class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True):
+    """A world that is simulated: episode e has layout seed `first_seed` + e.
+
+    Of so many `episodes`; where a sample was drawn, `selection` has how many it is `of`, and the draw.
+    """
 
     scenario: dict[str, Any]
     first_seed: int
     episodes: int
     late_against: str
+    selection: dict[str, int] = {}
+
+    def __post_init__(self) -> None:
+        name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
+        if not isinstance(name, str) or not isinstance(parameters, dict):
+            raise ValueError("the scenario has no name, or no parameters")
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
@@ -304,6 +315,20 @@ class Manifest(Struct, frozen=True, kw_only=True):
     engine_errors: int
     retries: int = 0
     versions: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for where, table, keys in (
+            ("model", self.model, ("name", "engine")), ("prompt", self.prompt, ("version", "sha256")),
+            *(("conditions", point, ("name",)) for point in self.conditions),
+        ):  # fmt: skip
+            if lacks := [key for key in keys if not isinstance(table.get(key), str)]:
+                raise ValueError(f"{where}: {lacks[0]} is no text")
+        if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
+            raise ValueError("conditions: a profile is no text")
+        names = tuple(point["name"] for point in self.conditions)
+        for what, several in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
+            if not 0 < len(several) == len(set(several)):
+                raise ValueError(f"{what}: none, or one twice")
 
     @property
     def variant(self) -> Variant:

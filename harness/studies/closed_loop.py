@@ -34,7 +34,7 @@ def panels() -> dict[str, list[Setting]]:
     losses = density_coupled_loss(np.arange(1, VEHICLES + 1))
     changes = (
         *(("size", n, n, f"max_helpers={n - 1},loss={loss:g}") for n, loss in enumerate(losses, 1)),
-        *(("loss", VEHICLES, v, f"loss={float(v) / 100:g}") for v in grid(AXES["loss"])),
+        *(("loss", VEHICLES, v, f"loss={v:g}") for v in grid(AXES["loss"])),
         *(("tau", VEHICLES, v, f"tau_nats={v:g}") for v in grid(AXES["tau"])),
     )
     settings = {CORE: [Setting(name, point, VEHICLES) for name, point in POINTS.items()]}

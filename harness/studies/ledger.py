@@ -99,8 +99,7 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
     elif value.startswith(FROM):
         s = s[s.value.astype(float) >= float(value.removeprefix(FROM)) - 1e-9]
     elif value:
-        at = float(value) * (100 if row["variable"] == "loss" else 1)
-        s = s[abs(s.value.astype(float) - at) < 1e-9]
+        s = s[abs(s.value.astype(float) - float(value)) < 1e-9]
     return [{str(k): v for k, v in record.items()} for record in s.to_dict("records")]
 
 

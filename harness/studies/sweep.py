@@ -112,6 +112,7 @@ def run_sweep(
     page = environment(TEMPLATES).get_template("sweep.html.j2").render(
         pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
         tables=tables(whole.summary), seeds=seeds,
+        title=f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
     )  # fmt: skip
     write_whole(out / "index.html", page)
     return whole.summary

@@ -54,7 +54,7 @@ def distill(
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.Begun(settings=settings)) as place:
         facts = _trained(dataset, Student(dataset, prompts, plan, place, device), out, progress)
-    work.tidy(out)
+        work.tidy(out)
     return facts
 
 

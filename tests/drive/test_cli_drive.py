@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from harness.runs import folder
+
 
 def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     options = ("--condition", "all", "--episodes", 2, "--first-seed", 5, "--seeds", "0:2", "--workers", 1)
@@ -24,9 +26,32 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert success in (0.0, 0.5, 1.0)
 
 
+def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(harness, tmp_path, small_path):
+    draw = ("--sample", 2, "--sample-seed", 3, "--seeds", "0:1")
+    layouts = json.loads((small_path / "manifest.json").read_text())
+    of = ("--episodes", layouts["episodes"], "--first-seed", layouts["seed"])
+    run = tmp_path / "run"
+    code, out, err = harness("drive", *draw, *of, "--condition", "6g", "--workers", 2, "--out", run)
+    assert (code, err) == (0, "")
+    assert f"n = 2 episodes × 1 channel seeds; of layout seeds {layouts['seed']} to" in out
+    assert (
+        harness("eval", "--dataset", small_path, *draw, "--condition", "6g", "--out", tmp_path / "frozen")[0]
+        == 0
+    )
+    driven, frozen = (folder.read(path) for path in (run, tmp_path / "frozen"))
+    assert driven.grid.episodes == frozen.grid.episodes
+    assert [e.layout_seed for e in driven.episodes] == [e.layout_seed for e in frozen.episodes]
+    assert " --sample 2 --sample-seed 3 " in driven.manifest.command
+    assert harness("fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0] == 0
+    code, _, err = harness("drive", *draw, *of, "--condition", "6g", "--sample-seed", 4, "--out", run)
+    assert (code, "already holds a finished run" in err) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        ("--episodes 3 --sample 4", "--sample 4: there are 3 episodes to draw from"),
+        ("--sample 0", "give 1 or more"),
         ("--episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
         ("--first-seed -1", "--first-seed -1 is out of range"),
         ("--workers 0", "--workers 0 is out of range; give 1 to 256"),

@@ -115,7 +115,7 @@ def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, cap
 
 def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
     for arguments, says in (
-        ((out, 3, None, None), "give 0 to 2"),
+        ((out, 3, None, None), "episode 3 is not in .*; give one of 0, 1, 2$"),
         ((out, 0, "5g", None), "unknown condition '5g'"),
         ((out, 0, None, 9), "unknown seed '9'"),
         ((tmp_path, 0, None, None), "is no finished run.* or `harness drive`"),

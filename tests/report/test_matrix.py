@@ -16,7 +16,9 @@ from harness.report import matrix, statistics
 from harness.report.charts import statuses
 from harness.report.page import render
 from harness.report.runs import gather
+from harness.report.words import shown
 from harness.runs.folder import read
+from harness.runs.metrics import SUCCESS
 
 
 def marked(*ended):
@@ -107,7 +109,14 @@ def test_a_run_has_a_line_under_each_condition_and_a_place_in_each_grid(both):
 def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     lines = matrix.lines(both)
     assert matrix.headline(lines).startswith("Best under single-local: ")
+    best = [line for line in lines if line.mark == matrix.BEST]
+    assert [(f["what"], f["value"]) for f in matrix.figures(lines)] == [
+        (f"success with {line.condition}, best: {line.name}", shown(line.scores[SUCCESS])["value"])
+        for line in best
+    ]
+    assert len(best) == len(both.conditions)
     bare = [replace(line, mark="", behind=None) for line in lines]
+    assert matrix.figures(bare) == []
     assert "6g: none, as each is behind another run" in matrix.headline(bare)
 
 

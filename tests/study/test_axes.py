@@ -42,7 +42,7 @@ def test_every_axis_has_a_usual_grid_that_its_point_allows() -> None:
 
 def test_values_take_the_axis_unit() -> None:
     point = POINTS["6g"]
-    assert AXES["loss"].at(point, 10.0).loss == pytest.approx(0.1)
+    assert AXES["loss"].at(point, 0.1).loss == pytest.approx(0.1)
     assert AXES["window"].at(point, 250.0).window_s == pytest.approx(0.25)
     assert AXES["latency"].at(point, 25.0).latency_s == pytest.approx(0.025)
     assert AXES["consensus"].at(point, "median").consensus == "median"

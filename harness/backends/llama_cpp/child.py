@@ -3,15 +3,18 @@
 The process is spawned, so that it has only what its opener loads. Messages are pickled through a pipe.
 """
 
+import os
 import signal
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from operator import attrgetter
+from threading import Thread
 from typing import Any
 
 from harness.backends.base import Completion, Request
@@ -19,6 +22,7 @@ from harness.core.errors import UserError, printable
 from harness.core.parallel import end_with_parent
 
 LOADS = 3  # deaths in a row, while it loads, before we give up
+LOOK_S = 10.0  # between two looks at whether it is stopped
 
 
 class _Died(Exception):
@@ -30,7 +34,7 @@ class Child:
 
     Seconds are measured by the backend, where it is. After a death what was under way is asked again
     together, as company may move an answer by rounding. If that kills the engine too, it is asked one at a
-    time, and the request that kills it then is a completion with an error.
+    time, and the request that kills it then is a completion with an error. One that stays stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
@@ -104,6 +108,7 @@ class Child:
             with _uninterrupted():
                 process.start()
             theirs.close()  # else its death would not close the pipe
+            Thread(target=_watch, args=(process.pid,), daemon=True).start()
             self._running = process, ours
             try:
                 self._receive()
@@ -144,6 +149,18 @@ class Child:
         return value
 
 
+def _watch(pid: int) -> None:
+    """End a process that is found stopped twice in a row: who waits for its answer would wait for ever."""
+    before = False
+    with suppress(ChildProcessError, AttributeError):  # it is gone; or Windows, which stops none
+        while True:
+            time.sleep(LOOK_S)
+            stopped = os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+            if stopped and before:
+                os.kill(pid, signal.SIGKILL)
+            before = stopped
+
+
 def _serve(pipe: Connection, opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
     """Open a backend and answer until the parent is gone. Runs in the child."""
     end_with_parent()
@@ -180,6 +197,7 @@ def _uninterrupted() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    resource_tracker.ensure_running()  # the first start would start it, which unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

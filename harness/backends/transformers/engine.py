@@ -5,6 +5,7 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
+from warnings import catch_warnings, simplefilter
 
 from harness.backends.cards import Card, Dtype
 from harness.backends.chat import Chat
@@ -48,10 +49,12 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     # trust_remote_code=False: else a checkpoint with code of its own asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
     try:
-        tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
-        model, report = transformers.AutoModelForCausalLM.from_pretrained(
-            where, dtype=dtype, output_loading_info=True, **options
-        )
+        with catch_warnings():
+            simplefilter("ignore")  # torch's of a pickle: what is wrong with it is said below
+            tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
+            model, report = transformers.AutoModelForCausalLM.from_pretrained(
+                where, dtype=dtype, output_loading_info=True, **options
+            )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
         reason = printable(" ".join(str(error).split()), 200)
         raise UserError(
