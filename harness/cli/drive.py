@@ -62,7 +62,6 @@ def command(
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
-    from harness.world import scenarios
 
     if condition and ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
