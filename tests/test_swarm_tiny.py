@@ -33,7 +33,7 @@ def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluate
 def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
     said = [answer.verdict for answer in answers_of(done.out)]
     assert len(said) > 1000
-    assert said.count("strict") >= 0.95 * len(said)
+    assert said.count("strict") >= 0.98 * len(said)
 
 
 def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
