@@ -3,6 +3,7 @@
 import json
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import one_way_crossing
@@ -48,9 +49,10 @@ def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(scenario: Sc
     p = scenario.parameters
     if not hasattr(p, "danger_share"):
         pytest.skip("no dial for dangers")
+    safe: dict[str, Any] = {"danger_share": 0.0}
     for seed in range(40):
         found = scenario.layout(seed, p)
-        without = scenario.layout(seed, replace(p, danger_share=0.0))
+        without = scenario.layout(seed, replace(p, **safe))
         rest = [{s for s in of.spawns if s.id != found.danger_id} for of in (found, without)]
         assert (rest[0], found.buildings) == (rest[1], without.buildings)
 

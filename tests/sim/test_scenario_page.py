@@ -3,19 +3,28 @@
 from dataclasses import asdict
 from pathlib import Path
 
+import pytest
+
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
+from harness.world import scenarios
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
-PAGE = (Path(__file__).parents[2] / "docs/scenarios/occluded-intersection.md").read_text()
+PAGES = Path(__file__).parents[2] / "docs/scenarios"
+PAGE = (PAGES / f"{SCENARIO.name}.md").read_text()
+TABLED = sorted(page.stem for page in PAGES.glob("*.md") if "## Parameters" in page.read_text())
 
 
-def test_the_pages_table_has_every_parameter_with_its_value():
-    rows = dict(line.strip("| ").split(" | ")[:2] for line in PAGE.splitlines() if line.count(" | ") == 2)
+@pytest.mark.parametrize("name", TABLED)
+def test_the_pages_table_has_every_parameter_with_its_value(name):
+    """The first page has those of every scenario too; the others their own."""
+    page, parameters = (PAGES / f"{name}.md").read_text(), scenarios.get(name).parameters
+    rows = dict(line.strip("| ").split(" | ")[:2] for line in page.splitlines() if line.count(" | ") == 2)
     stated = {name.strip("`"): value for name, value in rows.items() if name.startswith("`")}
     values = {
         name: ", ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}"
-        for name, value in asdict(SCENARIO.parameters).items()
+        for name, value in asdict(parameters).items()
+        if name in type(parameters).__annotations__ or page == PAGE
     }
     assert stated == values
 
