@@ -111,8 +111,8 @@ class Spec:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
         if self.prompt.version in OF_A_CROSSING and self.scenario.prompt not in OF_A_CROSSING:
             raise UserError(
-                f"--prompt {self.prompt.version} speaks of a crossing, which {self.scenario.name} is not; give "
-                f"{self.scenario.prompt}, or one of your own"
+                f"--prompt {self.prompt.version} speaks of a crossing, which {self.scenario.name} is not; "
+                f"give {self.scenario.prompt}, or one of your own"
             )
         can = capabilities(self.card.engine)
         if self.source.kind == "closed-loop" and not can.closed_loop:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+from harness.core import noise
 from harness.core.errors import UserError
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
@@ -91,6 +92,30 @@ class Parameters:
 BEACON_DIALS = tuple(
     field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_"))
 )
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws of one layout: every quantity has one of its own, so one dial does not move another's."""
+
+    scenario: str
+    seed: int
+
+    def share(self, what: str) -> float:
+        """Uniform in [0, 1)."""
+        return float(noise.uniforms((1,), self.scenario, self.seed, what)[0])
+
+    def between(self, what: str, bounds: tuple[float, float]) -> float:
+        """Uniform between two bounds."""
+        return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
+
+    def numbers(self, count: int) -> list[int]:
+        """Numbers of vehicles in an order that says nothing of them.
+
+        Each has one whether it is there or not: a gap between two ids tells nothing.
+        """
+        order: list[int] = noise.generator(self.scenario, self.seed, "ids").permutation(count).tolist()
+        return order
 
 
 @dataclass(frozen=True)

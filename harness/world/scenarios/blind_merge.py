@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import Building
 
@@ -128,48 +127,44 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p, (at,) = parameters, road().crossings.values()
 
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
-
-    start = between("ego_start", p.ego_start_m)
+    start = draws.between("ego_start", p.ego_start_m)
 
     def back_m(speed: float, late_s: float) -> float:
         """Arc length on the main road from which one is beside the merge so long after a cruising ego."""
         return at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
 
-    truck = back_m(speed := between("truck_speed", p.truck_mps), between("truck_offset", p.truck_offset_s))
+    truck = back_m(
+        speed := draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
+    )
     spawns = [
         Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps),
         Spawn("v2", "truck", "helper", "main left", "straight", truck, speed),
     ]
     for id_, approach in (("v3", "main"), ("v4", "main left")):
-        arc = at.other_arc_m + between(f"{id_}_ahead", p.ahead_m)
-        speed = between(f"{id_}_speed", p.ahead_mps)
+        arc = at.other_arc_m + draws.between(f"{id_}_ahead", p.ahead_m)
+        speed = draws.between(f"{id_}_speed", p.ahead_mps)
         spawns.append(Spawn(id_, "car", "helper", approach, "straight", arc, speed))
-    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
     cars = {
         "danger": ("main", p.danger_share, p.danger_offset_s),
         "left": ("main left", p.left_share, p.danger_offset_s),
         "before": ("main", p.before_share, p.before_offset_s),
         "late": ("main", p.late_share, p.late_offset_s),
     }
-    numbers = noise.generator(NAME, seed, "ids").permutation(len(cars))
+    numbers = draws.numbers(len(cars))
     ids = {what: f"v{5 + int(number)}" for what, number in zip(cars, numbers, strict=True)}
     others = []
     for what, (approach, share, offset_s) in cars.items():
-        if draw(what) < share:
-            speed = between(f"{what}_speed", p.main_mps)
-            arc = back_m(speed, between(f"{what}_offset", offset_s))
+        if draws.share(what) < share:
+            speed = draws.between(f"{what}_speed", p.main_mps)
+            arc = back_m(speed, draws.between(f"{what}_offset", offset_s))
             others.append(Spawn(ids[what], "car", "other", approach, "straight", arc, speed))
     spawns += sorted(others, key=lambda spawn: spawn.id)
 
-    wall = Building("b1", BEGIN_M, WALL_M[0], -between("wall_end", p.wall_end_m), WALL_M[1])
+    wall = Building("b1", BEGIN_M, WALL_M[0], -draws.between("wall_end", p.wall_end_m), WALL_M[1])
     danger_id = ids["danger"] if any(spawn.id == ids["danger"] for spawn in others) else None
     return Layout(tuple(spawns), (wall,), "main" if danger_id else None, danger_id)
 

@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.world.road import Path, PathKey, Road, ground
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind
 
@@ -112,40 +111,34 @@ def network() -> Any:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p = parameters
-
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
 
     def own(id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps) -> Spawn:
         return Spawn(id_, kind, part, "own", OWN, arc_m, speed_mps)
 
-    ego = -BEGIN_M - between("ego_start", p.ego_start_m)
-    truck = ego + (CAR + TRUCK) / 2 + between("gap", p.gap_m)
-    leader = truck + (CAR + TRUCK) / 2 + between("leader", p.leader_m)
+    ego = -BEGIN_M - draws.between("ego_start", p.ego_start_m)
+    truck = ego + (CAR + TRUCK) / 2 + draws.between("gap", p.gap_m)
+    leader = truck + (CAR + TRUCK) / 2 + draws.between("leader", p.leader_m)
     spawns = [
         own("v1", "car", "ego", ego),
         own("v2", "truck", "helper", truck),
-        own("v3", "car", "helper", leader, between("leader_mps", p.leader_mps)),
-        own("v4", "car", "helper", ego - CAR - between("follower", p.follower_m)),
+        own("v3", "car", "helper", leader, draws.between("leader_mps", p.leader_mps)),
+        own("v4", "car", "helper", ego - CAR - draws.between("follower", p.follower_m)),
     ]
 
     def oncoming(id_: str, after_s: float) -> Spawn:
-        speed = between(f"{id_} speed", p.oncoming_mps)
+        speed = draws.between(f"{id_} speed", p.oncoming_mps)
         arc = END_M - BEGIN_M - ego - speed * after_s
         return Spawn(id_, "car", "other", "oncoming", "straight", arc, speed)
 
-    # Both have a number whether they are there or not: a gap between two ids tells nothing.
-    numbers = noise.generator(NAME, seed, "ids").permutation(2)
+    numbers = draws.numbers(2)
     danger_id, late_id = (f"v{5 + int(n)}" for n in numbers)
-    danger = draw("danger") < p.danger_share
-    others = [oncoming(danger_id, between("danger_s", p.danger_s))] if danger else []
-    if draw("late") < p.late_share:
-        others.append(oncoming(late_id, between("late_s", p.late_s)))
+    danger = draws.share("danger") < p.danger_share
+    others = [oncoming(danger_id, draws.between("danger_s", p.danger_s))] if danger else []
+    if draws.share("late") < p.late_share:
+        others.append(oncoming(late_id, draws.between("late_s", p.late_s)))
     spawns += sorted(others, key=lambda spawn: spawn.id)
     return Layout(tuple(spawns), (), "oncoming" if danger else None, danger_id if danger else None)
 

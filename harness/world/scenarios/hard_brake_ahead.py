@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.world.road import Path, PathKey, Road, ground
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind
 
@@ -109,28 +108,23 @@ def network() -> Any:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p = parameters
-
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
 
     def spawn(id_: str, kind: Kind, part: Any, lane: str, arc_m: float, *brakes: float) -> Spawn:
         return Spawn(id_, kind, part, "own", lane, arc_m, p.speed_mps, *brakes)
 
     car, van = SIZES_M["car"][0], SIZES_M["van"][0]
-    ego = ZONE_M - BEGIN_M - between("ego_start", p.ego_start_m)
-    before = ego + (car + van) / 2 + p.speed_mps * between("headway", p.headway_s)
-    lead = before + (car + van) / 2 + p.speed_mps * between("lead_headway", p.lead_headway_s)
-    danger = draw("danger") < p.danger_share
-    slows = draw("slow") < p.slow_share
-    brakes = between("brakes_at", p.brakes_at_s), between("brakes", p.brakes_mps2)
-    eases = between("slows_at", p.slows_at_s), 2.0, between("slows_to", p.slows_to_mps)
+    ego = ZONE_M - BEGIN_M - draws.between("ego_start", p.ego_start_m)
+    before = ego + (car + van) / 2 + p.speed_mps * draws.between("headway", p.headway_s)
+    lead = before + (car + van) / 2 + p.speed_mps * draws.between("lead_headway", p.lead_headway_s)
+    danger = draws.share("danger") < p.danger_share
+    slows = draws.share("slow") < p.slow_share
+    brakes = draws.between("brakes_at", p.brakes_at_s), draws.between("brakes", p.brakes_mps2)
+    eases = draws.between("slows_at", p.slows_at_s), 2.0, draws.between("slows_to", p.slows_to_mps)
     beside, front, slow = (
-        ego + between(what, bounds)
+        ego + draws.between(what, bounds)
         for what, bounds in (("beside", p.beside_m), ("front", p.front_m), ("slow_m", p.slow_m))
     )
     spawns = (

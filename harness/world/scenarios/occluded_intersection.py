@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Building, Kind
 
@@ -73,21 +72,16 @@ class Parameters(Common):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p, paths, crossings = parameters, road().paths, road().crossings
 
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
-
     danger = None
-    if draw("danger") < p.danger_share:
-        drawn = int(np.searchsorted(np.cumsum(p.sector_shares)[:2], draw("sector")))
+    if draws.share("danger") < p.danger_share:
+        drawn = int(np.searchsorted(np.cumsum(p.sector_shares)[:2], draws.share("sector")))
         danger = SECTORS[drawn]
 
-    start = between("ego_start", p.ego_start_m)
+    start = draws.between("ego_start", p.ego_start_m)
     # The centroid of the conflict zone lies 1.46 m before the ego's farthest conflict point.
     ego_arc = crossings["right", "straight"].ego_arc_m - 1.46 - start
 
@@ -96,38 +90,37 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         at = crossings[approach, ROUTES[approach]]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
-    truck_speed = between("truck_speed", p.truck_speed_mps)
-    truck_arc = timed("oncoming", truck_speed, between("truck_offset", p.truck_offset_s))
+    truck_speed = draws.between("truck_speed", p.truck_speed_mps)
+    truck_arc = timed("oncoming", truck_speed, draws.between("truck_offset", p.truck_offset_s))
     others: dict[str, tuple[Kind, str, str, float, float]] = {
         "truck": ("truck", "oncoming", "straight", truck_arc, truck_speed)
     }
     if danger == "oncoming":
-        arc = truck_arc - between("follow", p.follow_m)
+        arc = truck_arc - draws.between("follow", p.follow_m)
         others["danger"] = ("car", danger, ROUTES[danger], arc, truck_speed)
     elif danger:
-        speed = between("crossing_speed", p.crossing_speed_mps)
+        speed = draws.between("crossing_speed", p.crossing_speed_mps)
         ego_s = (crossings[danger, ROUTES[danger]].ego_arc_m - ego_arc) / p.ego_speed_mps
         soonest, latest = p.danger_offset_s
         soonest = max(soonest, behind_truck_s(danger, speed, truck_arc, truck_speed) - ego_s)
-        offset = between("danger_offset", (soonest, max(soonest, latest)))
+        offset = draws.between("danger_offset", (soonest, max(soonest, latest)))
         others["danger"] = ("car", danger, ROUTES[danger], timed(danger, speed, offset), speed)
-    if draw("late") < p.late_share:
-        arm = SECTORS[int(draw("late_sector") * len(SECTORS))]
-        speed = between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
-        arc = timed(arm, speed, between("late_offset", p.late_offset_s))
+    if draws.share("late") < p.late_share:
+        arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
+        speed = draws.between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
+        arc = timed(arm, speed, draws.between("late_offset", p.late_offset_s))
         others["late"] = ("car", arm, ROUTES[arm], arc, speed)
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
     for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
         arc = paths[approach, "straight"].ends_m[1]
-        arc += between(f"helper_start_{exit_name}", p.helper_start_m)
+        arc += draws.between(f"helper_start_{exit_name}", p.helper_start_m)
         if exit_name == "ahead":
             arc += 4.0  # stays clear of the ego that follows it out of the junction
-        speed = between(f"helper_speed_{exit_name}", p.helper_speed_mps)
+        speed = draws.between(f"helper_speed_{exit_name}", p.helper_speed_mps)
         spawns.append(Spawn(f"v{n + 2}", "car", "helper", approach, "straight", arc, speed))
 
-    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
-    numbers = noise.generator(NAME, seed, "ids").permutation(3)
+    numbers = draws.numbers(3)
     roles = ("danger", "truck", "late")
     ids = {role: f"v{5 + int(number)}" for role, number in zip(roles, numbers, strict=True)}
     for name in sorted(others, key=ids.__getitem__):
@@ -136,8 +129,8 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
     buildings = []
     for n, (east, south) in enumerate(((-1, 1), (1, 1), (-1, -1), (1, -1))):
-        xs = sorted((east * between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
-        ys = sorted((south * between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
+        xs = sorted((east * draws.between(f"corner_{n}_x", p.corner_m), east * BUILDING_END_M))
+        ys = sorted((south * draws.between(f"corner_{n}_y", p.corner_m), south * BUILDING_END_M))
         buildings.append(Building(f"b{n + 1}", xs[0], ys[0], xs[1], ys[1]))
     return Layout(tuple(spawns), tuple(buildings), danger, ids["danger"] if danger else None)
 

@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind, Part
 
@@ -135,54 +134,54 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p, (at,) = parameters, road().crossings.values()
 
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
-
-    start = OUT_M - PULL_OUT_M - between("ego_start", p.ego_start_m)
+    start = OUT_M - PULL_OUT_M - draws.between("ego_start", p.ego_start_m)
     ego = start - BEGIN_M
-    rear = start - SIZES_M["car"][0] / 2 - between("behind", p.behind_m) - VAN / 2
+    rear = start - SIZES_M["car"][0] / 2 - draws.between("behind", p.behind_m) - VAN / 2
     row = [rear]
     for n in range(2):
-        row.append(row[-1] - VAN - between(f"van_{n}", p.vans_m))
-    ahead = OUT_M + between("ahead", p.ahead_m) + VAN / 2
+        row.append(row[-1] - VAN - draws.between(f"van_{n}", p.vans_m))
+    ahead = OUT_M + draws.between("ahead", p.ahead_m) + VAN / 2
 
     def standing(id_: str, kind: Kind, part: Part, x_m: float, side: str = "kerb") -> Spawn:
         return Spawn(id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0)
 
     def coming(id_: str, what: str, bounds: tuple[float, float]) -> Spawn:
         """A car from behind that is where the ego comes into the lane so long after a cruising ego."""
-        speed = between(f"{what}_speed", p.lane_mps)
-        after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + between(f"{what}_offset", bounds)
+        speed = draws.between(f"{what}_speed", p.lane_mps)
+        after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + draws.between(f"{what}_offset", bounds)
         return Spawn(id_, "car", "other", "behind", "straight", at.other_arc_m - speed * after_s, speed)
 
-    passed = at.other_arc_m + between("passed", p.passed_m)
+    passed = at.other_arc_m + draws.between("passed", p.passed_m)
+    passed_mps = draws.between("passed_speed", p.passed_mps)
     spawns = [
         Spawn("v1", "car", "ego", "own", "pull-out", ego, p.ego_speed_mps),
         standing("v2", "van", "helper", row[-1]),
-        standing("v3", "car", "helper", OUT_M - between("opposite", p.opposite_m), "opposite"),
-        Spawn("v4", "car", "helper", "behind", "straight", passed, between("passed_speed", p.passed_mps)),
+        standing("v3", "car", "helper", OUT_M - draws.between("opposite", p.opposite_m), "opposite"),
+        Spawn(
+            "v4", "car", "helper", "behind", "straight", passed, draws.between("passed_speed", p.passed_mps)
+        ),
     ]
-    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
-    numbers = noise.generator(NAME, seed, "ids").permutation(6)
+    numbers = draws.numbers(6)
     danger_id, late_id, oncoming_id, *parked = (f"v{5 + int(n)}" for n in numbers)
     others = [
         standing(parked[0], "van", "other", row[0]),
         standing(parked[1], "van", "other", row[1]),
         standing(parked[2], "van", "other", ahead),
     ]
-    danger = draw("danger") < p.danger_share
+    danger = draws.share("danger") < p.danger_share
     if danger:
         others.append(coming(danger_id, "danger", p.danger_offset_s))
-    if draw("late") < p.late_share:
+    if draws.share("late") < p.late_share:
         others.append(coming(late_id, "late", p.late_offset_s))
-    if draw("oncoming") < p.oncoming_share:
-        arc, speed = END_M - start - between("oncoming", p.oncoming_m), between("oncoming_speed", p.lane_mps)
+    if draws.share("oncoming") < p.oncoming_share:
+        arc, speed = (
+            END_M - start - draws.between("oncoming", p.oncoming_m),
+            draws.between("oncoming_speed", p.lane_mps),
+        )
         others.append(Spawn(oncoming_id, "car", "other", "oncoming", "straight", arc, speed))
     spawns += sorted(others, key=lambda spawn: int(spawn.id[1:]))
     return Layout(tuple(spawns), (), "behind" if danger else None, danger_id if danger else None)

@@ -21,10 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.core import noise
 from harness.core.arrays import Floats
 from harness.world.road import Lane, Path, Road, crossings, ground
-from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import Building
 
@@ -185,56 +184,50 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode. Every quantity has a draw of its own, so one dial does not move another's."""
+    """Draw one episode."""
+    draws = Draws(NAME, seed)
     p, paths, meetings = parameters, road().paths, road().crossings
 
-    def draw(what: str) -> float:
-        return float(noise.uniforms((1,), NAME, seed, what)[0])
-
-    def between(what: str, bounds: tuple[float, float]) -> float:
-        return bounds[0] + draw(what) * (bounds[1] - bounds[0])
-
     def arm(what: str) -> str:
-        return SECTORS[int(draw(what) >= p.sector_shares[0])]
+        return SECTORS[int(draws.share(what) >= p.sector_shares[0])]
 
-    start, ring_mps = between("ego_start", p.ego_start_m), between("ring_speed", p.ring_mps)
+    start, ring_mps = draws.between("ego_start", p.ego_start_m), draws.between("ring_speed", p.ring_mps)
     spawns = [
         Spawn("v1", "car", "ego", "own", "straight", road().zone_arc_m - start, p.ego_speed_mps),
         Spawn("v2", "car", "helper", "oncoming", "right",
-              paths["oncoming", "right"].ends_m[-2] + between("helper_south", p.helper_south_m),
-              between("helper_south_speed", p.helper_mps)),
+              paths["oncoming", "right"].ends_m[-2] + draws.between("helper_south", p.helper_south_m),
+              draws.between("helper_south_speed", p.helper_mps)),
         Spawn("v3", "car", "helper", "own", "left",
-              paths["own", "left"].ends_m[-2] + between("helper_west", p.helper_west_m),
-              between("helper_west_speed", p.helper_mps)),
+              paths["own", "left"].ends_m[-2] + draws.between("helper_west", p.helper_west_m),
+              draws.between("helper_west_speed", p.helper_mps)),
         Spawn("v4", "car", "helper", "own", "straight",
-              road().zone_arc_m + between("helper_ahead", p.helper_ahead_m),
-              between("helper_ahead_speed", p.helper_mps)),
+              road().zone_arc_m + draws.between("helper_ahead", p.helper_ahead_m),
+              draws.between("helper_ahead_speed", p.helper_mps)),
     ]  # fmt: skip
 
     def car(what: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
         """A car that is, or would be, where the ego enters so long after a cruising ego."""
-        late_s = between(f"{what}_offset", bounds)
+        late_s = draws.between(f"{what}_offset", bounds)
         back_m = ring_mps * (start / p.ego_speed_mps + late_s)
         arc = meetings[sector, "straight"].other_arc_m - back_m
         return Spawn(ids[what], "car", "other", sector, route, arc, ring_mps)
 
-    # Every other vehicle has a number whether it is there or not: a gap between two ids tells nothing.
-    numbers = noise.generator(NAME, seed, "ids").permutation(3)
+    numbers = draws.numbers(3)
     ids = {what: f"v{5 + int(n)}" for what, n in zip(("round", "before", "late"), numbers, strict=True)}
-    danger = arm("sector") if draw("danger") < p.danger_share else None
+    danger = arm("sector") if draws.share("danger") < p.danger_share else None
     others = []
     if danger:
         others.append(car("round", danger, "straight", p.danger_offset_s))
-    elif draw("leaver") < p.leaver_share:
+    elif draws.share("leaver") < p.leaver_share:
         others.append(car("round", arm("sector"), "right", p.danger_offset_s))
-    if draw("before") < p.before_share:
+    if draws.share("before") < p.before_share:
         others.append(car("before", arm("before_sector"), "right", p.before_offset_s))
-    if draw("late") < p.late_share:
+    if draws.share("late") < p.late_share:
         others.append(car("late", arm("late_sector"), "straight", p.late_offset_s))
     spawns += sorted(others, key=lambda spawn: spawn.id)
 
-    half, mound = p.hedge_half_m, between("mound", p.mound_m)
-    hedge = -half, between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M
+    half, mound = p.hedge_half_m, draws.between("mound", p.mound_m)
+    hedge = -half, draws.between("hedge_end", p.hedge_end_m), half, ARC_Y_M + ARM_M
     boxes = [hedge]
     for degrees in (22.5, 45.0, 67.5):  # three boxes whose corners lie on a circle
         x, y = mound * math.cos(math.radians(degrees)), mound * math.sin(math.radians(degrees))
