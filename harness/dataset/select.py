@@ -66,7 +66,7 @@ ALL = Selection()
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
     """Some of the episodes' numbers, all of which are below `end`. Raises UserError if there are too few."""
     if not 1 <= sample <= len(numbers):
-        raise UserError(f"--sample {sample}: there are {len(numbers)} episodes to draw from; give 1 or more")
+        raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")
     order = noise.generator("sample of episodes", seed).random(end)
     return sorted(sorted(numbers, key=lambda n: order[n])[:sample])
 

@@ -161,9 +161,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
         Spawn("v1", "car", "ego", "own", "pull-out", ego, p.ego_speed_mps),
         standing("v2", "van", "helper", row[-1]),
         standing("v3", "car", "helper", OUT_M - draws.between("opposite", p.opposite_m), "opposite"),
-        Spawn(
-            "v4", "car", "helper", "behind", "straight", passed, draws.between("passed_speed", p.passed_mps)
-        ),
+        Spawn("v4", "car", "helper", "behind", "straight", passed, passed_mps),
     ]
     numbers = draws.numbers(6)
     danger_id, late_id, oncoming_id, *parked = (f"v{5 + int(n)}" for n in numbers)
