@@ -21,9 +21,11 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of, fusion_request, requests
 from harness.prompts import versions as prompts
 from harness.prompts.densest import EVIDENCE, densest_messages
+from harness.world import scenarios
 
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = prompts.names()
+CROSSING = scenarios.get(scenarios.DEFAULT).prompt_words
 ID = re.compile(r"\bv[1-9][0-9]?\b")
 
 
@@ -36,7 +38,7 @@ def text_of(messages: tuple[dict[str, str], ...]) -> str:
 def test_a_prompt_is_the_golden_text(version: str, case: str) -> None:
     """After a wanted change: `UPDATE_GOLDEN=1 pytest tests/test_prompts.py`, and read the difference."""
     seen, messages = CASES[case]
-    said = text_of(prompts.load(version).render(seen, ACTIONS, messages))
+    said = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
     file = GOLDEN / f"{version}-{case}.txt"
     if os.environ.get("UPDATE_GOLDEN"):
         file.write_text(said, encoding="utf-8")
@@ -54,16 +56,18 @@ def test_every_golden_text_is_of_a_version_and_a_case() -> None:
 def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_counted(version: str) -> None:
     near = [{**CAR, "id": f"v{20 + i}", "forward_m": 1.0 + i, "left_m": 0.0} for i in range(4)]
     prompt = prompts.load(version)
-    [_, user] = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS)
+    [_, user] = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS, (), CROSSING)
     listed = [v for v in ("v4", "v20", "v21", "v22", "v23") if re.search(rf"^{v}\b", user["content"], re.M)]
-    assert listed == ["v4", "v20", "v21"]
-    assert re.search(r"2 (more )?farther|2 more", user["content"])
+    assert listed == ["v4", "v20", "v21"][: prompt.max_objects]
+    assert re.search(
+        rf"{5 - prompt.max_objects} (more )?farther|{5 - prompt.max_objects} more", user["content"]
+    )
 
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_action_names_are_the_ones_passed_in(version: str) -> None:
     for role in prompts.ROLES:
-        said = text_of(prompts.load(version).render(graph(role, [], []), ("LANE_LEFT", "KEEP")))
+        said = text_of(prompts.load(version).render(graph(role, [], []), ("LANE_LEFT", "KEEP"), (), CROSSING))
         assert "LANE_LEFT" in said
         assert "KEEP" in said
 
@@ -75,7 +79,7 @@ def test_nobody_is_named_who_is_not_in_the_viewers_graph(version: str, small: Da
         present = {v.id for v in scene.state.vehicles}
         for viewer, seen in scene.record["graphs"].items():
             known = {viewer, seen["ego"]["id"], *(n["id"] for n in seen["nodes"])}
-            named = set(ID.findall(text_of(prompt.render(seen, small.actions))))
+            named = set(ID.findall(text_of(prompt.render(seen, small.actions, (), CROSSING))))
             assert named <= known, f"{scene.id} {viewer}: {named - known}"
             assert known <= present
 
@@ -89,14 +93,16 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
     node = {**TRUCK, "id": WORDS, "lane": WORDS, "type": WORDS}
     seen = graph(role, [node], [{**STANDING, "with": WORDS}])
     messages = ({**MESSAGES[0], "sender": WORDS, "evidence": WORDS},) if role == "ego" else ()
-    said = text_of(prompts.load(version).render(seen, ACTIONS, messages))
+    said = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
     assert said.count(WORDS) >= 3
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(st.text(max_size=30), st.sampled_from(VERSIONS))
 def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
-    said = text_of(prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS))
+    said = text_of(
+        prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS, (), CROSSING)
+    )
     assert name in said
 
 
@@ -183,7 +189,7 @@ def test_a_template_that_fails_or_reaches_out_is_one_line(draft: Edit, template:
     message = one_line(caught)
     assert message.startswith("prompt v9 ego.j2 does not render: ")
     assert said in message
-    assert "may use graph, actions, objects, more, messages" in message
+    assert "may use graph, actions, objects, more, conflicts, messages" in message
 
 
 @pytest.mark.parametrize("template", ["{% import os %}", "{{ graph.", "{% if %}", "{% endblock %}"])
@@ -358,7 +364,7 @@ def test_every_prompt_keeps_its_token_budget(
         for viewer, seen in scene.record["graphs"].items():
             if messages and seen["role"] == "helper":
                 continue
-            n = count(prompt.render(seen, small.actions, messages))
+            n = count(prompt.render(seen, small.actions, messages, CROSSING))
             assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
 
 
@@ -374,7 +380,7 @@ def test_no_evidence_takes_a_fusion_call_over_its_budget(
     for scene in scenes_of(small):
         ego, *helpers = scene.viewers
         messages = densest_messages(helpers[:senders], small.actions)
-        n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages))
+        n = count(prompt.render(scene.record["graphs"][ego], small.actions, messages, CROSSING))
         assert 200 <= n <= 400, f"{version} {scene.id}: {n} tokens"
 
 
@@ -384,7 +390,7 @@ def test_tokens_decode_to_the_prompt_and_every_digit_is_one(
     version: str, case: str, vocabulary: Path
 ) -> None:
     qwen = tokenizer(vocabulary)
-    said = text_of(prompts.load(version).render(CASES[case][0], ACTIONS, CASES[case][1]))
+    said = text_of(prompts.load(version).render(CASES[case][0], ACTIONS, CASES[case][1], CROSSING))
     encoded = qwen.encode(said)
     assert qwen.decode(encoded.ids) == said
     assert [t for t in encoded.tokens if any(c.isdigit() for c in t)] == [c for c in said if c.isdigit()]

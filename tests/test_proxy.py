@@ -164,6 +164,7 @@ def test_a_quarter_of_a_sector_hidden_leaves_it_just_sure_enough() -> None:
     """SLOWER .05 + .33/4 = .1325, the third action .10, the planned one the rest .7675: 0.697 nats."""
     graph = {
         "step": 0, "ego": {"speed_mps": 14.0, "target_speed_mps": 14.0, "zone_m": 60.0}, "conflicts": [],
+        "viewer": "v1", "self": {}, "nodes": [],
         "sectors": [{"sector": "left", "seen_share": 0.75, "occluded": False, "by": ["b1"]}],
     }  # fmt: skip
     p = distribution(SCENARIO, graph)

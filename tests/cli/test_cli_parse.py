@@ -72,7 +72,7 @@ def test_hostile_text_cannot_reach_the_terminal() -> None:
         (["-", "--role", "egg"], "harness: unknown role 'egg'; did you mean 'ego'? known: ego, helper"),
         (
             ["-", "--scenario", "roundabout"],
-            "harness: unknown scenario 'roundabout'; known: occluded-intersection",
+            "harness: unknown scenario 'roundabout'; did you mean 'roundabout-entry'? known: blind-merge,",
         ),
         (
             ["-", "--finish-reason", "lenght"],

@@ -12,10 +12,10 @@ def test_it_renders_every_graph_of_the_dataset_the_same_each_time(version: str, 
     prompt = prompts.load(version)
     for scene in scenes_of(small):
         for graph in scene.record["graphs"].values():
-            messages = prompt.render(graph, small.actions)
+            messages = prompt.render(graph, small.actions, (), small.scenario.prompt_words)
             assert [m["role"] for m in messages] == ["system", "user"]
             assert all(m["content"].strip() for m in messages)
-            assert prompt.render(graph, small.actions) == messages
+            assert prompt.render(graph, small.actions, (), small.scenario.prompt_words) == messages
 
 
 @pytest.mark.parametrize("version", prompts.names())
@@ -23,7 +23,7 @@ def test_it_tells_every_viewer_the_actions_and_the_form_of_the_answer(version: s
     prompt = prompts.load(version)
     assert prompt.helper_answer in ("distribution", "recommendation")
     for graph in scenes_of(small)[0].record["graphs"].values():
-        system = prompt.render(graph, small.actions)[0]["content"]
+        system = prompt.render(graph, small.actions, (), small.scenario.prompt_words)[0]["content"]
         form = "distribution" if graph["role"] == "ego" else prompt.helper_answer
         assert ("action_distribution" in system) == (form == "distribution")
         assert ("recommended_maneuver" in system) == (form == "recommendation")

@@ -281,6 +281,9 @@ def scored(run, tmp_path, *scores, ended=None):
             structs.replace(e, episode=n, success=n < ended[e.condition]) for e in some for n in range(50)
         ]
         (copy / "episodes.csv").write_text(csv_text(Episode, episodes, variant))
+        manifest = json.loads((copy / "run.json").read_text())
+        manifest["world"]["episodes"] = 50
+        (copy / "run.json").write_text(json.dumps(manifest))
     return read(copy)
 
 

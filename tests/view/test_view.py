@@ -199,7 +199,11 @@ def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
 def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
     name = '<img src=x onerror="a()"> & ?#%2e'
     (reports / "second").rename(reports / name)
-    configure(reports / name, tags=["<script>tag</script>", "\u202egat"], model={"name": "</table><script>"})
+    configure(
+        reports / name,
+        tags=["<script>tag</script>", "\u202egat"],
+        model={"name": "</table><script>", "engine": "proxy"},
+    )
     page = browser.get('/?q="><script>').text + (listed := browser.get("/").text)
     tags: list[tuple[str, dict[str, str | None]]] = []
 
