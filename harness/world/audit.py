@@ -113,12 +113,7 @@ def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[st
         if world.outcome.ended or world.step >= scenario.parameters.decisions:
             continue
         graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
-        shown = {
-            node["id"]
-            for node in graph["nodes"]
-            if node["id"] == world.layout.danger_id or node.get("braking")
-        }
-        if shown:
+        if any(node["id"] == world.layout.danger_id or node.get("braking") for node in graph["nodes"]):
             continue
         found.append((world.step, dict(numbers(graph, scenario.road()))))
         ways: dict[str, tuple[str, ...]] = {}

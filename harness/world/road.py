@@ -219,6 +219,17 @@ def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Cros
     return found
 
 
+def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple[int, int]]) -> Any:
+    """highway-env's network of lanes along x: of each its nodes, begin, end and y in metres, and lines."""
+    from highway_env.road.lane import StraightLane
+    from highway_env.road.road import RoadNetwork
+
+    net = RoadNetwork()
+    for start, end, begin_m, end_m, y_m, lines in lanes:
+        net.add_lane(start, end, StraightLane([begin_m, y_m], [end_m, y_m], width_m, line_types=lines))
+    return net
+
+
 def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: float) -> tuple[Any, Any]:
     """Two of highway-env's arcs, as long as their longitudinal coordinate, unlike its `SineLane`.
 

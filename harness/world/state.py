@@ -13,7 +13,7 @@ from harness.core.arrays import Floats
 Kind = Literal["car", "van", "truck"]
 Part = Literal["ego", "helper", "other"]
 
-# Length and width; a van's and a lorry's are SUMO's defaults, a truck's lie between them.
+# Length and width; a van's are those of SUMO's delivery van.
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
 
 

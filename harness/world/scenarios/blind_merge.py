@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import Building
@@ -77,19 +77,17 @@ class Parameters(Common):
 @cache
 def network() -> Any:
     """As highway-env's `MergeEnv`, but shorter, and the ramp's lane runs into the right lane."""
-    from highway_env.road.lane import LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
+    from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
-    net = RoadNetwork()
-    for start, end, begin_m, end_m, y_m, lines in (
+    net = straights(
+        LANE_WIDTH_M,
         ("a", "b", BEGIN_M, 0.0, -LANE_WIDTH_M, (edge, none)),
         ("a", "b", BEGIN_M, 0.0, 0.0, (dashed, edge)),
         ("b", "c", 0.0, END_M, -LANE_WIDTH_M, (edge, none)),
         ("b", "c", 0.0, END_M, 0.0, (dashed, edge)),
         ("j", "k", BEGIN_M, -CONVERGE_M, RAMP_M, (edge, edge)),
-    ):
-        net.add_lane(start, end, StraightLane([begin_m, y_m], [end_m, y_m], LANE_WIDTH_M, line_types=lines))
+    )
     first, second = to_the_left((-CONVERGE_M, RAMP_M), (0.0, 0.0), LANE_WIDTH_M)
     net.add_lane("k", "m", first)
     net.add_lane("m", "b", second)

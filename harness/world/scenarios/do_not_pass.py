@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.world.road import Path, PathKey, Road, ground
+from harness.world.road import Path, PathKey, Road, ground, straights
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind
@@ -98,16 +98,15 @@ def road() -> Road:
 @cache
 def network() -> Any:
     """Lanes as `TwoWayEnv` has them: the left one is there twice, once in each direction."""
-    from highway_env.road.lane import LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
+    from highway_env.road.lane import LineType
 
-    net = RoadNetwork()
-    own, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE
-    left, right = ([BEGIN_M, 0.0], [END_M, 0.0]), ([BEGIN_M, LANE_WIDTH_M], [END_M, LANE_WIDTH_M])
-    net.add_lane("a", "b", StraightLane(*left, line_types=(edge, none)))
-    net.add_lane("a", "b", StraightLane(*right, line_types=(own, edge)))
-    net.add_lane("b", "a", StraightLane(*reversed(left), line_types=(none, none)))
-    return net
+    striped, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE
+    return straights(
+        LANE_WIDTH_M,
+        ("a", "b", BEGIN_M, END_M, 0.0, (edge, none)),
+        ("a", "b", BEGIN_M, END_M, LANE_WIDTH_M, (striped, edge)),
+        ("b", "a", END_M, BEGIN_M, 0.0, (none, none)),
+    )
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:

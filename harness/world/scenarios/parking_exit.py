@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, to_the_left
+from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
 from harness.world.state import SIZES_M, Kind, Part
@@ -82,21 +82,19 @@ class Parameters(Common):
 @cache
 def network() -> Any:
     """A lane to the east and one to the west, what is parked beside each, and the ego's way out."""
-    from highway_env.road.lane import LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
+    from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
-    net, begins = RoadNetwork(), OUT_M - PULL_OUT_M
-    for start, end, begin_m, end_m, y_m, lines in (
+    begins = OUT_M - PULL_OUT_M
+    net = straights(
+        LANE_WIDTH_M,
         ("west", "out", BEGIN_M, OUT_M, 0.0, (dashed, none)),
         ("out", "east", OUT_M, END_M, 0.0, (dashed, none)),
         ("east", "west", END_M, BEGIN_M, -LANE_WIDTH_M, (none, none)),
         ("kerb", "end", BEGIN_M, END_M, VANS_M, (none, edge)),
         ("opposite", "far", END_M, BEGIN_M, -LANE_WIDTH_M - VANS_M, (none, edge)),
         ("space", "pull", BEGIN_M, begins, KERB_M, (none, edge)),
-    ):
-        lane = StraightLane([begin_m, y_m], [end_m, y_m], LANE_WIDTH_M, line_types=lines)
-        net.add_lane(start, end, lane)
+    )
     first, second = to_the_left((begins, KERB_M), (OUT_M, 0.0), LANE_WIDTH_M)
     net.add_lane("pull", "swing", first)
     net.add_lane("swing", "out", second)
