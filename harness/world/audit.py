@@ -31,6 +31,7 @@ RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
 DANGER, NONE = "danger", ""
 INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
+BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def numbers(graph: Mapping[str, Any], road: Road) -> Iterator[tuple[str, float]]
         yield f"{lane}: vehicles", float(len(nodes))
         for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
             yield f"{lane}: nearest {name}", _known(node.get(name))
-        yield f"{lane}: nearest is a truck", _known({"truck": 1.0, "car": 0.0}.get(node.get("type", "")))
+        yield f"{lane}: nearest kind", _known(BY_SIZE.get(node.get("type", "")))
         yield f"{lane}: nearest indicator", _known(INDICATORS.get(node.get("indicator") or ""))
         yield f"{lane}: nearest sensors", float(len(node.get("sensors", ())))
     seen = {s["sector"]: s for s in graph["sectors"]}

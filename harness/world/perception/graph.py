@@ -23,6 +23,7 @@ from harness.world.state import SIZES_M, VehicleState, WorldState, indicator
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
 ALIKE = 0.05  # paths that share a lane cost the same but for rounding
+STANDING_MPS = 0.5  # below that, a sensor's noise
 ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 
 Graph = dict[str, Any]
@@ -190,6 +191,8 @@ def _along(
             continue
         ego_mps, its_mps = ego.speed_mps, d.speed_mps * np.sign(turned)
         kind = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
+        if kind == "behind" and d.speed_mps <= STANDING_MPS:
+            continue  # what is parked behind the ego never meets it
         closing_mps = (ego_mps - its_mps) * (1 if gap > 0 else -1)
         share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
         time_s = _tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
@@ -212,7 +215,7 @@ def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
     """Arc length left (m, negative once past), and the seconds it takes (None at a standstill)."""
     return {
         "arc_m": _tenths(to_go_m),
-        "time_s": _tenths(to_go_m / speed_mps) if speed_mps > 0.5 else None,
+        "time_s": _tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None,
     }
 
 
