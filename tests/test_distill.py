@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,72 +12,104 @@ pytest.importorskip("torch", reason="needs the transformers extra")
 pytest.importorskip("transformers", reason="needs the transformers extra")
 
 import torch
-from evaluating import course, scenes_of
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset, load
 from harness.parsing.parse import parse
 from harness.prompts import readout
 from harness.prompts import versions as prompts
+from harness.training import lessons
 from harness.training.answers import answer, message
-from harness.training.distill import distill
-from harness.training.examples import alone, excerpts, kl_nats, labels, split, taught, with_messages
+from harness.training.distill import Curriculum, distill
+from harness.training.examples import Question, alone, excerpts, kl_nats, with_messages
+from harness.training.lessons import Lessons, draw, label
 from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
 from harness.training.train import STAGES, Plan
+from harness.world import scenarios
+from harness.world.reference import drive, finish
+from harness.world.world import World
 
-ACTIONS = ("SLOWER", "IDLE", "FASTER")
-PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 64, "answers": 96}, batch=8)
-VERSIONS = [prompts.load("v1"), prompts.load("v2")]
+PLAN = Plan({"excerpts": 128, "alone": 128, "messages": 128, "answers": 96}, batch=8)
+CROSSING, PASSING = scenarios.get("occluded-intersection"), scenarios.get("do-not-pass")
+LEARNT = {CROSSING: (prompts.load("v1"), prompts.load("v2")), PASSING: (prompts.load("v4"),)}
+CURRICULUM = Curriculum(LEARNT, layouts=3, seed=100_000)
 
 
 class Killed(Exception):
     pass
 
 
-@pytest.fixture(scope="module")
-def few(small_path: Path) -> Dataset:
-    return load(small_path, limit=3)
+def silent(*_: object) -> None:
+    pass
 
 
 @pytest.fixture(scope="module")
-def student(few: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def few(tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
+    place = tmp_path_factory.mktemp("lessons")
+    return [
+        draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
+        for scenario, versions in LEARNT.items()
+    ]
+
+
+@pytest.fixture(scope="module")
+def asked(few: list[Lessons]) -> list[Question]:
+    return [q for each in few for q in alone(each)]
+
+
+@pytest.fixture
+def drawn_before(few: list[Lessons], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a layout teaches is drawn once for all tests."""
+    by_layout = {(each.scenario.name, n): _points(each, n) for each in few for n in range(CURRICULUM.layouts)}
+    monkeypatch.setattr(lessons, "drawn", lambda scenario, seed, n: by_layout[scenario.name, n])
+
+
+def _points(each: Lessons, number: int) -> list[dict[str, object]]:
+    return [
+        {"moment": scene.record, "label": each.labels[scene.id].tolist()}
+        for scene in each.scenes if scene.record["episode"] == number
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def student(few: list[Lessons], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("distilled") / "student"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.training.train.LOG_STEPS", 4)
-        distill(few, VERSIONS, PLAN, out, lambda stage, seen, loss: None, "cpu")
+        distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
     return out
 
 
 # -- the teacher ------------------------------------------------------------------------------------
 
 
-def test_the_teacher_wants_what_turned_out_safe_and_least_late(few: Dataset) -> None:
+def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
     """SLOWER costs 0.5 s: exp(-2) beside 1 for IDLE and 0.3 for FASTER."""
-    outcomes = {
-        "00000-0": {"SLOWER": 5.5, "IDLE": 5.0, "FASTER": 5.0},
-        "00001-0": {"SLOWER": 7.0, "IDLE": "collision", "FASTER": "collision"},
-        "00002-0": dict.fromkeys(ACTIONS, "collision"),
-    }
-    free, danger, lost = labels(course(few, 1, outcomes))
     total = np.exp(-2.0) + 1.3
+    free = label({"SLOWER": 5.5, "IDLE": 5.0, "FASTER": 5.0})
     assert free == pytest.approx([np.exp(-2.0) / total, 1 / total, 0.3 / total])
+    danger = label({"SLOWER": 7.0, "IDLE": np.inf, "FASTER": np.inf})
     assert danger.tolist() == [1.0, 0.0, 0.0]
-    assert np.isnan(lost).all()
 
 
-def test_what_only_a_later_decision_could_save_is_not_safe(few: Dataset) -> None:
-    """At the second step SLOWER would still do, but the driver that takes the rest holds its speed."""
-    outcomes = {"00000-0": {}, "00000-1": {"SLOWER": 5.0, "IDLE": "collision", "FASTER": "collision"}}
-    data = course(few, 2, outcomes)
-    first, second = labels(data)
-    assert np.isnan(first).all()
-    assert second.tolist() == [1.0, 0.0, 0.0]
-    assert [scene.id for scene in taught(data)] == ["00000-1"], "where nothing is safe nothing is taught"
+def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
+    """Played again in the simulator, action by action, from the start."""
+    for each in few:
+        scenario = each.scenario
+        for scene in each.scenes:
+            if scene.record["step"] == 0:
+                seed = scene.record["episode_seed"]
+                reference = drive(scenario, "full-view", seed)
+                safe = []
+                for action in scenario.actions:
+                    world = World.start(scenario, seed)
+                    world.act(action)
+                    safe.append(finish(world, "local-view").judged(reference, scenario.parameters).success)
+                assert (each.labels[scene.id] > 0).tolist() == safe
 
 
 def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
@@ -90,48 +123,53 @@ def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
 # -- what it learns to say --------------------------------------------------------------------------
 
 
-@given(st.lists(st.floats(0.001, 1), min_size=3, max_size=3), st.booleans())
-def test_every_text_it_learns_says_what_it_should(few: Dataset, weights: list[float], bare: bool) -> None:
-    intent = np.array(weights) / sum(weights)
-    for prompt in VERSIONS:
-        for graph in scenes_of(few)[2].record["graphs"].values():
-            text = answer(prompt, graph, intent, ACTIONS, bare=bare)
-            said = parse(text, role=graph["role"], actions=ACTIONS)
-            reasons_first = prompt.helper_answer == "recommendation" and not bare
-            assert said.verdict == ("recovered" if reasons_first else "strict")
-            assert said.intent is not None
-            if graph["role"] == "ego" or prompt.helper_answer == "distribution":
-                assert said.intent == pytest.approx(intent, abs=0.0501)
-            else:
-                assert said.intent[int(np.argmax(intent))] == pytest.approx(intent.max(), abs=0.0501)
+@given(st.data(), st.booleans())
+def test_every_text_it_learns_says_what_it_should(
+    few: list[Lessons], data: st.DataObject, bare: bool
+) -> None:
+    for each in few:
+        actions = each.scenario.actions
+        weights = data.draw(st.lists(st.floats(0.001, 1), min_size=len(actions), max_size=len(actions)))
+        intent = np.array(weights) / sum(weights)
+        for prompt in each.prompts:
+            for graph in each.scenes[2].record["graphs"].values():
+                text = answer(prompt, graph, intent, actions, bare=bare)
+                said = parse(text, role=graph["role"], actions=actions)
+                reasons_first = prompt.helper_answer == "recommendation" and not bare
+                assert said.verdict == ("recovered" if reasons_first else "strict")
+                assert said.intent is not None
+                if graph["role"] == "ego" or prompt.helper_answer == "distribution":
+                    assert said.intent == pytest.approx(intent, abs=0.0501)
+                else:
+                    assert said.intent[int(np.argmax(intent))] == pytest.approx(intent.max(), abs=0.0501)
 
 
-def test_a_helpers_evidence_keeps_to_twelve_words(few: Dataset) -> None:
-    for scene in scenes_of(few):
-        for graph in scene.record["graphs"].values():
-            assert len(message(graph, np.array([0.2, 0.5, 0.3]), ACTIONS)["evidence"].split()) <= 12
+def test_a_helpers_evidence_keeps_to_twelve_words(asked: list[Question]) -> None:
+    for q in asked:
+        assert len(message(q.graph, q.label, q.actions)["evidence"].split()) <= 12
 
 
-def test_the_ego_with_messages_reads_what_helpers_sent(few: Dataset) -> None:
-    asked = list(alone(few, taught(few), VERSIONS))
-    intents = {q.key: np.array([0.91, 0.06, 0.03]) for q in asked}
-    heard = list(with_messages(few, taught(few), VERSIONS, intents))
-    assert heard
-    for q in heard:
-        assert q.key.endswith("+m")
-        assert q.graph["role"] == "ego"
-        assert "0.90" in q.messages[-1]["content"]
+def test_the_ego_with_messages_reads_what_helpers_sent(few: list[Lessons], asked: list[Question]) -> None:
+    intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
+    for each in few:
+        heard = list(with_messages(each, each.scenes, intents))
+        assert heard
+        for q in heard:
+            assert q.key.endswith("+m")
+            assert q.graph["role"] == "ego"
+            assert ("90 5" if q.prompt.version == "v4" else "0.90") in q.messages[-1]["content"]
 
 
-def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(few: Dataset) -> None:
-    asked = {q.key: q for q in alone(few, taught(few), VERSIONS)}
-    short = list(excerpts(list(asked.values()), ACTIONS))
+def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(asked: list[Question]) -> None:
+    whole = {q.key: q for q in asked}
+    short = list(excerpts(asked))
     assert short
     for q in short:
         text = q.messages[-1]["content"]
-        assert len(text) < len(asked[q.key].messages[-1]["content"])
-        assert all(str(c["other"]["time_s"]) in text for c in q.graph["conflicts"] if c["other"]["time_s"])
-        assert np.array_equal(q.label, asked[q.key].label)
+        assert len(text) < len(whole[q.key].messages[-1]["content"])
+        shown = min(q.graph["conflicts"], key=lambda c: float(c["other"]["time_s"] or 1e9))
+        assert shown["other"]["time_s"] is None or str(shown["other"]["time_s"]) in text
+        assert np.array_equal(q.label, whole[q.key].label)
 
 
 # -- its optimizer ----------------------------------------------------------------------------------
@@ -175,7 +213,7 @@ def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     facts = json.loads((student / "training.json").read_text())
     assert set(facts["curves"]) == set(STAGES)
     assert 0.4e6 < facts["parameters"] < 2e6
-    assert "imitate one planner in one scenario" in (student / "README.md").read_text()
+    assert "imitate one planner in the scenarios below" in (student / "README.md").read_text()
 
 
 def test_its_loss_falls(student: Path) -> None:
@@ -183,22 +221,22 @@ def test_its_loss_falls(student: Path) -> None:
         assert curve[-1][1] < curve[0][1], stage
 
 
-def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, few: Dataset) -> None:
+def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, asked: list[Question]) -> None:
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(student)
-    for q in list(alone(few, taught(few), VERSIONS))[:8]:
-        asked = readout.asked(q.messages, ACTIONS)
+    for q in (*asked[:8], *asked[-8:]):
+        sent = readout.asked(q.messages, q.actions)
         rendered = tokenizer.apply_chat_template(
-            [dict(m) for m in asked], tokenize=False, add_generation_prompt=True
+            [dict(m) for m in sent], tokenize=False, add_generation_prompt=True
         )
-        assert rendered == "".join(chat(asked))
+        assert rendered == "".join(chat(sent))
         assert "".join(tokenizer.batch_decode(tokenizer(rendered)["input_ids"])) == rendered
     assert len(tokenizer("307")["input_ids"]) == 3, "every digit stands alone"
 
 
 def test_a_killed_run_goes_on_to_the_same_model(
-    student: Path, few: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
     monkeypatch.setattr("harness.training.train.LOG_STEPS", 4)
@@ -210,30 +248,34 @@ def test_a_killed_run_goes_on_to_the_same_model(
                 raise Killed
 
         with pytest.raises(Killed):
-            distill(few, VERSIONS, PLAN, out, progress, "cpu")
-    distill(few, VERSIONS, PLAN, out, lambda stage, seen, loss: None, "cpu")
+            distill(CURRICULUM, PLAN, out, silent, progress, "cpu")
+    distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
     for name in ("model.safetensors", "tokenizer.json", "student-f16.gguf"):
         assert (out / name).read_bytes() == (student / name).read_bytes()
 
 
 def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
-    student: Path, few: Dataset, tmp_path: Path
+    student: Path, drawn_before: None, tmp_path: Path
 ) -> None:
     def stop(stage: str, seen: int, loss: float) -> None:
         raise Killed
 
     with pytest.raises(UserError, match=r"with other files in it; choose an empty or a new one"):
-        distill(few, VERSIONS, PLAN, student, stop, "cpu")
+        distill(CURRICULUM, PLAN, student, silent, stop, "cpu")
     with pytest.raises(Killed):
-        distill(few, VERSIONS, PLAN, tmp_path / "m", stop, "cpu")
+        distill(CURRICULUM, PLAN, tmp_path / "m", silent, stop, "cpu")
     with pytest.raises(UserError, match=r"was begun with another seed"):
-        distill(few, VERSIONS, replace(PLAN, seed=1), tmp_path / "m", stop, "cpu")
+        distill(CURRICULUM, replace(PLAN, seed=1), tmp_path / "m", silent, stop, "cpu")
+    with pytest.raises(UserError, match=r"was begun with another scenarios, prompts"):
+        distill(
+            replace(CURRICULUM, prompts={PASSING: LEARNT[PASSING]}), PLAN, tmp_path / "m", silent, stop, "cpu"
+        )
 
 
-def test_too_few_sequences_for_a_message_are_refused(few: Dataset, tmp_path: Path) -> None:
+def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
     with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
-        distill(few, VERSIONS, plan, tmp_path / "m", lambda stage, seen, loss: None, "cpu")
+        distill(CURRICULUM, plan, tmp_path / "m", silent, silent, "cpu")
 
 
 @pytest.mark.parametrize(
@@ -248,14 +290,16 @@ def test_too_few_sequences_for_a_message_are_refused(few: Dataset, tmp_path: Pat
         (["--threads", "0"], "--threads 0: give 1 or more"),
         (["--seed", "-1"], "--seed -1: give 0 or more"),
         (["--prompt", "v9"], "unknown prompt 'v9'"),
-        ([], "has layout seeds 100 to 103 (tune); a model learns from train seeds alone"),
+        (["--prompt", "v2", "do-not-pass"], "--prompt v2: none is for do-not-pass; give v4"),
+        (["no-such-road"], "unknown scenario 'no-such-road'"),
+        (["--first-seed", "100"], "layout seeds 100 to 339 (tune); a model learns from train seeds alone"),
     ],
 )
-def test_bad_input_writes_nothing(options: list[str], said: str, small_path: Path, tmp_path: Path) -> None:
+def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         CliRunner().invoke(
             app,
-            ["distill", str(small_path), "--out", str(tmp_path / "m"), *options],
+            ["distill", "occluded-intersection", "--out", str(tmp_path / "m"), *options],
             standalone_mode=False,
             catch_exceptions=False,
         )
@@ -266,18 +310,24 @@ def test_bad_input_writes_nothing(options: list[str], said: str, small_path: Pat
 # -- data that stay apart ---------------------------------------------------------------------------
 
 
-def test_held_out_episodes_are_in_neither_half_twice(few: Dataset) -> None:
-    kept, apart = split(few, 1)
-    assert (kept.episodes, apart.episodes) == ((0, 1), (2,))
+def test_held_out_layouts_are_in_neither_half_twice(few: list[Lessons]) -> None:
+    for each in few:
+        kept, apart = each.split(0.05)
+        assert apart.episodes == each.episodes[-1:]
+        assert (*kept.episodes, *apart.episodes) == each.episodes
+        assert kept.scenes + apart.scenes == each.scenes
 
 
-def test_it_learns_from_every_level_of_a_tree(few: Dataset) -> None:
+def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
     """Not from one driver's course alone, and from no more scenes than it needs."""
-    scenes, forest = taught(few), few.forest
-    safe = ~np.isnan(labels(few)).any(axis=1)
-    for place, tree in enumerate(few.trees):
-        steps = [s.record["step"] for s in scenes if s.record["episode"] == tree.episode]
-        there = [int((safe & (forest.tree == place) & (forest.step == step)).sum()) for step in range(6)]
-        assert [steps.count(step) for step in range(6)] == [min(6, n) for n in there]
-        assert steps
-    assert [s.id for s in taught(few)] == [s.id for s in scenes]
+    for each in few:
+        for number in each.episodes:
+            steps = [s.record["step"] for s in each.scenes if s.record["episode"] == number]
+            assert set(steps) == set(range(max(steps) + 1))
+            assert max(steps) > 1
+            assert all(steps.count(step) <= lessons.OF_A_LEVEL for step in steps)
+
+
+def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
+    again = msgspec.json.encode(lessons.drawn(PASSING, CURRICULUM.seed + 1, 1))
+    assert msgspec.json.decode(again) == _points(few[1], 1)

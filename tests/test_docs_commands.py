@@ -36,7 +36,7 @@ CUT = {
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
     "harness scenario check": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness scenario audit": "--layouts 24 --workers 1",  # of 300
-    "harness distill": "--samples 16,16,16,16",  # of 226 000 sequences
+    "harness distill": "--layouts 3 --samples 64,64,64,64 --workers 1",  # of 240, and of 300 000 sequences
     "harness parity": "--prompts 1",  # of 64, on two engines
 }
 

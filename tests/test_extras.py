@@ -82,7 +82,7 @@ def test_a_frozen_evaluation_and_what_is_done_with_it_need_no_extra(tmp_path: Pa
         ("dataset show occluded-intersection-v2 00000-0 --out scene.svg", "matplotlib", "report"),
         ("campaign paper --out paper", "matplotlib", "report"),
         ("eval --model swarm-tiny", "llama-cpp-python", "llama-cpp"),
-        ("distill . --out student", "torch", "transformers"),
+        ("distill do-not-pass --out student", "torch", "transformers"),
     ],
 )
 def test_what_needs_an_extra_says_in_one_line_which(

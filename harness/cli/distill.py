@@ -1,65 +1,85 @@
-"""`harness distill`: train a small language model on a frozen dataset."""
+"""`harness distill`: train a small language model in some scenarios."""
 
 import time
 from pathlib import Path
 
 import typer
 
+from harness.cli import options
 from harness.cli.progress import bar
+from harness.cli.scenario import ready_to_drive
 from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose, stated
 
-SAMPLES = "60000,110000,16000,40000"
+SAMPLES = "60000,160000,30000,50000"
 BATCH = 16
 
 
 def command(
-    dataset: str = typer.Argument(help="A dataset's folder: what the model learns from.", metavar="DIR"),
+    scenario: list[str] = typer.Argument(help="Scenarios to learn to drive in."),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
-    prompt: list[str] = typer.Option(["v1", "v2"], help="Prompt version to learn; repeat for several."),
+    prompt: list[str] = typer.Option(
+        ["v2", "v4"], help="Prompt version to learn, in the scenarios it fits; repeat for several."
+    ),
+    layouts: int = typer.Option(240, help="Layouts of each scenario."),
+    first_seed: int = typer.Option(FIRST["train"], help="Layout seed of the first."),
     samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
     seed: int = typer.Option(0, help="Seed of the weights and of the order."),
     batch: int = typer.Option(BATCH, help="Sequences a step."),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
+    workers: options.Workers = 2,
 ) -> None:
-    """Train a small Qwen3 on a frozen dataset. The same command again continues training that was stopped."""
-    from harness.dataset import load
+    """Train a small Qwen3 in some scenarios. The same command again continues training that was stopped."""
     from harness.prompts import versions as prompts
 
-    extras.need("harness distill", "torch", "transformers")
+    extras.need("harness distill", "torch", "transformers", "highway_env")
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
-    # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
-    counts = _counts(samples, max(batch, 4 * len(versions)))
-    data = load.load(load.find(dataset))
-    seeds = data.manifest.seed, data.manifest.episodes
-    if purpose(*seeds) != "train":
+    driven = [ready_to_drive(name, layouts, first_seed, workers) for name in dict.fromkeys(scenario)]
+    if purpose(first_seed, layouts) != "train":
         raise UserError(
-            f"{printable(dataset)} has {stated(*seeds)}; a model learns from train seeds alone: "
-            f"`harness dataset build {data.scenario.name} --seed {FIRST['train']}`"
+            f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train seeds "
+            f"alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
+    learnt = {of: tuple(v for v in versions if prompts.fits(v.version, of.prompt)) for of in driven}
+    for of, some in learnt.items():
+        if not some:
+            raise UserError(
+                f"--prompt {printable(' '.join(prompt))}: none is for {of.name}; give {of.prompt}, or one "
+                "of your own"
+            )
+    # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
+    counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))
 
     from harness.backends.transformers.engine import device_of
+    from harness.training.distill import Curriculum
     from harness.training.distill import distill as run
     from harness.training.train import STAGES, Plan
 
     plan = Plan(dict(zip(STAGES, counts, strict=True)), batch=batch, seed=seed)
     begun_s = time.monotonic()
-    with bar("training", sum(counts)) as progress:
+    drawn = layouts * len(learnt)
+    with bar("drawing layouts", drawn) as progress:
 
         def show(stage: str, seen: int, loss: float) -> None:
             progress.label = f"{stage} loss {loss:.3f}"
-            progress(sum(counts[: STAGES.index(stage)]) + seen - progress.done)
+            progress.more(drawn + sum(counts) - progress.total)
+            progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
-        facts = run(data, versions, plan, out, show, device_of(device), threads)
-    apart = facts["held_out"]
+        facts = run(
+            Curriculum(learnt, layouts, first_seed), plan, out, progress, show, device_of(device), threads,
+            workers,
+        )  # fmt: skip
+    for apart in facts["held_out"]:
+        typer.echo(
+            f"{apart['scenario']}: held-out KL {apart['kl_nats']:.3f} nats (mean label "
+            f"{apart['kl_of_the_mean_nats']:.3f}, n = {apart['questions']})"
+        )
     typer.echo(
-        f"held-out KL {apart['kl_nats']:.3f} nats (mean label {apart['kl_of_the_mean_nats']:.3f}, "
-        f"n = {apart['questions']})\n"
         f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"
     )
 

@@ -110,11 +110,7 @@ class Forest:
     @cached_property
     def then_full_view(self) -> Ints:
         """The last edge of the course after each action if the full-view driver takes the rest, (N, A)."""
-        return self.then(PRIVILEGED)
-
-    def then(self, driver: str) -> Ints:
-        """The last edge of the course after each action if a reference driver takes the rest, (N, A)."""
-        last, chosen = self.edge.copy(), self.drivers[driver]
+        last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
             child = self.child[rows]
             last[rows] = np.where(child >= 0, last[child, chosen[child]], last[rows])

@@ -35,7 +35,7 @@ def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branc
             state = world.state()
             record = _record(world, state, episode)
             drivers = _drivers(scenario, state, record["graphs"][state.ego.id])
-            points.append(Branching(record["scene"], drivers, list(_edges(world, episode, following))))
+            points.append(Branching(record["scene"], drivers, list(edges(world, episode, following))))
             records.append(record)
         scenes.append(records)
         branchings.append(points)
@@ -43,8 +43,8 @@ def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branc
     return branchings, scenes
 
 
-def _edges(world: World, episode: int, following: dict[str, World]) -> Iterator[Edge]:
-    """Where each action leads; decision points that are new are added to those `following`, by id."""
+def edges(world: World, episode: int, following: dict[str, World]) -> Iterator[Edge]:
+    """Where each action of a decision point leads; new decision points join those `following`, by id."""
     waiting = world.branch()
     waiting.outcome, waiting.hard_brakings = Outcome(), 0  # what happens from here on
     p = world.scenario.parameters

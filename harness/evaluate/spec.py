@@ -18,7 +18,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
 from harness.evaluate.latency import MEASURED, NAMES, declared
-from harness.prompts.versions import OF_A_CROSSING, Prompt
+from harness.prompts.versions import Prompt, fits
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
@@ -109,7 +109,7 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        if self.prompt.version in OF_A_CROSSING and self.scenario.prompt not in OF_A_CROSSING:
+        if not fits(self.prompt.version, self.scenario.prompt):
             raise UserError(
                 f"--prompt {self.prompt.version} speaks of a crossing, which {self.scenario.name} is not; "
                 f"give {self.scenario.prompt}, or one of your own"

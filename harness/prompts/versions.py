@@ -219,6 +219,11 @@ def names(where: Path | None = None) -> list[str]:
     return sorted({file.parent.name for file in files})
 
 
+def fits(version: str, default: str) -> bool:
+    """Whether a version may speak to a scenario that has this `default`: of a crossing where there is one."""
+    return version not in OF_A_CROSSING or default in OF_A_CROSSING
+
+
 def load(version: str, where: Path | None = None) -> Prompt:
     """A version by name.
 

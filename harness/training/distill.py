@@ -1,8 +1,8 @@
-"""From a frozen dataset to a small model, in stages that a kill does not undo."""
+"""From scenarios to a small model that drives in them, in stages that a kill does not undo."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,62 +10,96 @@ import torch
 import transformers
 
 from harness.core import work
-from harness.core.files import write_whole
-from harness.dataset.load import Dataset
+from harness.core.files import canonical_json, sha256_bytes, write_whole
 from harness.prompts.versions import Prompt
 from harness.training.gguf_export import export
+from harness.training.lessons import draw
 from harness.training.model import save_tokenizer
 from harness.training.student import Progress, Student
 from harness.training.train import STAGES, Plan
+from harness.world.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Curriculum:
+    """What is learnt from.
+
+    Attributes:
+        prompts: of each scenario, the versions that are learnt.
+        layouts: how many of each scenario.
+        seed: layout seed of the first.
+    """
+
+    prompts: Mapping[Scenario, tuple[Prompt, ...]]
+    layouts: int
+    seed: int
+
+    def settings(self) -> dict[str, Any]:
+        """What a run that goes on must have in common with what it began as, as plain values."""
+        return {
+            "scenarios": {
+                scenario.name: sha256_bytes(canonical_json(asdict(scenario.parameters)).encode())
+                for scenario in self.prompts
+            },
+            "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},
+            "layouts": self.layouts,
+            "first_seed": self.seed,
+        }
 
 
 def distill(
-    dataset: Dataset,
-    prompts: Sequence[Prompt],
+    curriculum: Curriculum,
     plan: Plan,
     out: Path,
+    drawing: Callable[[int], None],
     progress: Progress,
     device: str,
     threads: int | None = None,
+    workers: int = 1,
 ) -> dict[str, Any]:
-    """Train a model on a dataset and write checkpoint, tokenizer, GGUF file and model card to `out`.
+    """Train a model in some scenarios and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
-    Stages that an earlier, killed call finished are taken over, and one it had begun goes on.
+    Layouts and stages that an earlier, killed call finished are taken over, and a stage it had begun goes on.
 
     Args:
-        dataset: what it learns from.
-        prompts: versions that it learns to read.
+        curriculum: what it learns from.
         plan: how long.
         out: folder to make; its name is the model's.
+        drawing: called with the number of layouts just drawn.
         progress: called with the stage, the sequences seen in it and the loss.
         device: `cpu` or `cuda`.
         threads: on a CPU; None is PyTorch's choice.
+        workers: processes that draw layouts.
 
     Returns:
-        What the model card states: data, plan, curves, and the KL of the read-out on held-out episodes.
+        What the model card states: data, plan, curves, and the KL of the read-out on held-out layouts.
 
     Raises:
         UserError: the folder holds something else.
     """
     if threads:
         torch.set_num_threads(threads)
-    settings = {"dataset": dataset.sha256, "prompts": [p.sha256 for p in prompts], **asdict(plan)}
+    settings = {**curriculum.settings(), **asdict(plan)}
     if begun := work.begun(out, work.Begun):
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.Begun(settings=settings)) as place:
-        facts = _trained(dataset, Student(dataset, prompts, plan, place, device), out, progress)
+        lessons = [
+            draw(scenario, prompts, curriculum.layouts, curriculum.seed, place / "lessons" / scenario.name,
+                 workers, drawing)
+            for scenario, prompts in curriculum.prompts.items()
+        ]  # fmt: skip
+        facts = _trained(curriculum, Student(lessons, plan, place, device), out, progress)
         work.tidy(out)
     return facts
 
 
-def _trained(dataset: Dataset, student: Student, out: Path, progress: Progress) -> dict[str, Any]:
+def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Progress) -> dict[str, Any]:
     """Train what is missing, and write the model's folder."""
-    prompts, plan = student.prompts, student.plan
+    plan = student.plan
     curves = {name: student.stage(name, progress) for name in STAGES}
     facts = {
-        "dataset": {"name": dataset.name, "sha256": dataset.sha256, "seed": dataset.manifest.seed,
-                    "episodes": dataset.manifest.episodes, "scenes": len(student.scenes)},
-        "prompts": {p.version: p.sha256 for p in prompts},
+        **curriculum.settings(),
+        "scenes": {each.scenario.name: len(each.scenes) for each in student.lessons},
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),
         "vocabulary": student.tokenizer.get_vocab_size(),
@@ -84,26 +118,34 @@ def _trained(dataset: Dataset, student: Student, out: Path, progress: Progress) 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
-    data, plan, apart = facts["dataset"], facts["plan"], facts["held_out"]
+    plan = facts["plan"]
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
         for stage, curve in facts["curves"].items()
     )
+    apart = "\n".join(
+        f"| `{of['scenario']}` | {facts['scenes'][of['scenario']]} | {of['layouts']} | {of['questions']} "
+        f"| {of['kl_nats']:.3f} | {of['kl_of_the_mean_nats']:.3f} |"
+        for of in facts["held_out"]
+    )
     return f"""# {name}
 
 A Qwen3 of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained from random weights
-by `harness distill` to imitate one planner in one scenario. It shows the harness with a real language model
-that fits beside the source; it says nothing about Qwen3-4B or any other model, and drives nothing but
-`occluded-intersection`.
+by `harness distill` to imitate one planner in the scenarios below. It shows the harness with a real language
+model that fits beside the source; it says nothing about Qwen3-4B or any other model.
 
-- Data: `{data["name"]}`, {data["episodes"]} episodes from seed {data["seed"]}, {data["scenes"]} scenes
-  (manifest sha256 `{data["sha256"]}`), prompts {", ".join(facts["prompts"])}; every viewer, and the ego with
-  messages.
-- Teacher: the decision trees, as soft labels over the actions after which success is possible. A viewer that
-  cannot tell scenes apart learns their mean, so what is hidden makes it unsure.
+- Data: {facts["layouts"]} layouts a scenario from seed {facts["first_seed"]}, decision points drawn from each
+  level of their trees; prompts {", ".join(facts["prompts"])}; every viewer, and the ego with messages.
+- Teacher: outcomes, as soft labels over the actions after which success is possible. A viewer that cannot
+  tell scenes apart learns their mean, so what is hidden makes it unsure.
 - Seed {plan["seed"]}, batches of {plan["batch"]}, Muon {plan["muon_lr"]:g} and AdamW {plan["adam_lr"]:g}.
-- Read-out on {apart["questions"]} questions of {apart["episodes"]} episodes held out: KL to the soft labels
-  {apart["kl_nats"]:.3f} nats; always answering the mean label would give {apart["kl_of_the_mean_nats"]:.3f}.
+
+The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering the mean
+label:
+
+| scenario | scenes learnt | layouts held out | questions | KL | of the mean |
+|---|---|---|---|---|---|
+{apart}
 
 | stage | sequences | first loss | last loss |
 |---|---|---|---|

@@ -10,17 +10,16 @@ import torch
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset
 from harness.prompts import readout
-from harness.prompts.versions import Prompt
 from harness.training.answers import answer, evidence
-from harness.training.examples import Question, alone, excerpts, kl_nats, split, taught, with_messages
+from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
+from harness.training.lessons import Lessons
 from harness.training.model import END, PAD, chat, new_model, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
 BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be
-HELD_OUT = 0.05  # episodes that are not trained on, a share of all
+HELD_OUT = 0.05  # layouts that are not trained on, a share of all
 
 
 Progress = Callable[[str, int, float], None]
@@ -28,37 +27,34 @@ T = TypeVar("T")
 
 
 class Student:
-    """The dataset as questions, the tokenizer, and the model as it grows."""
+    """The lessons as questions, the tokenizer, and the model as it grows."""
 
-    def __init__(
-        self, dataset: Dataset, prompts: Sequence[Prompt], plan: Plan, work: Path, device: str
-    ) -> None:
-        self.plan, self.work, self.prompts, self.actions = plan, work, prompts, dataset.actions
-        self.data, self.held_out = split(dataset, max(1, round(len(dataset.episodes) * HELD_OUT)))
-        self.scenes = taught(self.data)
-        self.questions = list(alone(self.data, self.scenes, prompts))
+    def __init__(self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str) -> None:
+        self.plan, self.work = plan, work
+        self.lessons, self.held_out = zip(*(each.split(HELD_OUT) for each in lessons), strict=True)
+        self.questions = [q for each in self.lessons for q in alone(each)]
         self.tokenizer = self._tokenizer()
-        self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(self.actions)]
+        most = max((each.scenario.actions for each in lessons), key=len)
+        self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
         end, pad = (self.tokenizer.token_to_id(t) for t in (END, PAD))
         self.model = new_model(self.tokenizer.get_vocab_size(), end, pad, plan.seed).to(device)
         self._shared: dict[str, Any] = {}
 
     def reading(self, questions: Sequence[Question]) -> list[Sample]:
         """Samples where one letter is asked for; drawn by the label, it is followed by a report in words."""
-        rng, letters = np.random.default_rng(self.plan.seed), readout.letters(self.actions)
-        drawn = [letters[rng.choice(len(letters), p=q.label)] for q in questions]
-        return [
-            self._sample(
-                readout.asked(q.messages, self.actions), f"{letter}: {evidence(q.graph)}{END}", q.label
-            )
-            for q, letter in zip(questions, drawn, strict=True)
-        ]
+        rng = np.random.default_rng(self.plan.seed)
+        samples = []
+        for q in questions:
+            letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=q.label)]
+            said = f"{letter}: {evidence(q.graph)}{END}"
+            samples.append(self._sample(readout.asked(q.messages, q.actions), said, q.label))
+        return samples
 
-    def writing(self, questions: Sequence[Question], intents: Floats) -> list[Sample]:
+    def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
         """Samples whose answer states a distribution."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         return [
-            self._sample(q.messages, answer(q.prompt, q.graph, p, self.actions, bare=bool(b)) + END, None)
+            self._sample(q.messages, answer(q.prompt, q.graph, p, q.actions, bare=bool(b)) + END, None)
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
 
@@ -69,36 +65,40 @@ class Student:
 
     @cached_property
     def heard(self) -> list[Question]:
-        """The ego's questions with messages in some scenes, as the first stage's model reads helpers out.
+        """The ego's questions with messages in some scenes, as the first stages' model reads helpers out.
 
         Raises:
             UserError: in the scenes that are taken no message reaches the ego.
         """
-        most = self.plan.samples["messages"] // (4 * len(self.prompts))
-        scenes = self.some(self.scenes, most)
-        ids = {scene.id for scene in scenes}
+        prompts = sum(len(each.prompts) for each in self.lessons)
+        most = self.plan.samples["messages"] // (4 * prompts)  # of each scenario
+        some = [(each, self.some(each.scenes, most)) for each in self.lessons]
+        helpers = {
+            key(each, scene, helper, prompt)
+            for each, scenes in some for scene in scenes
+            for helper in scene.viewers[1:] for prompt in each.prompts
+        }  # fmt: skip
         spoke = [
-            (question.key, sample)
-            for question, sample in zip(self.questions, self.asked, strict=True)
-            if question.graph["role"] == "helper" and question.key.split("/")[0] in ids
+            (q.key, sample) for q, sample in zip(self.questions, self.asked, strict=True) if q.key in helpers
         ]
         kept = self.work / "heard.pt"
         if not kept.is_file():  # a later stage's model, after a kill, would read otherwise
-            save({"intents": torch.from_numpy(self.read([sample for _, sample in spoke]))}, kept)
-        intents = torch.load(kept, weights_only=True)["intents"].numpy()
-        said = dict(zip((key for key, _ in spoke), intents, strict=True))
-        heard = list(with_messages(self.data, scenes, self.prompts, said)) if said else []
+            read = [torch.from_numpy(p) for p in self.read([sample for _, sample in spoke])]
+            save({"intents": read}, kept)
+        intents = [p.numpy() for p in torch.load(kept, weights_only=True)["intents"]]
+        said = dict(zip((name for name, _ in spoke), intents, strict=True))
+        heard = [q for each, scenes in some for q in with_messages(each, scenes, said)]
         if not heard:
             raise UserError(
                 f"--samples: {self.plan.samples['messages']} sequences of the stage messages take too few "
-                "scenes: no message reaches the ego in them; give more, or a dataset with more helpers"
+                "scenes: no message reaches the ego in them; give more, or a scenario with more helpers"
             )
         return heard
 
     def samples(self, stage: str) -> list[Sample]:
         """What a stage learns from; the last two rehearse the read-outs of earlier ones."""
         if stage == "excerpts":
-            return self.reading(list(excerpts(self.questions, self.actions, self.data.scenario.prompt_words)))
+            return self.reading(list(excerpts(self.questions)))
         if stage == "alone":
             return self.asked
         with_heard = self.reading(self.heard)
@@ -131,20 +131,27 @@ class Student:
         going.unlink(missing_ok=True)
         return curve
 
-    def held_out_kl(self) -> dict[str, Any]:
-        """KL (nats) of the read-out to the soft labels on held-out episodes, beside the mean label's."""
-        questions = list(alone(self.held_out, taught(self.held_out), self.prompts))
-        labels = np.stack([q.label for q in questions])
-        mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
-        return {
-            "episodes": len(self.held_out.episodes),
-            "questions": len(questions),
-            "kl_nats": kl_nats(labels, self.read(self.reading(questions))),
-            "kl_of_the_mean_nats": kl_nats(labels, mean),
-        }
+    def held_out_kl(self) -> list[dict[str, Any]]:
+        """Of each scenario, KL (nats) of the read-out to the soft labels on held-out layouts.
 
-    def read(self, samples: Sequence[Sample]) -> Floats:
-        """Read-outs of some samples, (n, A)."""
+        Beside it stands that of always answering the mean label.
+        """
+        facts = []
+        for each in self.held_out:
+            questions = list(alone(each))
+            labels = np.stack([q.label for q in questions])
+            mean = np.broadcast_to(labels.mean(axis=0), labels.shape)
+            facts.append({
+                "scenario": each.scenario.name,
+                "layouts": len(each.episodes),
+                "questions": len(questions),
+                "kl_nats": kl_nats(labels, np.stack(self.read(self.reading(questions)))),
+                "kl_of_the_mean_nats": kl_nats(labels, mean),
+            })  # fmt: skip
+        return facts
+
+    def read(self, samples: Sequence[Sample]) -> list[Floats]:
+        """Read-outs of some samples, (A,) each."""
         return read_out(self.model, samples, self.letters)
 
     def _sample(self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None) -> Sample:
@@ -164,7 +171,7 @@ class Student:
         file = self.work / "tokenizer.json"
         if not file.is_file():
             some = self.some(self.questions, 5000)
-            texts = ["".join(chat(readout.asked(q.messages, self.actions))) for q in some]
-            texts += [answer(q.prompt, q.graph, q.label, self.actions) for q in some]
+            texts = ["".join(chat(readout.asked(q.messages, q.actions))) for q in some]
+            texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts).save(str(file))
         return Tokenizer.from_file(str(file))

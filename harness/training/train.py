@@ -1,8 +1,8 @@
 """Training in four stages, each from the weights of the one before.
 
 1. `excerpts`: prompts that show nothing but the conflicts, so that reading the numbers is learnt on short
-   sequences. The read-out (one letter) is fitted to the outcome table's soft label by KL, and a report in
-   words follows it, which names the gap between two arrivals.
+   sequences. The read-out (one letter) is fitted to the soft label by KL, and a report in words follows it,
+   which names the gap between two arrivals.
 2. `alone`: the same with whole prompts, of every viewer.
 3. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 2 is rehearsed.
 4. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
@@ -45,7 +45,8 @@ class Sample:
         shared: how many of them are the system message, equal in all samples of a `kind`.
         kind: names that system message.
         answer_at: where the answer starts.
-        target: what the read-out there should be, (A,); None where the answer is a text from its first token.
+        target: what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
+            text from its first token.
     """
 
     ids: NDArray[np.int32]
@@ -173,6 +174,7 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
         at = torch.tensor([batch[i].answer_at - shared - 1 for i in reading], device=device)
         logits = hidden[torch.tensor(reading, device=device), at] @ weight.T
         target = torch.from_numpy(np.stack(list(targets.values()))).to(logits)
+        letters = letters[: target.shape[1]]
         kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
         # Beside the letters nothing should be likely where a letter is asked for.
         outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
@@ -199,15 +201,18 @@ def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample]) -> Any:
     return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
 
 
-def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> Floats:
-    """Distribution over the letters after each prompt, (n, A)."""
+def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> list[Floats]:
+    """Distribution over the letters after each prompt, (A,) each."""
     model.eval()
     device = next(model.parameters()).device
-    weight = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
-    p = np.zeros((len(samples), len(letters)))
+    of_letters = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
+    p: dict[int, Floats] = {}
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
     for _, group in groupby(order, key=lambda i: samples[i].kind):
         of_kind = list(group)
+        target = samples[of_kind[0]].target
+        assert target is not None
+        weight = of_letters[: len(target)]
         for start in range(0, len(of_kind), batch):
             some = of_kind[start : start + batch]
             asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
@@ -215,8 +220,8 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
             with torch.no_grad():
                 hidden = hidden_states(model, asked)
                 logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
-            p[some] = torch.softmax(logits.float(), -1).cpu().numpy()
-    return p
+            p.update(zip(some, torch.softmax(logits.double(), -1).cpu().numpy(), strict=True))
+    return [p[i] for i in range(len(samples))]
 
 
 def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:

@@ -1,0 +1,138 @@
+"""The decision points that a model learns from, and what it should have intended there.
+
+They are drawn from the decision trees of train layouts: of each level up to `OF_A_LEVEL` points, whose
+actions are all tried. So a model sees the scenes that its own errors lead to, for a tenth of what whole trees
+cost.
+
+An action is safe if the episode still succeeds when the driver that sees no more than the ego takes the rest:
+what only one who sees everything could still save is not safe for who does not. Each safe action has the
+weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one has none. Where IDLE and
+another come to the same (FASTER at the highest speed level, a lane as good) most goes to IDLE. A viewer that
+cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure. A
+point at which nothing is safe any more teaches nothing, and is not gone on from.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.files import write_whole
+from harness.core.parallel import spread
+from harness.dataset.freeze import edges, moment
+from harness.dataset.load import Scene
+from harness.prompts.versions import Prompt
+from harness.world.drivers import PRIVILEGED
+from harness.world.outcome import Outcome
+from harness.world.reference import drive, finish
+from harness.world.scenario import Scenario
+from harness.world.world import World
+
+TEACHER = "local-view"
+SOFTNESS_S = 0.25
+OF_A_LEVEL = 5
+CALM = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}  # prior weight of an action, 1 if not named
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """What is learnt from one scenario.
+
+    Attributes:
+        scenario: whose actions and words the prompts have.
+        prompts: versions that are learnt.
+        scenes: decision points, layout by layout.
+        labels: soft label of each, (A,), by its id.
+    """
+
+    scenario: Scenario
+    prompts: tuple[Prompt, ...]
+    scenes: tuple[Scene, ...]
+    labels: Mapping[str, Floats]
+
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """The layouts that are learnt from, by number."""
+        return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
+
+    def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
+        """All but the last layouts, of which a share is held out, at least one; and those."""
+        last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
+        apart = [scene.record["episode"] in last for scene in self.scenes]
+        parts = (
+            tuple(s for s, out in zip(self.scenes, apart, strict=True) if out == of) for of in (False, True)
+        )
+        kept, held = (replace(self, scenes=part) for part in parts)
+        return kept, held
+
+
+def draw(
+    scenario: Scenario, prompts: Sequence[Prompt], layouts: int, seed: int, place: Path, workers: int,
+    progress: Callable[[int], None],
+) -> Lessons:  # fmt: skip
+    """Draw what is missing in the folder `place`, a file a layout, and read all of it.
+
+    Args:
+        scenario: what is decided in.
+        prompts: versions that are learnt.
+        layouts: how many; number n has layout seed `seed + n`.
+        seed: first layout seed.
+        place: folder of what is drawn, which a killed call goes on with.
+        workers: processes.
+        progress: called with the number of layouts just done.
+    """
+    place.mkdir(parents=True, exist_ok=True)
+    files = [place / f"{n:05d}.json" for n in range(layouts)]
+    todo = [n for n, file in enumerate(files) if not file.is_file()]
+    progress(layouts - len(todo))
+    spread(partial(_draw_to_file, scenario, place, seed), todo, workers, progress)
+    points = [point for file in files for point in msgspec.json.decode(file.read_bytes())]
+    scenes = tuple(Scene(point["moment"]) for point in points)
+    labels = {point["moment"]["scene"]: np.array(point["label"]) for point in points}
+    return Lessons(scenario, tuple(prompts), scenes, labels)
+
+
+def _draw_to_file(scenario: Scenario, place: Path, seed: int, number: int) -> None:
+    write_whole(place / f"{number:05d}.json", msgspec.json.encode(drawn(scenario, seed + number, number)))
+
+
+def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
+    """A layout's decision points that are learnt from: each one's `moment` and soft `label`."""
+    rng = noise.generator("lessons", scenario.name, seed)
+    reference, points = drive(scenario, PRIVILEGED, seed), []
+    level = [World.start(scenario, seed)]
+    while level:
+        following: dict[str, World] = {}
+        for n in sorted(rng.permutation(len(level))[:OF_A_LEVEL].tolist()):
+            world, state = level[n], level[n].state()
+            seen = moment(world, state, number, (state.ego, *state.helpers))
+            children: dict[str, World] = {}
+            ends_s = dict.fromkeys(world.actions, float(np.inf))
+            for edge in list(edges(world, number, children)):
+                if edge.end:
+                    outcome = Outcome(edge.end.result, edge.end.time_s)
+                else:
+                    outcome = finish(list(children.values())[edge.to or 0].branch(), TEACHER)
+                if outcome.judged(reference, scenario.parameters).success and outcome.time_s is not None:
+                    ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
+            if np.isfinite(list(ends_s.values())).any():
+                points.append({"moment": seen, "label": label(ends_s).tolist()})
+                following.update(children)
+        level = list(following.values())
+    return points
+
+
+def label(ends_s: Mapping[str, float]) -> Floats:
+    """Soft label (A,) of a decision point, of when the episode succeeds after each action (inf for never).
+
+    At least one has to be finite.
+    """
+    time_s = np.array(list(ends_s.values()))
+    weight = np.array([CALM.get(a, 1.0) for a in ends_s]) * np.exp((time_s.min() - time_s) / SOFTNESS_S)
+    return np.asarray(weight / weight.sum())
