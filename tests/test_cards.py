@@ -216,6 +216,7 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
         (("inference_s = 0", ""), ["inference_s", "card"]),
         (('source = "card"', 'source = "paper"'), ["inference_s", "card"]),
         (("inference_s = 0", "inference_s = -1.0"), ["inference_s = -1.0", "0 or more"]),
+        (("inference_s = 0", "inference_s = 1e308"), ["inference_s = 1e+308", "at most 3600"]),
         (("inference_s = 0", "inference_s = nan"), ["inference_s = nan", "0 or more"]),
         (("inference_s = 0", "inference_s = true"), ["inference_s", "float"]),
         (("[latency]", "[latency"), ["mine.toml", "no TOML"]),

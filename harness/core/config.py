@@ -18,7 +18,6 @@ import tomllib
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from sys import float_info
 from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
@@ -29,7 +28,10 @@ from harness.core.files import text_of
 
 Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
-Seconds = Annotated[float, msgspec.Meta(ge=0, le=float_info.max, description="seconds, 0 or more")]
+LONGEST_S = 3600.0  # of an answer that a model can be declared to take
+Seconds = Annotated[
+    float, msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}")
+]
 _type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
 _STEPS = re.compile(r"[^.\[\]`]+")  # of a path such as `.points[1].loss`

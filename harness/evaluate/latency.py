@@ -13,13 +13,13 @@ from harness.backends.base import Backend, Timed
 from harness.backends.cards import Card
 from harness.backends.registry import capabilities
 from harness.core.arrays import Floats
+from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.runs.records import Answer, Latency, Times
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
 MEASURED = "measured"
 NAMES = ("card", MEASURED, "paper")
-LONGEST_S = 3600.0  # of an inference that can be declared
 EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 

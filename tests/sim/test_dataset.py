@@ -432,6 +432,7 @@ HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "actions that are no names": {"actions": [["IDLE"], {}]},
     "an allowance that is a text": {"parameters": {"delay_allowance_s": "1"}},
     "an unknown field": {"extra": 1},
+    "a scenario that is none": {"scenario": "egg"},
 }
 
 
