@@ -21,11 +21,12 @@ from harness.backends.base import Completion, Request
 from harness.backends.cards import Latency as CardLatency
 from harness.backends.cards import resolve
 from harness.coordination.operating_point import POINTS, named_point
+from harness.core.config import LONGEST_S
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
-from harness.evaluate.latency import LONGEST_S, PAPER, as_declared, declared, known, times
+from harness.evaluate.latency import PAPER, as_declared, declared, known, times
 from harness.evaluate.timing import IDLE, measured
 from harness.runs.records import Latency, Times
 
