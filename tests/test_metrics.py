@@ -12,6 +12,7 @@ from harness.core.statistics import (
     Estimate,
     brier,
     episode_interval,
+    mean_of,
     negative_log_likelihood,
     rate_difference,
     rate_interval,
@@ -253,3 +254,32 @@ def test_unknown_decisions_are_left_out_and_none_gives_no_share():
     share = rate_interval(np.array([1.0, np.nan, 0.0]), np.array([0, 0, 1]))
     assert (share.value, share.n, share.n_excluded) == (0.5, 2, 1)
     assert np.isnan(rate_interval(np.array([np.nan]), np.array([0])).value)
+
+
+def test_the_mean_of_two_families_by_hand():
+    """.5 [.3, .6] and .9 [.8, .96]: the ends are half of √(.2² + .1²) below and of √(.1² + .06²) above .7."""
+    mean = mean_of([Estimate(0.5, 0.3, 0.6, 20, 0), Estimate(0.9, 0.8, 0.96, 50, 1)])
+    assert (mean.value, mean.low, mean.high) == pytest.approx((0.7, 0.588197, 0.758310), abs=1e-6)
+    assert (mean.n, mean.n_excluded) == (70, 1)
+
+
+def test_the_mean_of_one_family_is_its_own_and_what_one_does_not_bound_the_mean_does_not():
+    one = mean_of([Estimate(0.5, 0.3, 0.6, 20, 0)])
+    assert (one.value, one.low, one.high) == pytest.approx((0.5, 0.3, 0.6))
+    open_above = mean_of([Estimate(0.5, 0.3, 0.6, 20, 0), Estimate(0.9, 0.8, NAN, 1, 0)])
+    assert open_above.low == pytest.approx(0.588197, abs=1e-6)
+    assert math.isnan(open_above.high)
+
+
+@pytest.mark.parametrize("rates", [(0.5, 0.5, 0.5), (0.4, 0.7, 0.9), (0.6, 0.95, 0.8)])
+def test_the_interval_of_the_mean_over_families_holds_the_truth_as_often_as_it_says(rates):
+    """Exactly, over all outcomes of 20 episodes in each of three families."""
+    n = 20
+    of_k = [Estimate(k / n, *wilson(k / n, n), n, 0) for k in range(n + 1)]
+    chances = [stats.binom.pmf(range(n + 1), n, rate) for rate in rates]
+    truth, held = sum(rates) / 3, 0.0
+    for ks in np.ndindex(n + 1, n + 1, n + 1):
+        mean = mean_of([of_k[k] for k in ks])
+        if mean.low <= truth <= mean.high:
+            held += math.prod(chance[k] for chance, k in zip(chances, ks, strict=True))
+    assert 0.94 < held < 0.97

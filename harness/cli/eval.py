@@ -1,11 +1,12 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli import options
+from harness.cli import options, suite
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
@@ -15,6 +16,7 @@ from harness.core.seeds import stated
 
 if TYPE_CHECKING:
     from harness.dataset.load import Dataset as Frozen
+    from harness.evaluate.run import Evaluated, Opens
     from harness.evaluate.spec import Spec
 
 COLUMNS = (
@@ -58,57 +60,85 @@ def command(
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
-    from harness.dataset import load
+    from harness.dataset import load, suites
     from harness.dataset.select import Selection
     from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
 
+    named = suites.named(dataset)
     selection = Selection(limit, only, danger, sample, sample_seed)
-    frozen = selection.of(load.load(load.find(dataset), None if selection.given else limit))
-    spec = Spec(
-        card=cards.resolve(model, engine),
-        prompt=versions.load(prompt or frozen.scenario.prompt),
-        source=FrozenSource(frozen, selection),
-        points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
-        seeds=options.parse_seeds(seeds),
-        thinking=thinking,
-        answer=answer,
-        batch_size=batch_size,
-        device=device,
-        dtype=dtype,
-        latency=latency,
-        tags=tuple(dict.fromkeys(tag or ())),
-    )
+    frozen = [
+        selection.of(load.load(load.find(name), None if selection.given else limit))
+        for name in (named.datasets if named else (dataset,))
+    ]
+    card, channel_seeds = cards.resolve(model, engine), options.parse_seeds(seeds)
+    specs = [
+        Spec(
+            card=card,
+            prompt=versions.load(prompt or each.scenario.prompt),
+            source=FrozenSource(each, selection),
+            points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+            seeds=channel_seeds,
+            thinking=thinking,
+            answer=answer,
+            batch_size=batch_size,
+            device=device,
+            dtype=dtype,
+            latency=latency,
+            tags=tuple(dict.fromkeys(tag or ())),
+        )
+        for each in frozen
+    ]
+    if named:
+        suite.check(named, specs)
     if dry_run:
-        _dry_run(spec, frozen, tokenizer, as_json, quiet)
+        counted = [_counted(*each, tokenizer) for each in zip(specs, frozen, strict=True)]
+        if as_json:
+            echo_json(counted if named else counted[0])
+        elif not quiet:
+            for each in zip(specs, counted, strict=True):
+                _show_counted(*each)
         return
-    folder = out or default_out(spec)
-    silent = as_json or quiet
-    with bar(f"asking {printable(spec.card.name, 30)}", quiet=silent) as progress:
-        cache = None if no_cache else default_file()
-        done = evaluate(spec, folder, progress, cache, progress.more)
-    from harness.cli.report import write
-
-    with work.going_on(folder):
-        page = write([folder], quiet=silent, dataset=frozen)
-    work.tidy(folder)
+    silent, cache = as_json or quiet, None if no_cache else default_file()
+    evaluated = partial(_evaluated, cache=cache, silent=silent)
+    if named:
+        suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
+        return
+    done, page = evaluated(specs[0], frozen[0], out or default_out(specs[0]))
     if as_json:
         echo_json(as_mapping(done))
     if silent:
         return
-    seeds_of = frozen.manifest.episodes if selection.given else len(frozen.episodes)
+    seeds_of = frozen[0].manifest.episodes if selection.given else len(frozen[0].episodes)
     notes = (
-        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds; "
-        f"{'of ' if selection.given else ''}{stated(frozen.manifest.seed, seeds_of)};",
+        f"n = {len(frozen[0].episodes)} episodes × {len(channel_seeds)} channel seeds; "
+        f"{'of ' if selection.given else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
         "intervals over episodes; msgs an episode; gain: over single-local, paired",
     )
-    show(done, frozen.name, COLUMNS, notes)
+    show(done, frozen[0].name, COLUMNS, notes)
     typer.echo(f"wrote {page}")
 
 
-def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: bool, quiet: bool) -> None:
+def _evaluated(
+    spec: "Spec", dataset: "Frozen", folder: Path, opens: "Opens | None" = None,
+    *, cache: Path | None, silent: bool,
+) -> "tuple[Evaluated, Path]":  # fmt: skip
+    """Evaluate, and write the run and its page."""
+    from harness.evaluate.run import evaluate
+
+    with bar(f"asking {printable(spec.card.name, 30)}", quiet=silent) as progress:
+        done = evaluate(spec, folder, progress, cache, progress.more, opens=opens)
+    from harness.cli.report import write
+
+    with work.going_on(folder):
+        page = write([folder], quiet=silent, dataset=dataset)
+    work.tidy(folder)
+    return done, page
+
+
+def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[str, Any]:
+    """What would be asked: the settings, how many requests about the scenes, and the tokens of prompts."""
     from harness.backends.tokens import counter, spread_of
     from harness.evaluate.asking import requests
 
@@ -120,17 +150,18 @@ def _dry_run(spec: "Spec", dataset: "Frozen", tokenizer: Path | None, as_json: b
         if count:
             sizes.setdefault(request.role, []).append(count(request.messages))
     stats = {role: spread_of(n) for role, n in sizes.items()}
-    if as_json:
-        echo_json({**spec.settings(), "requests": asked, "prompt_tokens": stats or None})
-    if as_json or quiet:
-        return
+    return {**spec.settings(), "requests": asked, "scenes": len(scenes), "prompt_tokens": stats or None}
+
+
+def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     typer.echo(
-        f"{asked} requests for the {len(scenes)} scenes on the reference drivers' courses; would score "
-        f"{len(spec.points)} conditions × {len(spec.seeds)} seeds; no model was called"
+        f"{spec.source.name}: {counted['requests']} requests for the {counted['scenes']} scenes on the "
+        f"reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} seeds; "
+        "no model was called"
     )
-    for role, s in stats.items():
+    for role, s in (counted["prompt_tokens"] or {}).items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
-    if not stats:
+    if not counted["prompt_tokens"]:
         typer.echo(
             "prompt tokens: not counted, no tokenizer at hand; give --tokenizer (tokenizer.json or GGUF)"
         )

@@ -1,6 +1,6 @@
 """What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -45,10 +45,17 @@ def default_out(spec: "Spec") -> Path:
     """The first folder of the run's name under reports/ that is free, or where this was stopped."""
     from harness.evaluate.run import goes_on
 
-    mode = "" if spec.answer == "json" else f"-{spec.answer}"
-    name = f"{file_name(spec.card.name)}-{spec.prompt.version}{mode}-{spec.source.name}"
+    return free_folder([spec], spec.source.name, lambda folder: goes_on(spec, folder))
+
+
+def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
+    """The first folder of a name under reports/ that is not there, or in which this goes on."""
+    first = specs[0]
+    prompts = "-".join(dict.fromkeys(spec.prompt.version for spec in specs))
+    mode = "" if first.answer == "json" else f"-{first.answer}"
+    name = f"{file_name(first.card.name)}-{prompts}{mode}-{scenes}"
     folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
-    return next(folder for folder in folders if not folder.exists() or goes_on(spec, folder))
+    return next(folder for folder in folders if not folder.exists() or goes_on(folder))
 
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:

@@ -20,7 +20,7 @@ def purpose(first: int, count: int) -> Purpose:
     Raises:
         UserError: they are not all for one purpose.
     """
-    found = _purposes(first, count)
+    found = purposes(first, count)
     if len(found) > 1:
         ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]
         raise UserError(
@@ -32,10 +32,11 @@ def purpose(first: int, count: int) -> Purpose:
 
 def stated(first: int, count: int) -> str:
     """Layout seeds as they stand beside a number: `layout seeds 0 to 239 (tune)`."""
-    return f"layout seeds {first} to {first + count - 1} ({' and '.join(_purposes(first, count))})"
+    return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 
 
-def _purposes(first: int, count: int) -> list[Purpose]:
+def purposes(first: int, count: int) -> list[Purpose]:
+    """What the layout seeds `first` to `first + count - 1` are for; several where no command asked before."""
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
     return [n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count]

@@ -6,6 +6,7 @@ should is measured by `benchmarks/coverage.py`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -192,6 +193,20 @@ def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
 
     low, high = value - reach(p - p_low, q_high - q), value + reach(p_high - p, q - q_low)
     return Estimate(value, low, high, n, n_excluded)
+
+
+def mean_of(estimates: Sequence[Estimate]) -> Estimate:
+    """Unweighted mean of independent estimates, with an interval from their own, of their level.
+
+    An end is as far from the mean as the estimates' ends from them, added as squares ("MOVER": Zou and Donner
+    2008). What is averaged is fixed, not drawn from more of its kind: another family of scenes is not in the
+    interval. NaN where any estimate's is.
+    """
+    value, low, high = (np.array([getattr(e, end) for e in estimates]) for end in ("value", "low", "high"))
+    mean = float(np.mean(value))
+    below, above = (math.hypot(*(value - end)) / len(value) for end in (low, high))
+    n, n_excluded = sum(e.n for e in estimates), sum(e.n_excluded for e in estimates)
+    return Estimate(mean, mean - below, mean + above, n, n_excluded)
 
 
 def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:

@@ -37,6 +37,7 @@ from harness.runs.summary import counted, scores
 if TYPE_CHECKING:  # the simulator is loaded by who drives
     from harness.evaluate.live_world import LiveSource, LiveWorld
 
+Opens = Callable[..., Backend]  # as `open_backend` is called
 EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
 
@@ -66,6 +67,7 @@ def evaluate(
     cache: Path | None = None,
     more: Callable[[int], None] = lambda count: None,
     workers: int = 1,
+    opens: Opens | None = None,
 ) -> Evaluated:
     """Evaluate a model with a prompt and write the run's folder; the same for any number of workers.
 
@@ -80,6 +82,7 @@ def evaluate(
         cache: file of completions kept between runs, for language models; None for no cache.
         more: called with the number of answers that are owed next, where scenes are frozen.
         workers: processes that drive, each with a backend of its own.
+        opens: in the place of `open_backend`, where scenes are frozen: what it gives may be open already.
 
     Raises:
         UserError: the folder holds something else, or the model is not available. Nothing is written then.
@@ -90,13 +93,11 @@ def evaluate(
         raise UserError(
             f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
         )
-    begun = work.begun(out, Begun)
-    if begun:
-        work.same(out, _compared(spec.settings()), _compared(begun.settings))
-    elif spec.latency == latencies.MEASURED:
+    begun = left(spec, out)
+    if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(spec, spec.source, out, begun, progress, cache, more)
+        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens or open_backend)
     return _closed_loop(spec, cast("LiveSource", spec.source), out, begun, progress, cache, workers)
 
 
@@ -117,10 +118,10 @@ def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walke
 
 def _frozen(
     spec: Spec, source: FrozenSource, out: Path, begun: Begun | None, progress: Callable[[int], None],
-    cache: Path | None, more: Callable[[int], None],
+    cache: Path | None, more: Callable[[int], None], opens: Opens,
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
-    backend = open_backend(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
+    backend = opens(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
     latency = _latency(spec, begun, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     begun = _begin(spec, out, begun, backend.identity(), latency)
     with work.working(out, begun, "run.json") as place:
@@ -235,15 +236,20 @@ def finished(spec: Spec, out: Path) -> Evaluated:
     return Evaluated(out, run.manifest, run.scores)
 
 
+def left(spec: Spec, out: Path) -> Begun | None:
+    """What a stopped run in a folder began with. Raises UserError if it, or what is there, is another."""
+    begun = work.begun(out, Begun)
+    if begun:
+        work.same(out, _compared(spec.settings()), _compared(begun.settings))
+    return begun
+
+
 def goes_on(spec: Spec, out: Path) -> bool:
     """Whether this was begun in a folder, stopped there, and nobody is at it."""
     try:
-        begun = work.begun(out, Begun)
-        if begun:
-            work.same(out, _compared(spec.settings()), _compared(begun.settings))
+        return left(spec, out) is not None and not work.held(out)
     except UserError:
         return False
-    return begun is not None and not work.held(out)
 
 
 def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import find
 from harness.core.errors import printable
@@ -22,6 +22,17 @@ _FAILED = {
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
     return [*unread(scores), *no_prompt([manifest])]
+
+
+def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
+    """What is to be said of runs, each sentence once; of several with the names of those it is about."""
+    about: dict[str, list[str]] = {}
+    for name, run in runs.items():
+        for sentence in of(run):
+            about.setdefault(sentence, []).append(name)
+    if len(runs) == 1:
+        return list(about)
+    return [f"{', '.join(names)}: {sentence}" for sentence, names in about.items()]
 
 
 def unread(scores: Sequence[Score]) -> Iterator[str]:

@@ -5,7 +5,7 @@ text nodes and nothing else of what it reads, characters that show nothing or tu
 out, and the page's own policy lets two scripts run, named by their digests, and forbids every request.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
-from harness.runs.folder import Run
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -75,8 +74,9 @@ def render(
     charts = list(panels(runs))
     decisions = Decisions(runs, prompts)
     alone = len(runs.names) == 1
-    unread = _said(runs, lambda run: caveats.unread(run.scores))
-    others = _said(runs, caveats.of_run)
+    by_name = dict(zip(runs.names, runs.runs, strict=True))
+    unread = caveats.said(by_name, lambda run: caveats.unread(run.scores))
+    others = caveats.said(by_name, caveats.of_run)
     blocks = []
     for block in decisions.blocks():
         blocks.append(library.packed(block))
@@ -107,17 +107,6 @@ def render(
         index=library.packed(decisions.index),
         blocks=blocks,
     )  # fmt: skip
-
-
-def _said(runs: Runs, of: Callable[[Run], Iterable[str]]) -> list[str]:
-    """What is to be said of runs, each sentence once; of several with the names of those it is about."""
-    about: dict[str, list[str]] = {}
-    for name, run in zip(runs.names, runs.runs, strict=True):
-        for sentence in of(run):
-            about.setdefault(sentence, []).append(name)
-    if len(runs.names) == 1:
-        return list(about)
-    return [f"{', '.join(names)}: {sentence}" for sentence, names in about.items()]
 
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:

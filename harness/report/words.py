@@ -1,15 +1,19 @@
 """Numbers and findings in the words of the report."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from harness.core import multiplicity
 from harness.core.multiplicity import LEVEL, holm
+from harness.core.statistics import Estimate, mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
 from harness.runs.records import Latency, Score, Times
+from harness.runs.suite import SuiteRun
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -35,25 +39,29 @@ def interval(score: Score) -> str:
     return f"{number(score.low * factor, digits)} to {number(score.high * factor, digits)}{suffix}"
 
 
-def headline(run: Run) -> str:
+def headline(run: Run | SuiteRun) -> str:
     """The result in one short sentence: the best condition, and the one without V2V beside it."""
     model = run.manifest.model.get("name")
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
     text = f"With {best} {model} clears {_success(run, best)} of the episodes"
+    if isinstance(run, SuiteRun):
+        text += f" (mean over {len(run.runs)} families)"
     if not base:
         several = len(run.conditions) > 1
         return text + (", and no other condition does better." if several else ".")
     text += f", with {base} {_success(run, base)}"
     gain = run.score(best, GAIN + base)
     if gain is not None and interval(gain):
-        clear = "a clear difference" if _p_values(run, base)[best] <= LEVEL else "this may be chance"
+        p = p_values(run, base)
+        corrected = dict(zip(p, holm(list(p.values())), strict=True))[best]
+        clear = "a clear difference" if corrected <= LEVEL else "this may be chance"
         text += f": {clear}"
     return text + "."
 
 
-def compared(run: Run) -> tuple[str, str]:
+def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """The best condition, and the one that it is held against: the one without V2V, or the worst.
 
     Empty where there is none.
@@ -78,13 +86,17 @@ def figures(run: Run) -> list[dict[str, str]]:
     return [{"what": what, **shown(score)} for what, score in wanted if score is not None]
 
 
-def _p_values(run: Run, base: str) -> dict[str, float]:
-    """Of the gain in success of each condition over one of them, corrected by Holm's method."""
-    ended = np.array([e.success for e in run.episodes], dtype=float).reshape(run.grid.shape)
-    success = {c: of.T for c, of in zip(run.conditions, ended, strict=True)}
-    alone = success.pop(base)
-    p_values = [metrics.p_value(SUCCESS, of, alone) for of in success.values()]
-    return dict(zip(success, holm([1.0 if p is None else p for p in p_values]), strict=True))
+def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
+    """Of the gain in success of each other condition over one of them; of a suite the mean gain's."""
+    runs = run.runs.values() if isinstance(run, SuiteRun) else (run,)
+    ended = [np.array([e.success for e in one.episodes], dtype=float).reshape(one.grid.shape) for one in runs]
+
+    def gain(condition: str, level: float) -> Estimate:
+        a, b = (run.conditions.index(name) for name in (condition, base))
+        return mean_of([metrics.difference(SUCCESS, each[a].T, each[b].T, level) for each in ended])
+
+    found = {c: multiplicity.p_value(partial(gain, c)) for c in run.conditions if c != base}
+    return {c: 1.0 if p is None else p for c, p in found.items()}
 
 
 def p_value(p: float) -> str:
@@ -92,7 +104,7 @@ def p_value(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
-def _success(run: Run, condition: str) -> str:
+def _success(run: Run | SuiteRun, condition: str) -> str:
     score = run.score(condition, SUCCESS)
     assert score is not None
     return shown(score)["value"]

@@ -5,6 +5,7 @@ from typing import Any, Literal
 from msgspec import Struct, field
 
 from harness.core.config import Seconds
+from harness.core.statistics import Estimate
 
 Role = Literal["ego", "helper", "merge"]
 
@@ -255,6 +256,18 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     n: int
     n_excluded: int
     interval: str
+
+    @classmethod
+    def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
+        """An estimate as a line; None for NaN."""
+        value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
+        return cls(condition, metric, value, low, high, e.n, e.n_excluded, interval)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The line as an estimate; NaN for None."""
+        value, low, high = (float("nan") if x is None else x for x in (self.value, self.low, self.high))
+        return Estimate(value, low, high, self.n, self.n_excluded)
 
 
 class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True):

@@ -8,7 +8,6 @@ from msgspec.structs import replace
 
 from harness.core.arrays import Floats
 from harness.core.statistics import (
-    Estimate,
     episode_interval,
     rate_difference,
     rate_interval,
@@ -57,10 +56,10 @@ def of_conditions(conditions: Sequence[str], values: Mapping[str, Floats]) -> It
     """Each metric (C, S, E) in each condition, over seeds and over episodes."""
     for place, condition in enumerate(conditions):
         for name, each in values.items():
-            yield _score(condition, name, over_seeds(name, each[place]), "seed means")
-            yield _score(condition, name, over_episodes(name, each[place]), "episodes")
+            yield Score.of(condition, name, over_seeds(name, each[place]), "seed means")
+            yield Score.of(condition, name, over_episodes(name, each[place]), "episodes")
         total = values["messages_per_episode"][place].sum(axis=1)
-        yield _score(condition, "message_count", seed_interval(total), "seed means")
+        yield Score.of(condition, "message_count", seed_interval(total), "seed means")
 
 
 def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
@@ -70,7 +69,7 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
         mine = of_seeds[place * len(grid.seeds) : (place + 1) * len(grid.seeds)]
         for percent, values in zip(PERCENTILES, mine.T, strict=True):
             estimate = in_range(LATENCY, seed_interval(values))
-            yield _score(condition, f"latency_p{percent}_ms", estimate, "seed means")
+            yield Score.of(condition, f"latency_p{percent}_ms", estimate, "seed means")
 
 
 def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
@@ -79,8 +78,8 @@ def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
         for place, condition in enumerate(conditions):
             if condition != BASELINE:
                 mine, other, name = success[place], success[conditions.index(BASELINE)], GAIN + BASELINE
-                yield _score(condition, name, seed_rate_interval(mine - other), "seed means")
-                yield _score(condition, name, rate_difference(mine.T, other.T), "episodes")
+                yield Score.of(condition, name, seed_rate_interval(mine - other), "seed means")
+                yield Score.of(condition, name, rate_difference(mine.T, other.T), "episodes")
 
 
 def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Score]:
@@ -96,7 +95,7 @@ def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Sco
             if given:
                 hits = np.array([float(answer.verdict == verdict) for answer in given])
                 of = np.array([episodes[answer.scene] for answer in given])
-                yield _score(ALL, f"{verdict}_rate_{role}", rate_interval(hits, of), "answers")
+                yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, of), "answers")
     for role, given in by_role.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
             counts = [
@@ -107,7 +106,7 @@ def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Sco
             if counts:
                 values, of = np.array(counts, dtype=float).T
                 estimate = in_range(what, episode_interval(values, of.astype(int)))
-                yield _score(ALL, f"{what}_{role}", estimate, "answers")
+                yield Score.of(ALL, f"{what}_{role}", estimate, "answers")
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
@@ -134,8 +133,3 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
         replace(episode, **dict(zip(columns, values, strict=True)))
         for episode, *values in zip(ordered, *columns.values(), strict=True)
     ]
-
-
-def _score(condition: str, metric: str, e: Estimate, interval: str) -> Score:
-    value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
-    return Score(condition, metric, value, low, high, e.n, e.n_excluded, interval)

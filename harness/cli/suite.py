@@ -1,0 +1,183 @@
+"""`harness eval --dataset suite:NAME`: a run of each dataset, and the means over families."""
+
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import typer
+
+from harness.cli.estimates import console, echo_json, interval, table
+from harness.cli.run import as_mapping, free_folder
+from harness.core import work
+from harness.core.errors import UserError, printable
+from harness.core.formats import WORK
+
+if TYPE_CHECKING:
+    from harness.dataset.load import Dataset
+    from harness.dataset.suites import Suite
+    from harness.evaluate.spec import Spec
+    from harness.report.suite import Line
+    from harness.runs.records import Score
+    from harness.runs.suite import SuiteRun
+
+MOST_INTERVALS = 3  # conditions whose intervals fit into a line
+
+
+def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
+    """Raise UserError unless a model can be evaluated on a suite."""
+    from harness.backends.registry import capabilities
+    from harness.evaluate.latency import MEASURED
+
+    families = [spec.scenario.name for spec in specs]
+    if twice := {family for family in families if families.count(family) > 1}:
+        raise UserError(
+            f"suite {printable(suite.name)} has {' and '.join(sorted(twice))} twice; "
+            "give each family one dataset"
+        )
+    first = specs[0]
+    if first.latency == MEASURED:
+        raise UserError(
+            f"--latency {MEASURED}: its own first runs would keep the machine busy; measure on one dataset, "
+            "and give the seconds that its run.json has"
+        )
+    if not capabilities(first.card.engine).closed_loop:
+        raise UserError(
+            f"--model {printable(first.card.name)}: a replay has the answers of one run; replay its dataset"
+        )
+
+
+def _left(specs: "Sequence[Spec]", out: Path) -> None:
+    """Raise UserError unless a folder is new, or these runs were stopped in it."""
+    from harness.evaluate.run import finished
+    from harness.evaluate.run import left as left_in
+    from harness.runs.suite import FILE, SUMMARY
+
+    if (out / FILE).is_file():
+        raise UserError(
+            f"--out {printable(out)} already holds a finished suite; choose another folder or delete it"
+        )
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {printable(out)} is no folder; choose an empty or a new one")
+    ours = {SUMMARY, "report.html", *_names(specs)}
+    if out.is_dir() and any(path.name not in ours and path.name[0] != "." for path in out.iterdir()):
+        raise UserError(
+            f"--out {printable(out)} is a folder with other files in it; choose an empty or a new one"
+        )
+    for spec in specs:
+        run = out / spec.source.name
+        if (run / "run.json").is_file():
+            finished(spec, run)
+        else:
+            left_in(spec, run)
+
+
+def _names(specs: "Sequence[Spec]") -> list[str]:
+    return [spec.source.name for spec in specs]
+
+
+def _goes_on(specs: "Sequence[Spec]", out: Path) -> bool:
+    """Whether these runs were stopped in a folder, and nobody is at them."""
+    try:
+        _left(specs, out)
+    except UserError:
+        return False
+    return not any(work.held(run) for run in map(out.joinpath, _names(specs)) if (run / WORK).is_dir())
+
+
+def evaluate(
+    suite: "Suite", specs: "Sequence[Spec]", datasets: "Sequence[Dataset]", out: Path | None,
+    evaluated: Callable[..., Any], quiet: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means."""
+    from harness.backends.registry import open_backend
+    from harness.report import suite as report
+    from harness.report.compare.page import beside
+    from harness.report.page import save
+    from harness.runs.folder import read
+    from harness.runs.suite import SuiteRun, write
+
+    folder = out or free_folder(specs, suite.name, partial(_goes_on, specs))
+    _left(specs, folder)
+    opens = cache(open_backend)
+    for spec, dataset in zip(specs, datasets, strict=True):
+        run = folder / spec.source.name
+        if not (run / "run.json").is_file() or (run / WORK).is_dir():
+            evaluated(spec, dataset, run, opens)
+    by_family = {spec.scenario.name: dataset for spec, dataset in zip(specs, datasets, strict=True)}
+    runs = {family: read(folder / dataset.name) for family, dataset in by_family.items()}
+    done = SuiteRun(folder, suite.name, suite.description, runs)
+    lines = report.lines(done, by_family)
+    page = folder / "report.html"
+    save(report.render([(done, lines)], beside(page)), page, "--out")
+    write(done)
+    if as_json:
+        echo_json(_mapping(done, lines))
+    elif not quiet:
+        _show(done, lines)
+        typer.echo(f"wrote {page}")
+
+
+def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
+    """A suite's run for machines: each family's run, and the means over families."""
+    from harness.evaluate.run import Evaluated
+
+    drivers = {line.name: msgspec.to_builtins(line.drivers) for line in lines}
+    return {
+        "suite": done.name,
+        "folder": str(done.path),
+        "families": {
+            family: {**as_mapping(Evaluated(run.path, run.manifest, run.scores)), "drivers": drivers[family]}
+            for family, run in done.runs.items()
+        },
+        "mean": {"summary": msgspec.to_builtins(done.scores), "drivers": drivers[lines[-1].name]},
+    }
+
+
+def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
+    """Print success, gains and the reference drivers, each a table of families."""
+    from harness.report import caveats
+    from harness.report.suite import seeds_of
+    from harness.runs.summary import BASELINE
+
+    text, m = console(), done.variant
+    text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
+    for said in (
+        *caveats.said(done.runs, lambda run: caveats.unread(run.scores)),
+        *caveats.no_prompt(run.manifest for run in done.runs.values()),
+    ):
+        text.print(said)
+    gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
+    _matrix("success, % [95 % CI]", "success", done.conditions, lines)
+    _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)
+    drivers = list(lines[-1].drivers)
+    table(
+        ("reference drivers, %", *drivers, "n", "seeds"),
+        [
+            (
+                line.name, *(f"{100 * (line.drivers[d].value or 0.0):.1f}" for d in drivers),
+                *((str(len(line.run.grid.episodes)), seeds_of(line.run)) if line.run else ("", "")),
+            )
+            for line in lines
+        ],
+        True,
+    )  # fmt: skip
+    text.print(
+        f"n: episodes, each × {len(done.manifest.seeds)} channel seeds; seeds: what the layouts are for; "
+        "intervals over episodes; gains paired; the mean weights families alike, and its interval is of "
+        "other episodes of these families"
+    )
+
+
+def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:
+    """Print one score of every family and condition, with its interval."""
+    for start in range(0, len(conditions), MOST_INTERVALS):
+        some = conditions[start : start + MOST_INTERVALS]
+        rows = [(line.name, *(_cell(getattr(line.cells[c], what)) for c in some)) for line in lines]
+        table((head, *some), rows, tight=True)
+        typer.echo()
+
+
+def _cell(score: "Score | None") -> str:
+    return "-" if score is None else interval(score.value, score.low, score.high, 100)

@@ -1,0 +1,60 @@
+"""Suites: datasets that are evaluated together, one of each family of scenes (a scenario).
+
+`datasets/suites.toml` has a table a suite: its description and the names of its datasets.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable, unknown
+from harness.core.resources import entries
+
+PREFIX = "suite:"  # of a suite's name, where a dataset's is expected
+
+
+class Suite(Struct, frozen=True, forbid_unknown_fields=True):
+    """One suite.
+
+    Attributes:
+        name: how it is called.
+        description: what it is for.
+        datasets: names of its datasets, in the order of tables.
+    """
+
+    name: str
+    description: str
+    datasets: Annotated[
+        tuple[str, ...], Meta(min_length=1, description="a list of datasets' names, one or more")
+    ]
+
+
+def named(text: str) -> Suite | None:
+    """The suite that `suite:NAME` names, shipped or the project's; None for any other text.
+
+    Raises:
+        UserError: there is no such suite, or two, or its table is wrong.
+    """
+    if not text.startswith(PREFIX):
+        return None
+    name, files = text.removeprefix(PREFIX), entries("datasets", "suites.toml")
+    tables = [(file, key, table) for file in files for key, table in _tables(file).items()]
+    found = [(file, table) for file, key, table in tables if key == name]
+    if not found:
+        raise unknown("suite", name, {key for _, key, _ in tables})
+    if len(found) > 1:
+        raise UserError(
+            f"suite {printable(name)} is in this project and ships with the harness; give yours another name"
+        )
+    [(file, table)] = found
+    where = f"suite {printable(name)} in {printable(file)}"
+    if not isinstance(table, Mapping):
+        raise UserError(f"{where} is no table; give it a description and datasets")
+    return convert(table, Suite, where, name=name)
+
+
+def _tables(file: Path) -> dict[str, Any]:
+    return toml(file, f"file of suites {printable(file)}")

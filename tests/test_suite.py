@@ -1,0 +1,193 @@
+"""A suite: datasets of several families evaluated together, from the command to the page of all."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from shutil import copytree, rmtree
+from typing import Any
+
+import pytest
+from evaluating import same_files
+
+from harness.core.statistics import mean_of
+from harness.dataset.build import build
+from harness.runs.suite import read
+from harness.world import scenarios
+
+Said = tuple[int, str, str]
+Harness = Callable[..., Said]
+EVAL = ("eval", "--dataset", "suite:two", "--seeds", "0:2")
+DONE = Path("reports/proxy-v2-v4-two")
+SUITES = """
+[two]
+description = "Two families"
+datasets = ["small", "exits"]
+"""
+
+
+@pytest.fixture(scope="session")
+def exits_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("exits") / "exits"
+    build(scenarios.get("parking-exit"), out, 2, 5000, 1, lambda done: None)
+    return out
+
+
+@pytest.fixture
+def project(harness: Harness, tmp_path: Path, small_path: Path, exits_path: Path) -> Harness:
+    """The command, typed in a project that has a suite of two datasets."""
+    (tmp_path / "datasets").mkdir()
+    (tmp_path / "swarmdrive.toml").touch()
+    for name, path in (("small", small_path), ("exits", exits_path)):
+        (tmp_path / "datasets" / name).symlink_to(path)
+    (tmp_path / "datasets/suites.toml").write_text(SUITES)
+    return harness
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("made") / "suite"
+
+
+@pytest.fixture
+def evaluated(project: Harness, made: Path) -> Harness:
+    """The same project, after the suite was evaluated (once for all tests)."""
+    if made.exists():
+        copytree(made, DONE)
+    else:
+        code, _, err = project(*EVAL)
+        assert (code, err) == (0, "")
+        copytree(DONE, made)
+    return project
+
+
+def test_a_suite_is_a_run_of_each_dataset_their_means_and_a_page(project: Harness) -> None:
+    code, out, err = project(*EVAL)
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    lines = out.splitlines()
+    assert lines[0] == "proxy · prompt v2 and v4 · json · suite two"
+    assert lines[-1] == f"wrote {DONE / 'report.html'}"
+    firsts = [line.split("  ")[0] for line in lines]
+    for name in ("occluded-intersection", "parking-exit", "mean over families"):
+        assert firsts.count(name) == 3, "success, gains, reference drivers"
+    assert {path.name for path in DONE.iterdir()} == {
+        "small", "exits", "suite.json", "summary.csv", "report.html",
+    }  # fmt: skip
+    assert (DONE / "exits/report.html").is_file()
+
+
+def test_a_run_of_a_suite_is_what_it_is_alone(evaluated: Harness) -> None:
+    code, _, err = evaluated("eval", "--dataset", "exits", "--seeds", "0:2", "--out", "alone")
+    assert (code, err) == (0, "")
+    assert same_files(Path("alone"), DONE / "exits")
+
+
+def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness) -> None:
+    suite = read(DONE)
+    assert list(suite.runs) == ["occluded-intersection", "parking-exit"]
+    for metric in ("success_rate", "success_gain_over_single-local", "unsafe_rate", "latency_proxy_ms"):
+        scores = [run.score("6g", metric) for run in suite.runs.values()]
+        expected = mean_of([score.estimate for score in scores if score])
+        found = suite.score("6g", metric)
+        assert found
+        assert (found.value, found.low, found.high) == pytest.approx(
+            (expected.value, expected.low, expected.high), nan_ok=True
+        )
+        assert found.value == pytest.approx(sum(s.value for s in scores if s and s.value is not None) / 2)
+    assert found.n == 6, "four layouts and two"
+
+
+def test_json_has_every_family_and_the_means(project: Harness) -> None:
+    code, out, err = project(*EVAL, "--json", "--limit", "1")
+    told: dict[str, Any] = json.loads(out, parse_constant=pytest.fail)
+    assert (code, err, told["suite"]) == (0, "", "two")
+    assert list(told["families"]) == ["occluded-intersection", "parking-exit"]
+    of_family = told["families"]["parking-exit"]
+    assert of_family["manifest"]["world"]["name"] == "exits"
+    assert of_family["drivers"]["full-view"]["value"] == 1.0
+    rows = {(r["condition"], r["metric"], r["interval"]): r for r in told["mean"]["summary"]}
+    assert rows["6g", "success_rate", "episodes"]["n"] == 2
+    assert rows["6g", "success_gain_over_single-local", "episodes"]["ci_low"] is None, (
+        "one episode bounds nothing"
+    )
+
+
+def test_the_same_command_goes_on_and_a_finished_suite_is_refused(evaluated: Harness) -> None:
+    before = (DONE / "summary.csv").read_text()
+    kept = (DONE / "small/answers.jsonl").stat().st_mtime_ns
+    rmtree(DONE / "exits")  # as if it was killed between the two
+    for name in ("suite.json", "summary.csv", "report.html"):
+        (DONE / name).unlink()
+    code, _, err = evaluated(*EVAL)
+    assert (code, err) == (0, "")
+    assert (DONE / "summary.csv").read_text() == before
+    assert (DONE / "small/answers.jsonl").stat().st_mtime_ns == kept
+    code, out, err = evaluated(*EVAL, "--out", DONE)
+    assert (code, out) == (2, "")
+    assert err == (
+        f"harness: --out {DONE} already holds a finished suite; choose another folder or delete it\n"
+    )
+
+
+def test_other_settings_do_not_go_on(evaluated: Harness) -> None:
+    (DONE / "suite.json").unlink()
+    code, _, err = evaluated(*EVAL[:-1], "0:1", "--out", DONE)
+    assert code == 2
+    assert err.startswith(f"harness: --out {DONE / 'small'} was begun with another seeds")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--dataset", "suite:tow"), "unknown suite 'tow'; did you mean 'two'? known: two, v2v-safety\n"),
+        (("--prompt", "v2"), "--prompt v2 speaks of a crossing, which parking-exit is not; "),
+        (("--latency", "measured"), "--latency measured: "),
+        (("--only", "3"), "--only 3: give episodes from 0 to 1, "),
+    ],
+)
+def test_bad_input_is_one_line_before_anything_is_asked(
+    project: Harness, options: tuple[str, str], said: str
+) -> None:
+    code, out, err = project(*EVAL, *options)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"harness: {said}")
+    assert err.count("\n") == 1
+    assert not Path("reports").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ('two = "small"', "suite two in {file} is no table; give it a description and datasets"),
+        ("[two]\ndescription = ''\ndatasets = []", "suite two in {file}: datasets = []; allowed: a list of "
+         "datasets' names, one or more"),
+        ("[two]\ndescription = ''", "suite two in {file} has no datasets; add it"),
+        ("[two]\ndescription = ''\ndatasets = ['small', 'exits']\nweight = 1", "unknown key in suite two in "
+         "{file} 'weight'; known: datasets, description"),
+        ("[two]\ndescription = ''\ndatasets = ['none']", "unknown dataset 'none'; known: "),
+        ("[two]\ndescription = ''\ndatasets = ['small', 'small']", "suite two has occluded-intersection "
+         "twice; give each family one dataset"),
+        ("[v2v-safety]\ndescription = ''\ndatasets = ['small']\n[two]", "suite two in {file} has no "
+         "description; add it"),
+    ],
+)  # fmt: skip
+def test_a_wrong_table_is_one_line(project: Harness, table: str, said: str) -> None:
+    file = Path("datasets/suites.toml").absolute()
+    file.write_text(table)
+    code, out, err = project(*EVAL)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"harness: {said.format(file=file)}")
+
+
+def test_a_suite_of_the_project_may_not_have_a_shipped_ones_name(project: Harness) -> None:
+    Path("datasets/suites.toml").write_text(SUITES.replace("two", "v2v-safety"))
+    code, _, err = project("eval", "--dataset", "suite:v2v-safety")
+    assert code == 2
+    assert err.startswith("harness: suite v2v-safety is in this project and ships with the harness; ")
+
+
+def test_a_dry_run_counts_every_dataset(project: Harness) -> None:
+    code, out, err = project(*EVAL, "--dry-run")
+    assert (code, err) == (0, "")
+    assert [line.split(":")[0] for line in out.splitlines() if "requests" in line] == ["small", "exits"]
+    assert not Path("reports").exists()
