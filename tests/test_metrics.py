@@ -276,7 +276,7 @@ def test_the_interval_of_the_mean_over_families_holds_the_truth_as_often_as_it_s
     """Exactly, over all outcomes of 20 episodes in each of three families."""
     n = 20
     of_k = [Estimate(k / n, *wilson(k / n, n), n, 0) for k in range(n + 1)]
-    chances = [stats.binom.pmf(range(n + 1), n, rate) for rate in rates]
+    chances = [np.atleast_1d(stats.binom.pmf(np.arange(n + 1), n, rate)) for rate in rates]
     truth, held = sum(rates) / 3, 0.0
     for ks in np.ndindex(n + 1, n + 1, n + 1):
         mean = mean_of([of_k[k] for k in ks])

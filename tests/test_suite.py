@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 from evaluating import same_files
+from starlette.testclient import TestClient
 
 from harness.core.statistics import mean_of
 from harness.dataset.build import build
+from harness.report.view.app import app
+from harness.runs.listing import runs
 from harness.runs.suite import read
 from harness.world import scenarios
 
@@ -191,3 +194,63 @@ def test_a_dry_run_counts_every_dataset(project: Harness) -> None:
     assert (code, err) == (0, "")
     assert [line.split(":")[0] for line in out.splitlines() if "requests" in line] == ["small", "exits"]
     assert not Path("reports").exists()
+
+
+def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harness) -> None:
+    page = (DONE / "report.html").read_text()
+    for family, folder in (("occluded-intersection", "small"), ("parking-exit", "exits")):
+        assert f'<a href="{folder}/report.html">{family}</a>' in page
+        assert (DONE / folder / "report.html").is_file()
+    for score in (read(DONE).score(c, "success_rate") for c in ("single-local", "v2x", "6g")):
+        assert f"<dd>{100 * score.value:.1f} %" in page
+    code, out, err = evaluated("report", DONE, "--out", "again.html")
+    assert (code, err, out) == (0, "", "wrote again.html\n")
+    assert Path("again.html").read_text() == page.replace('href="', f'href="{DONE}/')
+
+
+def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) -> None:
+    code, _, err = evaluated(*EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1")
+    assert (code, err) == (0, "")
+    other = Path("reports/local-view-v2-v4-two")
+    code, out, err = evaluated("report", DONE, other, "--out", "both.html")
+    assert (code, out, err) == (0, "wrote both.html\n", "")
+    page = Path("both.html").read_text()
+    assert page.index("proxy · v2 and v4 · json on two") < page.index("local-view · v2 and v4 · json on two")
+    code, out, err = evaluated("report", DONE, other / "small", "--out", "both.html")
+    assert (code, out) == (2, "")
+    assert err == f"harness: {other / 'small'} is no suite, and others are; report them apart\n"
+
+
+def test_ls_lists_a_suite_above_its_runs_with_its_mean(evaluated: Harness) -> None:
+    found = {one.name: one for one in runs(Path("reports"))}
+    assert list(found) == [DONE.name, f"{DONE.name}/exits", f"{DONE.name}/small"]
+    suite, best = found[DONE.name], read(DONE).score(found[DONE.name].condition, "success_rate")
+    assert (suite.kind, suite.state, suite.model, suite.prompt) == ("suite", "finished", "proxy", "v2 and v4")
+    assert (suite.success, suite.low, suite.high) == (best.value, best.low, best.high)
+    assert "  suite proxy · v2 and v4 · json" in evaluated("ls")[1]
+
+
+@pytest.mark.parametrize(
+    "families", ["{}", '{"a": ".."}', '{"a": "/etc"}', '{"a": "none"}', '{"a": 1}', "[]", '{"a": "."}']
+)
+def test_a_broken_suite_is_one_line(evaluated: Harness, families: str) -> None:
+    (DONE / "suite.json").write_text(
+        f'{{"format": "swarmdrive-suite/1", "name": "two", "description": "", "families": {families}}}'
+    )
+    [suite] = [one for one in runs(Path("reports")) if one.kind == "suite"]
+    assert (suite.state, suite.why) == ("broken", "suite.json")
+    code, out, err = evaluated("report", DONE)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+
+
+def test_view_opens_a_suite_with_links_to_its_runs_and_none_whose_files_lead_out(evaluated: Harness) -> None:
+    browser = TestClient(app(Path("reports").absolute()), base_url="http://127.0.0.1")
+    page = browser.get("/run", params={"path": DONE.name})
+    assert page.status_code == 200
+    for family, folder in (("occluded-intersection", "small"), ("parking-exit", "exits")):
+        assert f'<a href="/run?path={DONE.name}%2F{folder}">{family}</a>' in page.text
+    assert browser.get("/run", params={"path": f"{DONE.name}/exits"}).status_code == 200
+    summary = DONE / "exits/summary.csv"
+    summary.rename("outside.csv")
+    summary.symlink_to(Path("outside.csv").absolute())
+    assert browser.get("/run", params={"path": DONE.name}).status_code == 400

@@ -7,7 +7,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
     from harness.dataset.load import Dataset
@@ -17,7 +17,7 @@ def command(
     runs: options.Runs,
     out: Path | None = typer.Option(None, help="File to write. Default, for one run: RUN/report.html."),
 ) -> None:
-    """Write one HTML file about a run, or several side by side. It needs no network."""
+    """Write one HTML file about a run or a suite, or several side by side. It needs no network."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out)}")
@@ -27,6 +27,10 @@ def write(
     runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None
 ) -> Path:
     """Write a report, with a progress bar; returns the file. `dataset` spares reading theirs again."""
+    from harness.runs.suite import FILE
+
+    if any((run / FILE).is_file() for run in runs):
+        return _write_suites(runs, out, quiet)
     from harness.report.page import write_report
     from harness.report.runs import gather
 
@@ -34,3 +38,14 @@ def write(
     scenes = len({scene for run in gathered.runs for scene in run.decisions.scenes})
     with bar("packing decisions", scenes, quiet) as progress:
         return write_report(gathered, out or runs[0] / "report.html", progress=progress)
+
+
+def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:
+    from harness.report import suite
+    from harness.runs.suite import FILE, read
+
+    if others := [folder for folder in folders if not (folder / FILE).is_file()]:
+        raise UserError(f"{printable(others[0])} is no suite, and others are; report them apart")
+    with bar("reading datasets", quiet=quiet):
+        suites = [(each, suite.lines(each)) for each in map(read, dict.fromkeys(folders))]
+    return suite.write(suites, out or folders[0] / "report.html")

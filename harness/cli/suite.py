@@ -93,8 +93,6 @@ def evaluate(
     """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means."""
     from harness.backends.registry import open_backend
     from harness.report import suite as report
-    from harness.report.compare.page import beside
-    from harness.report.page import save
     from harness.runs.folder import read
     from harness.runs.suite import SuiteRun, write
 
@@ -109,8 +107,7 @@ def evaluate(
     runs = {family: read(folder / dataset.name) for family, dataset in by_family.items()}
     done = SuiteRun(folder, suite.name, suite.description, runs)
     lines = report.lines(done, by_family)
-    page = folder / "report.html"
-    save(report.render([(done, lines)], beside(page)), page, "--out")
+    page = report.write([(done, lines)], folder / "report.html")
     write(done)
     if as_json:
         echo_json(_mapping(done, lines))

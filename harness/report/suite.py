@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from markupsafe import Markup
 
@@ -10,9 +11,9 @@ from harness.core.seeds import purposes
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report import caveats, words
-from harness.report.compare.page import Place
+from harness.report.compare.page import Place, beside
 from harness.report.drawing import colours
-from harness.report.page import environment
+from harness.report.page import environment, save
 from harness.runs.folder import Run, dataset_of
 from harness.runs.metrics import GAIN, SUCCESS, label, meaning
 from harness.runs.records import Score
@@ -55,14 +56,14 @@ class Line:
     cells: Mapping[str, Cell]
 
 
-def lines(suite: SuiteRun, datasets: Mapping[str, Dataset]) -> list[Line]:
+def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> list[Line]:
     """The families, then their mean. Holm's method corrects families' gains together, and means' together.
 
     Args:
         suite: what was run.
         datasets: by family, those that were read already; others are read.
     """
-    gains = BASELINE in suite.conditions
+    datasets, gains = datasets or {}, BASELINE in suite.conditions
     drivers = {
         family: _drivers(datasets.get(family) or dataset_of(run), run) for family, run in suite.runs.items()
     }
@@ -102,6 +103,12 @@ def seeds_of(run: Run) -> str:
     """What the layout seeds of a run's episodes are for."""
     seeds = [episode.layout_seed for episode in run.episodes]
     return " and ".join(purposes(min(seeds), max(seeds) - min(seeds) + 1))
+
+
+def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
+    """Write the page of one suite's run, or of several. Raises UserError if `out` cannot be written."""
+    save(render(suites, beside(out)), out, "--out")
+    return out
 
 
 def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> str:

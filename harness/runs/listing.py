@@ -14,6 +14,7 @@ from harness.core.errors import UserError, printable
 from harness.core.formats import CONFIG, FORMAT, READ_BY, WORK
 
 DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
+SUITE = "suite"
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
 SUCCESS, FAILED = "success_rate", "failed_rate_ego"
@@ -36,17 +37,18 @@ class Listed:
 
     Attributes:
         name: its folder, from the folder that is listed.
-        kind: `eval`, `drive`, `sweep` or `study`; `run` where a broken one does not say.
+        kind: `eval`, `drive`, `suite`, `sweep` or `study`; `run` where a broken one does not say.
         state: `finished`, `unfinished` or `broken`.
-        date: when it began; of a study and a broken run, when it was last written.
+        date: when it began; of a suite, when the last of its runs did; of a study and a broken run, when
+            it was last written.
         why: of an unfinished one, the option that continues it; of a broken one, the file at fault, and
             whose format it has where that is an older version's.
         model: name of its card; of a sweep, its sources.
-        prompt: version.
+        prompt: version; of a suite, those of its families.
         answer: answer mode.
         tags: words to find it by.
         condition: the one of the highest success rate; the first of several.
-        success: that rate, 0 to 1, over episodes.
+        success: that rate, 0 to 1, over episodes; of a suite, the mean over families.
         low: lower end of its 95 % interval; None where the data cannot bound it.
         high: upper end.
         unread: share of the ego's answers that could not be read.
@@ -115,6 +117,8 @@ def _one(path: str, root: str) -> Listed | None:
             return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
+    if has("suite.json"):
+        return _suite(path, root, has("summary.csv"), written)
     for name, kind in STUDIES.items():
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
@@ -139,23 +143,49 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         listed = replace(_described(listed, config), why="summary.csv")
-        if not has_summary:
-            return listed
-        with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
-            # A summary may have a thousand rows, and a folder a thousand summaries.
-            wanted = (f",{SUCCESS},", f",{FAILED},")
-            head, *lines = [x for n, x in enumerate(file) if n == 0 or any(each in x for each in wanted)]
-        table = list(csv.DictReader([head, *lines]))
-        rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]
-        best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
-        value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
-        unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)
-        return replace(
-            listed, state="finished", why=None, condition=best["condition"], success=value, low=low,
-            high=high, unread=unread,
-        )  # fmt: skip
+        return _summed(path, listed) if has_summary else listed
     except _BROKEN:
         return listed
+
+
+def _suite(path: str, root: str, has_summary: bool, written: datetime) -> Listed:
+    """A suite's folder: its runs say what it was made of, and its summary has the means."""
+    listed = Listed("", SUITE, "broken", written, "suite.json")
+    try:
+        names = _json(path, "suite.json")["families"].values()
+        found = [_one(os.path.join(path, name), root) for name in names if own_name(name)]
+        parts = [one for one in found if one and one.state == "finished"]
+        if not 0 < len(parts) == len(names):
+            return listed
+        listed = replace(
+            parts[0], kind=SUITE, state="broken", why="summary.csv", date=max(one.date for one in parts),
+            prompt=" and ".join(dict.fromkeys(str(one.prompt) for one in parts)),
+        )  # fmt: skip
+        return _summed(path, listed) if has_summary else listed
+    except _BROKEN:
+        return listed
+
+
+def own_name(name: str) -> bool:
+    """Whether a name is that of a folder in another, and not hidden there."""
+    return os.path.basename(name) == name and not name.startswith(".")
+
+
+def _summed(path: str, listed: Listed) -> Listed:
+    """The same, finished, with the best condition of its summary."""
+    with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
+        # A summary may have a thousand rows, and a folder a thousand summaries.
+        wanted = (f",{SUCCESS},", f",{FAILED},")
+        head, *lines = [x for n, x in enumerate(file) if n == 0 or any(each in x for each in wanted)]
+    table = list(csv.DictReader([head, *lines]))
+    rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]
+    best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
+    value, low, high = (_number(best[key]) for key in ("value", "ci_low", "ci_high"))
+    unread = next((_number(row["value"]) for row in table if row["metric"] == FAILED), None)
+    return replace(
+        listed, state="finished", why=None, condition=best["condition"], success=value, low=low,
+        high=high, unread=unread,
+    )  # fmt: skip
 
 
 def _described(made: Listed, config: dict[str, Any]) -> Listed:

@@ -13,6 +13,7 @@ from harness.core.files import write_whole
 from harness.core.statistics import mean_of
 from harness.runs import folder
 from harness.runs.folder import Run, csv_text
+from harness.runs.listing import own_name
 from harness.runs.records import Manifest, Score, Variant
 
 FILE = "suite.json"
@@ -29,7 +30,7 @@ class Contents(msgspec.Struct, frozen=True, kw_only=True):
     families: dict[str, str]
 
     def __post_init__(self) -> None:
-        if not self.families or any(Path(name).name != name for name in self.families.values()):
+        if not self.families or not all(map(own_name, self.families.values())):
             raise ValueError("families: none, or one outside this folder")
 
 
@@ -102,15 +103,21 @@ def mean(scores: Sequence[Score]) -> Score:
     return Score.of(first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval)
 
 
+def contents_of(path: Path) -> Contents:
+    """What a suite's folder says that it holds. Raises UserError if it is none."""
+    contents = folder.whole(path / FILE, lambda file: msgspec.json.decode(file.read_bytes(), type=Contents))
+    if contents.format != FORMAT:
+        raise UserError(f"{printable(path / FILE)} is of another version; make the runs again")
+    return contents
+
+
 def read(path: Path) -> SuiteRun:
     """Read a suite's folder.
 
     Raises:
         UserError: it is none, or one of its runs is no finished one or was made under other conditions.
     """
-    contents = folder.whole(path / FILE, lambda file: msgspec.json.decode(file.read_bytes(), type=Contents))
-    if contents.format != FORMAT:
-        raise UserError(f"{printable(path / FILE)} is of another version; make the runs again")
+    contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}
     first, *others = runs.values()
     for other in others:

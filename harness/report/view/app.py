@@ -35,7 +35,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from harness.core.errors import UserError, printable
 from harness.report.view import pages
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
-from harness.runs.listing import Listed, runs
+from harness.runs.listing import SUITE, Listed, runs
+from harness.runs.suite import contents_of
 
 HOSTS = ("127.0.0.1", "localhost")
 HEADERS = {
@@ -113,6 +114,8 @@ class View:
             raise UserError(
                 f"{printable(one.name)} is {one.state} ({printable(one.why)}); it has no page yet"
             )
+        if one.kind == SUITE:
+            return await self._drawn(request, partial(self._suite, one))
         if one.kind not in pages.RUNS:
             return await run_in_threadpool(self._study, one)
         written, made = (own_file(self.folder, one.name, name) for name in ("report.html", "run.json"))
@@ -175,6 +178,12 @@ class View:
 
     def _whole(self, picked: Sequence[Listed]) -> Sequence[Path]:
         return [whole(self.folder, one.name) for one in picked]
+
+    def _suite(self, one: Listed) -> str:
+        path = self.folder / one.name
+        for name in contents_of(path).families.values():
+            whole(self.folder, f"{one.name}/{name}")
+        return pages.suite(self.folder, path)
 
     def _study(self, one: Listed) -> Response:
         page = own_file(self.folder, one.name, "index.html")

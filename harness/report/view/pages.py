@@ -1,11 +1,13 @@
 """The pages as text. A run's text is hostile: the report's templates escape it all."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
@@ -13,6 +15,7 @@ from harness.report.page import environment, render
 from harness.report.runs import gather
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD, Listed, runs
+from harness.runs.suite import read
 
 RUNS = ("eval", "drive")
 TEMPLATES = Path(__file__).parent / "templates"
@@ -35,11 +38,17 @@ def report(folders: Sequence[Path]) -> str:
 
 def compared(folder: Path, a: Path, b: Path) -> str:
     """Run B compared with run A, both of a folder."""
+    return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, partial(_place, folder))
 
-    def place(run: Run) -> str:
-        return f"/run?{urlencode({'path': run.path.relative_to(folder).as_posix()})}"
 
-    return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, place)
+def suite(folder: Path, path: Path) -> str:
+    """The page of a suite's runs, in a folder of it."""
+    found = read(path)
+    return suites.render([(found, suites.lines(found))], partial(_place, folder))
+
+
+def _place(folder: Path, run: Run) -> str:
+    return f"/run?{urlencode({'path': run.path.relative_to(folder).as_posix()})}"
 
 
 def listed(folder: Path, words: str, order: str) -> str:
