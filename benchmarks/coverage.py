@@ -11,7 +11,7 @@ measured within 1 point of it.
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from time import perf_counter
 
@@ -21,6 +21,7 @@ from harness.core.arrays import Floats
 from harness.core.statistics import (
     Estimate,
     known_mean,
+    mean_of,
     rate_interval,
     seed_interval,
     seed_rate_interval,
@@ -157,6 +158,16 @@ def seed_gains(loss: float) -> Kind:
     return draw
 
 
+def suite(families: Sequence[Kind]) -> Kind:
+    """The mean over families, each with so many episodes of its own."""
+
+    def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
+        for drawn in zip(*(family(rng, runs, episodes) for family in families), strict=True):
+            yield mean_of([estimate for estimate, _ in drawn]), float(np.mean([truth for _, truth in drawn]))
+
+    return draw
+
+
 def kinds() -> Iterator[tuple[str, str, Kind]]:
     """What is measured: its heading, its row, and how it is drawn."""
     for seeds, alike in ((1, 1.0), (SEEDS, 0.1), (SEEDS, 0.6), (SEEDS, 0.9)):
@@ -180,6 +191,13 @@ def kinds() -> Iterator[tuple[str, str, Kind]]:
             yield heading, f"loss {loss}", kind(loss)
     for rate in RATES:
         yield "mean over 5 seeds with episodes of their own", f"{rate:.2f}", own_episodes(rate)
+    rows = (("one seed", 1, 1.0), (f"{SEEDS} seeds, alike 0.6", SEEDS, 0.6))
+    for row, seeds, alike in rows:
+        of_rates = [success(rate, alike, seeds) for rate in RATES]
+        yield "success rate, mean over families", row, suite(of_rates)
+    for row, seeds, alike in rows:
+        of_pairs = [gain(before, after, (alike, alike), seeds) for before, after in PAIRS]
+        yield "paired gain, mean over families", row, suite(of_pairs)
 
 
 def main() -> None:

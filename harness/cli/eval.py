@@ -34,7 +34,9 @@ def command(
     ),
     engine: options.Engine = None,
     prompt: options.ScenarioPrompt = None,
-    dataset: options.Dataset = resources.DATASET,
+    dataset: str = typer.Option(
+        resources.DATASET, help="Shipped dataset, a dataset's folder, or suite:NAME."
+    ),
     condition: options.Conditions = None,
     seeds: options.Seeds = "0:5",
     limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
