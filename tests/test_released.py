@@ -1,11 +1,13 @@
 """What is released is pinned, and is what it was."""
 
+import json
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from harness.core.files import sha256_file
+from harness.dataset import suites
 from harness.dataset.verify import check
 from harness.prompts import versions as prompts
 
@@ -17,6 +19,17 @@ DATASETS = tomllib.loads((ROOT / "datasets/released.toml").read_text())
 def test_a_shipped_dataset_is_sound_and_has_the_digest_it_was_released_with(name: str) -> None:
     assert sha256_file(ROOT / "datasets" / name / "manifest.json") == DATASETS[name]
     assert check(ROOT / "datasets" / name) == []
+
+
+@pytest.mark.parametrize("name", tomllib.loads((ROOT / "datasets/suites.toml").read_text()))
+def test_a_shipped_suite_has_one_released_dataset_of_each_family(name: str) -> None:
+    suite = suites.named(f"suite:{name}")
+    assert suite
+    families = [
+        json.loads((ROOT / "datasets" / d / "manifest.json").read_text())["scenario"] for d in suite.datasets
+    ]
+    assert set(suite.datasets) <= set(DATASETS)
+    assert len(set(families)) == len(families)
 
 
 @pytest.mark.parametrize("version", prompts.names())

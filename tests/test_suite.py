@@ -221,6 +221,12 @@ def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) 
     assert err == f"harness: {other / 'small'} is no suite, and others are; report them apart\n"
 
 
+def test_a_command_on_one_run_says_that_a_suite_has_several(evaluated: Harness) -> None:
+    code, out, err = evaluated("compare", DONE, DONE / "small")
+    assert (code, out) == (2, "")
+    assert err == f"harness: {DONE} is a suite; give the folder of one of its runs\n"
+
+
 def test_ls_lists_a_suite_above_its_runs_with_its_mean(evaluated: Harness) -> None:
     found = {one.name: one for one in runs(Path("reports"))}
     assert list(found) == [DONE.name, f"{DONE.name}/exits", f"{DONE.name}/small"]

@@ -8,6 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.core.errors import UserError, printable
+from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
     from harness.dataset.load import Dataset
@@ -27,9 +28,7 @@ def write(
     runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None
 ) -> Path:
     """Write a report, with a progress bar; returns the file. `dataset` spares reading theirs again."""
-    from harness.runs.suite import FILE
-
-    if any((run / FILE).is_file() for run in runs):
+    if any((run / SUITE).is_file() for run in runs):
         return _write_suites(runs, out, quiet)
     from harness.report.page import write_report
     from harness.report.runs import gather
@@ -42,9 +41,9 @@ def write(
 
 def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:
     from harness.report import suite
-    from harness.runs.suite import FILE, read
+    from harness.runs.suite import read
 
-    if others := [folder for folder in folders if not (folder / FILE).is_file()]:
+    if others := [folder for folder in folders if not (folder / SUITE).is_file()]:
         raise UserError(f"{printable(others[0])} is no suite, and others are; report them apart")
     with bar("reading datasets", quiet=quiet):
         suites = [(each, suite.lines(each)) for each in map(read, dict.fromkeys(folders))]

@@ -89,11 +89,11 @@ def show(
         [(name, *(column.cell(figures.get((name, column.metric))) for column in columns)) for name in names],
         tight,
     )
-    for note in (*notes, *_origins(m, figures)):
+    for note in (*notes, *origins(m, figures)):
         text.print(note)
 
 
-def _origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
+def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
     """Where a run's times come from and how its answers were read."""
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
     for role, took in m.answer_times.items():

@@ -9,10 +9,10 @@ import msgspec
 import typer
 
 from harness.cli.estimates import console, echo_json, interval, table
-from harness.cli.run import as_mapping, free_folder
+from harness.cli.run import as_mapping, free_folder, origins
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.formats import WORK
+from harness.core.formats import SUITE, WORK
 
 if TYPE_CHECKING:
     from harness.dataset.load import Dataset
@@ -52,9 +52,9 @@ def _left(specs: "Sequence[Spec]", out: Path) -> None:
     """Raise UserError unless a folder is new, or these runs were stopped in it."""
     from harness.evaluate.run import finished
     from harness.evaluate.run import left as left_in
-    from harness.runs.suite import FILE, SUMMARY
+    from harness.runs.suite import SUMMARY
 
-    if (out / FILE).is_file():
+    if (out / SUITE).is_file():
         raise UserError(
             f"--out {printable(out)} already holds a finished suite; choose another folder or delete it"
         )
@@ -165,6 +165,8 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         "intervals over episodes; gains paired; the mean weights families alike, and its interval is of "
         "other episodes of these families"
     )
+    for note in origins(done.manifest, {(s.condition, s.metric): s for s in done.scores}):
+        text.print(note)
 
 
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:

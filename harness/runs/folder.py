@@ -23,7 +23,7 @@ from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
-from harness.core.formats import FORMAT, READ_BY
+from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs.decisions import Decisions
@@ -177,7 +177,9 @@ def read(path: Path) -> Run:
     file = path / "run.json"
     if not file.is_file():
         raise UserError(
-            f"{printable(path)} is no finished run: it has no run.json; "
+            f"{printable(path)} is a suite; give the folder of one of its runs"
+            if (path / SUITE).is_file()
+            else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
     stated: Any = whole(file, lambda file: msgspec.json.decode(file.read_bytes()))

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
-from harness.core.formats import CONFIG, FORMAT, READ_BY, WORK
+from harness.core.formats import CONFIG, FORMAT, READ_BY, SUITE, WORK
 
 DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
-SUITE = "suite"
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
 SUCCESS, FAILED = "success_rate", "failed_rate_ego"
@@ -117,7 +116,7 @@ def _one(path: str, root: str) -> Listed | None:
             return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
-    if has("suite.json"):
+    if has(SUITE):
         return _suite(path, root, has("summary.csv"), written)
     for name, kind in STUDIES.items():
         if has(name):
@@ -150,15 +149,15 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
 
 def _suite(path: str, root: str, has_summary: bool, written: datetime) -> Listed:
     """A suite's folder: its runs say what it was made of, and its summary has the means."""
-    listed = Listed("", SUITE, "broken", written, "suite.json")
+    listed = Listed("", "suite", "broken", written, SUITE)
     try:
-        names = _json(path, "suite.json")["families"].values()
+        names = _json(path, SUITE)["families"].values()
         found = [_one(os.path.join(path, name), root) for name in names if own_name(name)]
         parts = [one for one in found if one and one.state == "finished"]
         if not 0 < len(parts) == len(names):
             return listed
         listed = replace(
-            parts[0], kind=SUITE, state="broken", why="summary.csv", date=max(one.date for one in parts),
+            parts[0], kind="suite", state="broken", why="summary.csv", date=max(one.date for one in parts),
             prompt=" and ".join(dict.fromkeys(str(one.prompt) for one in parts)),
         )  # fmt: skip
         return _summed(path, listed) if has_summary else listed

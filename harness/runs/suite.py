@@ -10,13 +10,13 @@ import msgspec
 
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
+from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
 from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
 from harness.runs.records import Manifest, Score, Variant
 
-FILE = "suite.json"
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means
 
@@ -52,8 +52,11 @@ class SuiteRun:
 
     @property
     def manifest(self) -> Manifest:
-        """The first run's. Another's differs in the world, the prompt where none was given, and the name."""
-        return next(iter(self.runs.values())).manifest
+        """The first run's, with all runs' counts. Others have another world, and may have another prompt."""
+        every = [run.manifest for run in self.runs.values()]
+        counts = ("cached_answers", "engine_errors", "retries")
+        totals = {name: sum(getattr(m, name) for m in every) for name in counts}
+        return msgspec.structs.replace(every[0], answer_times={}, **totals)
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -105,9 +108,9 @@ def mean(scores: Sequence[Score]) -> Score:
 
 def contents_of(path: Path) -> Contents:
     """What a suite's folder says that it holds. Raises UserError if it is none."""
-    contents = folder.whole(path / FILE, lambda file: msgspec.json.decode(file.read_bytes(), type=Contents))
+    contents = folder.whole(path / SUITE, lambda file: msgspec.json.decode(file.read_bytes(), type=Contents))
     if contents.format != FORMAT:
-        raise UserError(f"{printable(path / FILE)} is of another version; make the runs again")
+        raise UserError(f"{printable(path / SUITE)} is of another version; make the runs again")
     return contents
 
 
@@ -139,4 +142,4 @@ def write(suite: SuiteRun) -> None:
     write_whole(suite.path / SUMMARY, csv_text(Score, suite.scores, suite.variant))
     families = {family: run.path.name for family, run in suite.runs.items()}
     contents = Contents(format=FORMAT, name=suite.name, description=suite.description, families=families)
-    write_whole(suite.path / FILE, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n")
+    write_whole(suite.path / SUITE, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n")

@@ -35,7 +35,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from harness.core.errors import UserError, printable
 from harness.report.view import pages
 from harness.report.view.folder import PICTURES, own_file, pictures, whole
-from harness.runs.listing import SUITE, Listed, runs
+from harness.runs.listing import Listed, runs
 from harness.runs.suite import contents_of
 
 HOSTS = ("127.0.0.1", "localhost")
@@ -114,7 +114,7 @@ class View:
             raise UserError(
                 f"{printable(one.name)} is {one.state} ({printable(one.why)}); it has no page yet"
             )
-        if one.kind == SUITE:
+        if one.kind == "suite":
             return await self._drawn(request, partial(self._suite, one))
         if one.kind not in pages.RUNS:
             return await run_in_threadpool(self._study, one)
