@@ -18,7 +18,7 @@ def command(
     runs: options.Runs,
     out: Path | None = typer.Option(None, help="File to write. Default, for one run: RUN/report.html."),
 ) -> None:
-    """Write one HTML file about a run or a suite, or several side by side. It needs no network."""
+    """Write one HTML file about a run or suite, or several. It needs no network."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out)}")
