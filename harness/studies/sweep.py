@@ -109,9 +109,11 @@ def run_sweep(
         "versions": versions(),
     }
     write_manifest(out, "sweep", manifest)
+    found = tables(whole.summary)
     page = environment(TEMPLATES).get_template("sweep.html.j2").render(
         pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
-        tables=tables(whole.summary), seeds=seeds,
+        tables=found, sentences=[f"{name}: {in_a_sentence(rows)}." for name, rows in found.items()],
+        seeds=seeds, axes=len(along),
         title=f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
     )  # fmt: skip
     write_whole(out / "index.html", page)
@@ -144,6 +146,13 @@ def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
         axis = "condition" if panel == CORE else str(panel)
         found.setdefault(title, []).append(Row(axis, at, with_interval(*ends), others))
     return found
+
+
+def in_a_sentence(rows: Sequence[Row]) -> str:
+    """What came out along an axis: success at both ends, and where it is best if that lies between."""
+    shown = {row.at: f"{row.success} % of episodes succeed at {row.axis} {row.at}" for row in rows}
+    best = max(rows, key=lambda row: float(row.success.split()[0]))
+    return "; ".join(dict.fromkeys([shown[rows[0].at], shown[best.at], shown[rows[-1].at]]))
 
 
 def _over_episodes(row: dict[Any, Any]) -> bool:

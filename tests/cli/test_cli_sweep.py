@@ -1,6 +1,7 @@
 """`harness sweep` and `harness campaign paper` as typed."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,7 +27,9 @@ def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert out.splitlines()[-1] == "wrote swept/index.html"
-    table = pd.read_csv("swept/conditions.csv")
+    page, table = Path("swept/index.html").read_text(), pd.read_csv("swept/conditions.csv")
+    assert page.count('class="headline"') == page.count("<h2>") > 4
+    assert re.search(r"over loss: [^<]+ % of episodes succeed at loss 0; ", page)
     assert set(table.panel) == {"core", "size", "loss", "tau"}
     assert set(table[table.panel == "core"].condition) == {"single-local", "v2x", "6g"}
     assert table.source.nunique() == 2
