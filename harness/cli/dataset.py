@@ -25,7 +25,9 @@ Dataset = Annotated[
 
 @app.command()
 def build(
-    name: options.Scenario,
+    name: str | None = typer.Argument(None, help="Scenario.", show_default=False),
+    env: options.Env = None,
+    env_config: options.EnvConfig = None,
     episodes: int = typer.Option(200, help="Episodes."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = 2,
@@ -36,6 +38,7 @@ def build(
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
 ) -> None:
     """Freeze every course of some layouts. The same command again continues a build that was stopped."""
+    name = options.scenario_name(name, env, env_config)
     scenario = ready_to_drive(name, episodes, seed, workers)
     if lag is not None:
         period_s = scenario.parameters.decision_period_s
@@ -45,7 +48,7 @@ def build(
     from harness.dataset.build import build as build_dataset
 
     begun_s = time.monotonic()
-    with bar(f"freezing {name}", episodes) as progress:
+    with bar(f"freezing {printable(name, 30)}", episodes) as progress:
         manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit, progress.more)
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "

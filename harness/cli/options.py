@@ -19,6 +19,11 @@ Runs = Annotated[list[Path], Argument(help="Folders of finished runs.", metavar=
 Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds them.")]
 Model = Annotated[str, Option(help="Card, checkpoint directory, .gguf file or hub id. `harness model list`.")]
 Scenario = Annotated[str, Argument(help="Scenario.")]
+Env = Annotated[
+    str | None,
+    Option(help="An environment of highway-env in place of a scenario: merge-v0, or my_package:MyEnv-v0."),
+]
+EnvConfig = Annotated[Path | None, Option(help="JSON file of what its configuration changes.")]
 Engine = Annotated[str | None, Option(help="Another engine that the card names, such as llama-cpp.")]
 Prompt = Annotated[str, Option(help="Prompt version. `harness prompt list`.")]
 ScenarioPrompt = Annotated[
@@ -69,6 +74,30 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             f"of {MOST_SEEDS} seeds at most"
         )
     return seeds
+
+
+def scenario_name(name: str | None, env: str | None, env_config: Path | None) -> str:
+    """The scenario that is meant by a name, or by an environment and what its configuration changes."""
+    import json
+
+    from harness.world import environment
+
+    if (name is None) == (env is None):
+        raise UserError("give a scenario or --env, one of the two; `harness scenario list` lists scenarios")
+    if name is not None:
+        if env_config is not None:
+            raise UserError("--env-config is of an environment; give --env as well")
+        return name
+    assert env is not None
+    if env_config is None:
+        return f"{environment.PREFIX}{env}"
+    try:
+        changes = json.loads(env_config.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(
+            f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
+        ) from None
+    return environment.named(env, changes)
 
 
 def in_range(option: str, value: int, least: int, most: int) -> None:

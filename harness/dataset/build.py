@@ -37,10 +37,10 @@ from harness.dataset.schema import (
     tree_schema,
 )
 from harness.dataset.verify import level_name, read_manifest, tree_name
-from harness.world import scenarios
+from harness.world import environment, scenarios
 from harness.world.audit import Audit, audit
 from harness.world.reference import drive_all
-from harness.world.scenario import BEACON_DIALS, Scenario
+from harness.world.scenario import Scenario
 
 LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
@@ -68,7 +68,7 @@ def build(
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
             the seeds are for several purposes; or the audit needs a package that is missing.
     """
-    audits = audits and episodes >= LEAST_AUDITED
+    audits = audits and episodes >= LEAST_AUDITED and not scenario.start  # no danger is known of
     if audits:
         extras.need("an audit", "sklearn")
     config = {
@@ -82,6 +82,7 @@ def build(
             "harness": __version__,
             **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
         },
+        **({"environment": environment.config(scenario.name)} if scenario.start else {}),
     }
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
@@ -99,6 +100,8 @@ def build(
         return made
     if begun := work.begun(out, work.Begun):
         work.same(out, config, begun.settings)
+    elif scenario.start:
+        environment.examine(scenario, seed)
     with work.working(out, begun or work.Begun(settings=config)) as place:
         manifest = _built(scenario, out, place, config, workers, progress, audits, more)
         work.tidy(out)
@@ -202,9 +205,9 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     usual, p = scenarios.get(scenario.name).parameters, scenario.parameters
     dials = [
         f"{dial}={canonical_json(getattr(p, dial))}"
-        for dial in BEACON_DIALS if getattr(p, dial) != getattr(usual, dial)
+        for dial in scenarios.dials(scenario) if getattr(p, dial) != getattr(usual, dial)
     ]  # fmt: skip
-    name = f"{scenario.name}:{','.join(dials)}" if dials else scenario.name
+    name = environment.joined(scenario.name, dials)
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != usual.decision_lag_s else ""
     unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"

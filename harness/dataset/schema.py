@@ -202,6 +202,13 @@ class Snapshot(Closed, frozen=True):
     speed_index: Count
 
 
+class Taken(Closed, frozen=True):
+    """What an environment needs to come to the same again from its seed: the frame and name of each action."""
+
+    frame: Count
+    taken: list[tuple[Count, Text]]
+
+
 class Record(Closed, frozen=True):
     """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
 
@@ -215,7 +222,7 @@ class Record(Closed, frozen=True):
     graphs: dict[VehicleId, Graph]
     distance_m: dict[VehicleId, Number]
     range_m: dict[VehicleId, Number]
-    snapshot: Snapshot
+    snapshot: Snapshot | Taken
 
 
 class End(Closed, frozen=True):
@@ -275,11 +282,14 @@ class Tree(Closed, frozen=True):
 
 
 class Manifest(Closed, frozen=True):
-    """`manifest.json`: what a dataset was built from, and the sha256 of every file and of every tree."""
+    """`manifest.json`: what a dataset was built from, and the sha256 of every file and of every tree.
+
+    Of an environment it holds the whole configuration.
+    """
 
     format: Literal["swarmdrive-dataset/2"]
     name: FileName
-    scenario: Text
+    scenario: Annotated[str, Meta(max_length=4000)]
     actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
     parameters: dict[str, bool | Number | list[Number]]
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
@@ -289,6 +299,7 @@ class Manifest(Closed, frozen=True):
     versions: dict[str, Text]
     files: dict[FileName, Sha256]
     trees_sha256: list[Sha256]
+    environment: dict[str, Any] | None = None
 
 
 @lru_cache(maxsize=8)
@@ -313,7 +324,7 @@ def record_type(scenario: Scenario) -> type[Record]:
         danger=_narrowed(Danger, sector=sector | None),
         state=_narrowed(State, vehicles=Annotated[_list(vehicle), Meta(min_length=1)]),
         graphs=GenericAlias(dict, (VehicleId, graph)),
-        snapshot=_narrowed(Snapshot, sections=_list(section)),
+        snapshot=Taken if scenario.start else _narrowed(Snapshot, sections=_list(section)),
     )
     return kind
 

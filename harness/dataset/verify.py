@@ -15,8 +15,8 @@ import msgspec
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_bytes, sha256_file
-from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, record_type
-from harness.world import scenarios
+from harness.dataset.schema import LAYOUTS, Manifest, Record, Taken, Tree, record_type
+from harness.world import environment, scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.scenario import Scenario
 
@@ -66,6 +66,9 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
     if missing := expected.keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
+    if scenario.start and manifest.environment != (here := environment.config(scenario.name)):
+        differing = sorted(k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v)
+        yield f"[environment]: here its configuration has another {', '.join(differing) or 'set of keys'}"
 
 
 def scenario_of(manifest: Manifest) -> Scenario:
@@ -254,11 +257,12 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     viewers = {v.id for v in state.vehicles if v.part != "other"}
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
-    speeds, road = manifest.parameters["target_speeds_mps"], scenario.road()
+    speeds, road, snapshot = manifest.parameters["target_speeds_mps"], scenario.road(), record.snapshot
+    ours = None if isinstance(snapshot, Taken) else snapshot
     holds = {
         "it is the scene of another decision point": record.scene == name,
         "there is no target speed of that index": isinstance(speeds, list)
-        and record.snapshot.speed_index < len(speeds),
+        and (not ours or ours.speed_index < len(speeds)),
         "scene is not <episode>-<step>-<digest>": record.scene.startswith(
             f"{record.episode:05d}-{record.step}-"
         ),
@@ -277,6 +281,6 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
-        "sections are not one a vehicle": len(record.snapshot.sections) == len(ids),
+        "sections are not one a vehicle": not ours or len(ours.sections) == len(ids),
     }
     return [what for what, true in holds.items() if not true]

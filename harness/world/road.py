@@ -52,10 +52,13 @@ class Path:
     @classmethod
     def along(
         cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str],
-        priority: int,
+        priority: int, origin_m: tuple[float, float] = (0.0, 0.0), reach_m: float = math.inf,
     ) -> "Path":  # fmt: skip
-        """The middle of some of highway-env's lanes, each of which goes on where the one before it ends."""
-        middles = [_middle(network.get_lane(lane)) for lane in lanes]
+        """The middle of some of highway-env's lanes, each of which goes on where the one before it ends.
+
+        Of a lane as much as lies within `reach_m` of the origin of the road's frame, and at least a point.
+        """
+        middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
         arc = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
         ends = arc[np.cumsum([len(middle) for middle in middles])[:-1]]
@@ -96,9 +99,16 @@ class Path:
         return self.roles[self.section(arc_m)]
 
 
-def _middle(lane: Any) -> Floats:
+def _middle(lane: Any, origin_m: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """(n, 2) m, points of the middle of one of highway-env's lanes, its ends among them."""
-    return np.array([lane.position(s, 0.0) for s in np.linspace(0, lane.length, math.ceil(lane.length) + 1)])
+    along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
+    return np.array([lane.position(s, 0.0) for s in along]) - origin_m
+
+
+def _within(points: Floats, reach_m: float) -> Floats:
+    """Those of the points that lie so near the origin, or the nearest."""
+    away_m = np.hypot(*points.T)
+    return points[away_m <= max(reach_m, away_m.min())]
 
 
 @dataclass(frozen=True)
@@ -154,6 +164,7 @@ class Road:
         sectors: where danger can come from, and the points (k, 2) m that must be seen to know of it.
         network: gives highway-env's network, always the same one; nobody writes to it.
         ground: gives what a picture shows that reaches so many metres from the origin.
+        origin_m: where the origin is in highway-env's own frame.
     """
 
     facts: Mapping[str, str | float]
@@ -166,6 +177,7 @@ class Road:
     ground: Callable[[float], Ground]
     ways: tuple[PathKey, ...] = ()
     form: Literal[1, 2] = 2
+    origin_m: tuple[float, float] = (0.0, 0.0)
 
     def beside(self, key: PathKey) -> dict[str, PathKey]:
         """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such."""
@@ -250,24 +262,27 @@ def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: f
     return first, second
 
 
-def ground(network: Any, far_m: float) -> Ground:
+def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
     """What a picture shows of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
-    strips = [LineString(_middle(lane)).buffer(lane.width / 2 + 0.05, cap_style="flat") for lane in lanes]
+    strips = [
+        LineString(_middle(lane, origin_m)).buffer(lane.width / 2 + 0.05, cap_style="flat") for lane in lanes
+    ]
     surface = shapely.union_all(strips).buffer(1.0).buffer(-1.0).intersection(view)
     pieces = [piece for piece in shapely.get_parts(surface) if piece.geom_type == "Polygon"]
     rings = [ring for piece in pieces for ring in (piece.exterior, *piece.interiors)]
     outlines = tuple(np.asarray(ring.simplify(0.05).coords) * NORTH for ring in rings)
-    return Ground(outlines, tuple(_marks(lanes, view)), (), tuple(_boxes(strips, view)))
+    return Ground(outlines, tuple(_marks(lanes, view, origin_m)), (), tuple(_boxes(strips, view)))
 
 
-def _marks(lanes: Sequence[Any], view: Any) -> Iterator[Floats]:
+def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> Iterator[Floats]:
     """Lines between lanes that lie side by side."""
     for lane in lanes:
         if lane.line_types[0] == STRIPED:  # on its left; what is on its right is another's left, or an edge
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
-            line = LineString([lane.position(s, -lane.width / 2) for s in along]).intersection(view)
+            side = np.array([lane.position(s, -lane.width / 2) for s in along]) - origin_m
+            line = LineString(side).intersection(view)
             yield from (np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1)
 
 

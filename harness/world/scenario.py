@@ -181,6 +181,7 @@ class Scenario:
             hidden by". Templates read `words.<name>`.
         brake_lamps: whether vehicles show that they brake.
         prompt: version that is taken where none is named.
+        start: starts an episode that is not simulated by the harness, `(scenario, seed)`: a `World`.
     """
 
     name: str
@@ -193,6 +194,7 @@ class Scenario:
     words: Mapping[str, str]
     brake_lamps: bool = False
     prompt: str = "v4"
+    start: Callable[["Scenario", int], Any] | None = None
 
     @property
     def prompt_words(self) -> dict[str, str]:

@@ -250,11 +250,13 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
     return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans)
 
 
-def state_of(v: ControlledVehicle, lamps: bool = False) -> VehicleState:
+def state_of(
+    v: ControlledVehicle, lamps: bool = False, origin_m: tuple[float, float] = (0.0, 0.0)
+) -> VehicleState:
     """A vehicle as the rest of the program knows it, to the micrometre: the last bits are the machine's."""
     s = v.spawn
     x_m, y_m, heading_rad, speed_mps = (
-        round(float(number), DECIMALS) + 0.0 for number in (*v.position, v.heading, v.speed)
+        round(float(number), DECIMALS) + 0.0 for number in (*(v.position - origin_m), v.heading, v.speed)
     )
     return VehicleState(
         s.id, s.kind, s.part, x_m, y_m, heading_rad, speed_mps, s.approach, s.route, bool(v.crashed),

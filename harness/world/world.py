@@ -5,6 +5,7 @@ it is decided.
 """
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,10 +18,11 @@ from harness.world import beacons
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import NOBODY_DRAWS, new_road, populated, spawn_of, state_of, vehicle_on
-from harness.world.state import Beacon, WorldState, rectangle
+from harness.world.state import Beacon, VehicleState, WorldState, rectangle
 
 Snapshot = Mapping[str, Any]
 Target = tuple[str, int]  # route, and index of the scenario's target speeds
+TOUCHING_M = 1.0  # farther apart than that two wrecks did not meet in this frame
 HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 
@@ -55,6 +57,9 @@ class World:
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
         """The start of an episode."""
+        if scenario.start is not None:
+            begun: World = scenario.start(scenario, seed)
+            return begun
         layout = scenario.layout(seed, scenario.parameters)
         world = cls(scenario, seed, layout, populated(scenario, layout))
         poses = beacons.lead_in(scenario.parameters, np.array(world._poses()))
@@ -65,6 +70,12 @@ class World:
     def actions(self) -> tuple[str, ...]:
         """Meta-actions by name, the most careful first."""
         return self.scenario.actions
+
+    @property
+    def vehicles(self) -> Sequence[Any]:
+        """highway-env's vehicles, the ego first."""
+        vehicles: Sequence[Any] = self.road.vehicles
+        return vehicles
 
     @property
     def time_s(self) -> float:
@@ -93,6 +104,14 @@ class World:
     @classmethod
     def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
         """The world that `state` and `snapshot` were taken from, before its episode was decided."""
+        if scenario.start is not None:
+            world = cls.start(scenario, state.episode_seed)
+            for frame, action in snapshot["taken"]:
+                world.advance(frame)
+                world.take(action)
+            world.advance(snapshot["frame"])
+            world.step = state.step
+            return world
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot["sections"], strict=True):
             spawn = spawn_of(scenario, layout, v)
@@ -115,12 +134,15 @@ class World:
 
     def state(self) -> WorldState:
         """What is where, now."""
-        vehicles = self.road.vehicles
+        vehicles = self.vehicles
         return WorldState(
             self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
-            tuple(state_of(v, self.scenario.brake_lamps) for v in vehicles), self.layout.buildings,
+            tuple(map(self._state_of, vehicles)), self.layout.buildings,
             self.beacons,
         )  # fmt: skip
+
+    def _state_of(self, v: Any) -> VehicleState:
+        return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
 
     def act(self, action: str) -> None:
         """Decide for an action by name, which acts a lag later, and simulate until the next decision is due.
@@ -136,17 +158,17 @@ class World:
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
-        self.road.vehicles[0].act(action)
+        self.vehicles[0].act(action)
 
     @property
     def target(self) -> Target:
         """What the ego aims at."""
-        ego = self.road.vehicles[0]
+        ego = self.vehicles[0]
         return ego.spawn.route, int(ego.speed_index)
 
     def target_after(self, action: str) -> Target:
         """What the ego would aim at if it took an action now."""
-        ego = self.road.vehicles[0]
+        ego = self.vehicles[0]
         kept = dict(vars(ego))
         self.take(action)
         target = self.target
@@ -155,7 +177,7 @@ class World:
 
     def advance(self, until_frame: int) -> None:
         """Simulate until so many frames have passed or the episode is decided."""
-        vehicles = self.road.vehicles
+        vehicles = self.vehicles
         frames, first, speed_mps = [], self.frame + 1, float(vehicles[0].speed)
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
@@ -174,36 +196,51 @@ class World:
 
     def _poses(self) -> list[tuple[float, ...]]:
         """x, y, heading and speed of each vehicle."""
-        return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in self.road.vehicles]
+        x_m, y_m = self.scenario.road().origin_m
+        return [
+            (float(v.position[0] - x_m), float(v.position[1] - y_m), float(v.heading), float(v.speed))
+            for v in self.vehicles
+        ]
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """What the ego and the helpers say of themselves in some frames, (F, V, 4)."""
-        radios = [n for n, v in enumerate(self.road.vehicles) if v.spawn.part != "other"]
+        radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
         self.beacons = beacons.broadcast(
             self.scenario.parameters, self.seed, self.beacons,
-            [self.road.vehicles[n].spawn.id for n in radios], float(self.road.vehicles[0].target_speed),
+            [self.vehicles[n].spawn.id for n in radios], float(self.vehicles[0].target_speed),
             poses[:, radios], first_frame,
         )  # fmt: skip
 
+    def _move(self) -> None:
+        """Simulate a frame."""
+        self.road.time_s = self.time_s
+        self.road.act()
+        self.road.step(1 / self.scenario.parameters.simulation_hz)
+
+    def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
+        """Whom the ego hit, and how; of an object on the road nothing is known."""
+        mine = self._state_of(ego)
+        hit = [(float(outline(mine).distance(outline(v))), v) for v in map(self._state_of, wrecks)]
+        apart_m, partner = min(hit, key=lambda pair: pair[0], default=(math.inf, mine))
+        if apart_m > TOUCHING_M:
+            return {}
+        blamed = fault(mine, partner, self.scenario.road().paths)
+        return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
+
     def _step(self) -> None:
-        p, road = self.scenario.parameters, self.road
-        standing = {v.spawn.id for v in road.vehicles if v.crashed}
-        road.time_s = self.time_s
-        road.act()
-        road.step(1 / p.simulation_hz)
+        p = self.scenario.parameters
+        standing = {v.spawn.id for v in self.vehicles if v.crashed}
+        self._move()
         self.frame += 1
-        ego, others = road.vehicles[0], road.vehicles[1:]
+        ego, others = self.vehicles[0], self.vehicles[1:]
         crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
-            mine, paths = state_of(ego), self.scenario.road().paths
-            partner = min(map(state_of, others), key=lambda v: float(outline(mine).distance(outline(v))))
-            crashed.discard(partner.id)
-            who, blamed = striker(mine, partner), fault(mine, partner, paths)
-            how = {"partner": partner.id, "striker": who, "fault": blamed}
+            how = self._collision(ego, [v for v in others if v.crashed])
+            crashed.discard(how.get("partner", ""))
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
             self.outcome = self.outcome.ending("off_road", self.time_s)
-        elif self.scenario.cleared(road.vehicles, p):
+        elif self.scenario.cleared(self.vehicles, p):
             self.outcome = self.outcome.ending("cleared", self.time_s)
         elif self.frame >= round(p.time_limit_s * p.simulation_hz):
             self.outcome = self.outcome.ending("time_out", self.time_s)

@@ -1,8 +1,9 @@
 """Scenarios: a file each, named with `-` for `_`, that has a `SCENARIO`. A new scenario is a new file.
 
-Other packages add theirs by an entry point of the group `swarmdrive.scenarios`.
+Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -10,6 +11,7 @@ from pkgutil import iter_modules
 from typing import Any
 
 from harness.core.errors import UserError, printable, unknown
+from harness.world import environment
 from harness.world.scenario import BEACON_DIALS, Parameters, Scenario
 
 GROUP = "swarmdrive.scenarios"
@@ -26,28 +28,39 @@ def get(text: str) -> Scenario:
 
     Raises UserError if there is none, or no such setting, or a value is not allowed.
     """
-    name, colon, settings = text.partition(":")
+    if text.startswith(environment.PREFIX):
+        name, settings = environment.split(text)
+    else:
+        name, colon, of_name = text.partition(":")
+        settings = of_name if colon else None
     scenario = _named(name)
-    if not colon:
+    if settings is None:
         return scenario
-    changed: dict[str, Any] = dict(_setting(name, part) for part in settings.split(","))
+    changed: dict[str, Any] = dict(_setting(scenario, part) for part in settings.split(","))
     return replace(scenario, parameters=replace(scenario.parameters, **changed))
 
 
-def _setting(scenario: str, text: str) -> tuple[str, bool | float]:
+def dials(scenario: Scenario) -> tuple[str, ...]:
+    """The parameters that a name may set: `NAME:beacon_loss=0.3`."""
+    return (*BEACON_DIALS, *(environment.DIALS if scenario.start else ()))
+
+
+def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float]:
     key, _, value = text.partition("=")
-    if key not in BEACON_DIALS:
-        example = f"; as in {scenario}:perfect_knowledge=true"
-        raise unknown(f"setting of scenario {scenario}", key, BEACON_DIALS, example)
+    shown, known = printable(scenario.name), dials(scenario)
+    if key not in known:
+        raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
     if key == "perfect_knowledge" and value in ("true", "false"):
         return key, value == "true"
     try:
-        return key, float(value)
+        return key, type(getattr(scenario.parameters, key))(value)
     except ValueError:
-        raise UserError(f"scenario {scenario}: {key} is {printable(value)!r}; give a number") from None
+        raise UserError(f"scenario {shown}: {key} is {printable(value)!r}; give a number") from None
 
 
 def _named(name: str) -> Scenario:
+    if name.startswith(environment.PREFIX):
+        return environment.scenario(name)
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario

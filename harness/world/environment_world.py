@@ -1,0 +1,213 @@
+"""An episode of an environment of highway-env, frame by frame.
+
+`env.step` simulates a whole decision period and hides in which frame what happened. So the frames are
+simulated here, as `env._simulate` does, and at the end of each period `env.step` is called without frames of
+its own: whatever an environment adds to it, new traffic, rewards, ends, happens as it would.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.world import beacons
+from harness.world.environment import (
+    Constants,
+    ego_actions,
+    first_target_mps,
+    index_of,
+    lane_of,
+    outline_of,
+    prepared,
+    reset,
+)
+from harness.world.road import PathKey
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.simulator import DECIMALS
+from harness.world.state import SIZES_M, Building, Kind, Part
+from harness.world.world import Snapshot, Target, World
+
+MOST_BUILDINGS = 9
+
+
+@dataclass
+class EnvironmentWorld(World):
+    """One episode in an environment.
+
+    Attributes:
+        env: highway-env's environment.
+        constants: highway-env's class constants as this environment wants them.
+        cast: its vehicles in the order of their ids, the ego first.
+        born: how many vehicles there have been.
+        action: the action that was taken last.
+        taken: the frame and the name of each action.
+        failed: whether the environment has ended the episode without success.
+    """
+
+    env: Any = None
+    constants: Constants = field(default_factory=lambda: Constants({}))
+    cast: list[Any] = field(default_factory=list)
+    born: int = 0
+    action: str = "IDLE"
+    taken: tuple[tuple[int, str], ...] = ()
+    failed: bool = False
+
+    @classmethod
+    def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
+        """The start of a seed's episode."""
+        env, same, p = reset(scenario.name, seed), prepared(scenario.name), scenario.parameters
+        ego, shown = env.vehicle, printable(scenario.name, 80)
+        if outline_of(env.road.network) != same.outline:
+            raise UserError(
+                f"{shown}: its road in seed {seed} is another than in seed 0; fix the road in its config"
+            )
+        if not set(same.routes.keys(lane_of(ego.target_lane_index), ego.route)) & set(same.ways):
+            raise UserError(
+                f"{shown}: in seed {seed} the ego starts on another road than in seed 0; fix that in its config"
+            )
+        world = cls(
+            scenario, seed, Layout((), _buildings(env, same.road.origin_m), None, None), env.road,
+            env=env, constants=Constants.now(),
+        )  # fmt: skip
+        others = sorted(
+            (v for v in env.road.vehicles if v is not ego),
+            key=lambda v: (v not in env.controlled_vehicles, float(np.hypot(*(v.position - ego.position)))),
+        )
+        ego.to_go_m = p.goal_s * first_target_mps(ego)  # type: ignore[attr-defined]
+        world._enter(ego, "ego")
+        for place, v in enumerate(others):
+            world._enter(v, "helper" if place < p.helpers else "other")  # type: ignore[attr-defined]
+        poses = beacons.lead_in(p, np.array(world._poses()))
+        world._broadcast(poses, 1 - len(poses))
+        return world
+
+    @property
+    def vehicles(self) -> Sequence[Any]:
+        """highway-env's vehicles, the ego first."""
+        return self.cast
+
+    @property
+    def period(self) -> int:
+        """Frames between two decisions of the environment's."""
+        p = self.scenario.parameters
+        return round(p.decision_period_s * p.simulation_hz)
+
+    def _enter(self, v: Any, part: Part) -> None:
+        self.born += 1
+        v.spawn = Spawn(f"v{self.born}", _kind(v), part, "", "", 0.0, 0.0)
+        self._place(v)
+        self.cast.append(v)
+
+    def _place(self, v: Any) -> None:
+        """Note which path a vehicle is on: the one that it was on, if that can be."""
+        same = prepared(self.scenario.name)
+        lane = v.target_lane_index if hasattr(v, "target_lane_index") else v.lane_index
+        keys: list[PathKey] = same.routes.keys(lane_of(lane), getattr(v, "route", None))
+        now = v.spawn.approach, v.spawn.route
+        if v.spawn.part == "ego":
+            keys = [key for key in same.ways if key in keys] or [same.road.ego if now == ("", "") else now]
+        if now not in keys:
+            approach, route = (keys or [same.road.ego])[0]
+            v.spawn = replace(v.spawn, approach=approach, route=route)
+
+    def branch(self) -> "EnvironmentWorld":
+        """A copy that goes its own way."""
+        import copy
+
+        lanes = self.road.network.lanes_list()
+        shared = (
+            self.scenario, self.layout, self.road.network, self.beacons, self.constants, self.taken, *lanes,
+        )  # fmt: skip
+        return copy.deepcopy(self, {id(thing): thing for thing in shared})
+
+    def snapshot(self) -> Snapshot:
+        """The actions so far: equal actions from the start lead to equal worlds."""
+        return {"frame": self.frame, "taken": list(map(list, self.taken))}
+
+    def take(self, action: str) -> None:
+        """Set the ego's target by a meta-action, now."""
+        ego_actions(self.env, "").act(ego_actions(self.env, "").actions_indexes[action])
+        self.action, self.taken = action, (*self.taken, (self.frame, action))
+        self._place(self.cast[0])
+
+    @property
+    def target(self) -> Target:
+        """The lane and the speed that the ego aims at."""
+        ego = self.cast[0]
+        return f"{lane_of(ego.target_lane_index)} {round(float(ego.target_speed), DECIMALS)}", int(ego.speed_index)
+
+    def target_after(self, action: str) -> Target:
+        """What the ego would aim at if it took an action now."""
+        ego, kept = self.cast[0], (self.action, self.taken)
+        own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
+        self.take(action)
+        target = self.target
+        vars(ego).update(own)
+        self.action, self.taken = kept
+        return target
+
+    def advance(self, until_frame: int) -> None:
+        """Simulate until so many frames have passed or the episode is decided."""
+        while self.frame < until_frame and not self.outcome.ended:
+            super().advance(min(until_frame, (self.frame // self.period + 1) * self.period))
+            self._recast()
+
+    def _recast(self) -> None:
+        """Let vehicles that have left go, and new ones enter."""
+        there = {id(v) for v in self.road.vehicles}
+        self.cast = [v for v in self.cast if id(v) in there]
+        known = {id(v) for v in self.cast}
+        for v in self.cast:
+            self._place(v)
+        for v in self.road.vehicles:
+            if id(v) not in known:
+                self._enter(v, "other")
+
+    def _move(self) -> None:
+        self.constants.restore()
+        env, ego = self.env, self.cast[0]
+        before = ego.position.copy()
+        env.road.act()
+        env.road.step(1 / self.scenario.parameters.simulation_hz)
+        env.steps += 1
+        ego.to_go_m -= float(np.hypot(*(ego.position - before)))
+        if (self.frame + 1) % self.period == 0:
+            self._end_period()
+
+    def _end_period(self) -> None:
+        env, ego = self.env, self.cast[0]
+        env._simulate = lambda action=None: None  # its frames are simulated already
+        try:
+            *_, terminated, _, info = env.step(index_of(env, self.action))
+        finally:
+            del env._simulate
+        if terminated and not ego.crashed and ego.on_road:
+            if info.get("is_success", True):
+                ego.to_go_m = 0.0
+            else:
+                self.failed = True
+
+    def _step(self) -> None:
+        super()._step()
+        if self.failed and not self.outcome.ended:
+            self.outcome = self.outcome.ending("time_out", self.time_s)
+
+
+def _kind(v: Any) -> Kind:
+    """The kind whose size is nearest to the vehicle's."""
+    kinds: tuple[Kind, ...] = ("car", "van", "truck")
+    return min(kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH))
+
+
+def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
+    """Solid objects on or beside the road, by their outlines along the axes; the nearest to the ego."""
+    ego = env.vehicle.position
+    solid = [thing for thing in env.road.objects if thing.solid]
+    solid.sort(key=lambda thing: float(np.hypot(*(thing.position - ego))))
+    boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
+    return tuple(
+        Building(f"b{n + 1}", *box.min(axis=0).round(3).tolist(), *box.max(axis=0).round(3).tolist())
+        for n, box in enumerate(boxes)
+    )

@@ -1,0 +1,216 @@
+"""The paths of any of highway-env's road networks: every route through it, on every lane.
+
+A road is named by its two nodes; a route is a chain of roads, each of which goes on where the one before it
+ends, from where nothing leads to where nothing leads on. A path keeps to one lane as far as there is one.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.world.road import Lane, Path, PathKey
+
+Street = tuple[str, str]  # the two nodes of a road
+Route = tuple[Street, ...]
+GAP_M = 6.0  # a lane that begins farther from a lane's end does not go on from it; lanes are 4 m wide
+TURN_RAD = math.radians(60.0)  # nor does one that is turned more
+MOST_ROUTES = 200
+TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the right
+
+
+@dataclass(frozen=True)
+class Routes:
+    """A network's paths.
+
+    Attributes:
+        network: highway-env's.
+        paths: by approach, the node where they begin, and route: where they go, and on which lane.
+        ways: of each route its paths from left to right.
+    """
+
+    network: Any
+    paths: dict[PathKey, Path]
+    ways: dict[Route, tuple[PathKey, ...]]
+
+    def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
+        """The roads that a vehicle in a lane will take by highway-env's rule, with a plan or without."""
+        streets, plan = [lane[:2]], list(plan or ())
+        while lane[1] in self.network.graph:
+            end = self.network.get_lane(lane)
+            follows = self.network.next_lane(lane, plan, end.position(end.length, 0.0))
+            if follows[:2] in streets:
+                break
+            lane = follows
+            streets.append(lane[:2])
+        return tuple(streets)
+
+    def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
+        """The paths that a vehicle in this lane may be on, those that go where it will go before others."""
+        ahead = self.ahead(lane, plan)
+        on_lane = [key for key, path in self.paths.items() if lane in path.lanes]
+        return sorted(on_lane, key=lambda key: -_together(ahead, self.paths[key].lanes))
+
+
+def _together(ahead: Route, lanes: Sequence[Lane]) -> int:
+    """How many of the roads ahead a path takes."""
+    streets = [lane[:2] for lane in lanes]
+    rest = streets[streets.index(ahead[0]) :]
+    return sum(a == b for a, b in zip(ahead, rest, strict=False))
+
+
+def routes(name: str, network: Any, begin: Street, origin_m: tuple[float, float], reach_m: float) -> Routes:
+    """Every path of a network as far as it lies within reach.
+
+    Args:
+        name: what the network is of.
+        network: highway-env's.
+        begin: where a route begins on a road that has no beginning.
+        origin_m: of the frame of the paths, in the network's.
+        reach_m: how far from there the paths are drawn.
+
+    Raises:
+        UserError: there are more than MOST_ROUTES routes.
+    """
+    every = list(_routes(name, network, begin))
+    labels = _labels(network, every)
+    paths: dict[PathKey, Path] = {}
+    ways = {}
+    for route, label in zip(every, labels, strict=True):
+        approach, lanes_of = route[0][0], _variants(network, route)
+        keys = []
+        for n, lanes in enumerate(lanes_of):
+            key = approach, label if len(lanes_of) == 1 else f"{label} lane {n + 1}"
+            roles = [_role(network, lane) for lane in lanes]
+            priority = int(getattr(network.get_lane(lanes[0]), "priority", 0))
+            paths[key] = Path.along(network, *key, lanes, roles, priority, origin_m, reach_m)
+            keys.append(key)
+        ways[route] = tuple(keys)
+    for lanes in _left_over(network, {lane for path in paths.values() for lane in path.lanes}):
+        key = lanes[0][0], f"to {lanes[-1][1]} lane {lanes[0][2] + 1}"
+        roles = [_role(network, lane) for lane in lanes]
+        paths[key] = Path.along(network, *key, lanes, roles, 0, origin_m, reach_m)
+    return Routes(network, paths, ways)
+
+
+def _left_over(network: Any, covered: set[Lane]) -> Iterator[list[Lane]]:
+    """The lanes that no route takes, such as the inner one of a roundabout, in chains."""
+    for lane in ((*street, n) for street in _streets(network) for n in range(len(_lanes(network, street)))):
+        chain: list[Lane] = []
+        while lane not in covered:
+            covered.add(lane)
+            chain.append(lane)
+            if lane[1] in network.graph:
+                end = network.get_lane(lane)
+                following = network.next_lane(lane, None, end.position(end.length, 0.0))
+                if _apart_m(end, network.get_lane(following)) <= GAP_M:
+                    lane = following
+        if chain:
+            yield chain
+
+
+def _streets(network: Any) -> list[Street]:
+    return [(a, b) for a, nodes in network.graph.items() for b in nodes]
+
+
+def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
+    streets = _streets(network)
+    after = {s: [t for t in streets if t[0] == s[1] and _goes_on(network, s, t)] for s in streets}
+    led_to = {street for following in after.values() for street in following}
+    found: list[Route] = []
+    rings: list[Route] = []
+
+    def extend(route: Route) -> None:
+        if len(found) + len(rings) > MOST_ROUTES:
+            raise UserError(
+                f"{printable(name)}: its road has more than {MOST_ROUTES} routes; give it fewer junctions"
+            )
+        following = [street for street in after[route[-1]] if street not in route]
+        for street in following:
+            extend((*route, street))
+        if not following:
+            (rings if after[route[-1]] else found).append(route)
+
+    for street in streets:
+        if street not in led_to:
+            extend((street,))
+    for street in (begin, *streets):  # what comes round to itself has no beginning
+        if not any(street in route for route in found):
+            extend((street,))
+            found += rings[:1]
+        rings.clear()
+    yield from found
+
+
+def _goes_on(network: Any, street: Street, following: Street) -> bool:
+    """Whether some lane of the second road goes on from one of the first."""
+    return any(
+        _apart_m(a, b) <= GAP_M and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
+        for a in _lanes(network, street)
+        for b in _lanes(network, following)
+    )
+
+
+def _lanes(network: Any, street: Street) -> Sequence[Any]:
+    lanes: Sequence[Any] = network.graph[street[0]][street[1]]
+    return lanes
+
+
+def _apart_m(lane: Any, following: Any) -> float:
+    """From where a lane ends to where another begins."""
+    return float(np.hypot(*(lane.position(lane.length, 0.0) - following.position(0.0, 0.0))))
+
+
+def _variants(network: Any, route: Route) -> list[list[Lane]]:
+    """The lanes of a route's paths, from left to right: one path through each lane of its widest road."""
+    widest = max(range(len(route)), key=lambda n: len(_lanes(network, route[n])))
+    found = []
+    for number in range(len(_lanes(network, route[widest]))):
+        lanes = [(*route[widest], number)]
+        for street in route[widest + 1 :]:
+            lanes.append((*street, _beside(network, lanes[-1], street, True)))
+        for street in reversed(route[:widest]):
+            lanes.insert(0, (*street, _beside(network, lanes[0], street, False)))
+        joined = [_apart_m(network.get_lane(a), network.get_lane(b)) for a, b in pairwise(lanes)]
+        if max(joined, default=0.0) <= GAP_M and lanes not in found:
+            found.append(lanes)
+    return found
+
+
+def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
+    """The lane of the next road, or of the one before, that a lane is joined with: by number, or nearest."""
+    here, lanes = network.get_lane(lane), _lanes(network, street)
+    if len(lanes) == len(_lanes(network, lane[:2])):
+        return lane[2]
+    gaps_m = [_apart_m(here, other) if after else _apart_m(other, here) for other in lanes]
+    return int(np.argmin(gaps_m))
+
+
+def _labels(network: Any, every: Sequence[Route]) -> list[str]:
+    """What routes are called: their turn where that tells those of one beginning apart, else their end."""
+    turns = [(route[0][0], _turn(network, route)) for route in every]
+    ends = [(route[0][0], f"to {route[-1][1]}") for route in every]
+    by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)
+    told = {a: begin[a] > 1 and all(n == 1 for key, n in by_turn.items() if key[0] == a) for a in begin}
+    return [
+        turn[1] if told[turn[0]]
+        else end[1] if by_end[end] == 1
+        else f"{end[1]} by {' '.join(node for _, node in route[:-1])}"
+        for turn, end, route in zip(turns, ends, every, strict=True)
+    ]  # fmt: skip
+
+
+def _turn(network: Any, route: Route) -> str:
+    first, last = _lanes(network, route[0])[0], _lanes(network, route[-1])[0]
+    quarters = (last.heading_at(last.length) - first.heading_at(0.0)) / (math.pi / 2)
+    return TURNS[round(quarters) % 4]
+
+
+def _role(network: Any, lane: Lane) -> str:
+    several = len(_lanes(network, lane[:2])) > 1
+    return f"{lane[0]}-{lane[1]}" + (f" lane {lane[2] + 1}" if several else "")
