@@ -27,7 +27,7 @@ REACH_M = 500.0  # from the middle of an episode: as far as paths are drawn
 BEHIND_M, BEYOND_M = 30.0, 40.0  # watched of the ego's ways, behind its start and beyond its goal
 BEFORE_M = (5.0, 45.0)  # watched of a path that meets the ego's, before that point
 HALFWAY_S = 2.0  # where the ego is then, the origin lies: in the middle of pictures
-GOAL_S = 6.0
+GOAL_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Parameters(Common):
     braking_mps2: float = 20.0  # highway-env's own controller has no limits
     acceleration_mps2: float = 20.0
     decisions: int = 4
+    time_limit_s: float = 8.0
     helpers: int = 3
     goal_s: float = GOAL_S
 
@@ -111,6 +112,7 @@ def scenario(name: str) -> Scenario:
             "task": f"follow your road, {sorted(path_names)[0].partition(' lane ')[0]}, and keep up speed",
             "hiding": "other vehicles",
         },
+        brake_lamps=True,
         start=_start,
     )
 

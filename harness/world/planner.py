@@ -28,6 +28,7 @@ LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
 MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
 RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC), and of its steering
 EMERGENCY_MPS2 = 6.0  # how hard one that is seen to brake is taken to brake
+LATERAL_MPS2 = 7.0  # what dry tyres hold in a bend
 AWAY_S = 0.5  # what it costs to end beside one's way
 STEP_S = 0.1
 LANE_M = 4.0  # between two ways
@@ -54,7 +55,9 @@ class Rollouts:
 def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     """The planner's meta-action for a scene graph."""
     p, road, ego = scenario.parameters, scenario.road(), graph["ego"]
-    beside = road.beside(_way(road, ego))
+    own = _way(road, ego)
+    at_m = road.zone_arc_m - ego["zone_m"]
+    beside = road.beside(own, at_m)
     sides = int("left" in beside), int("right" in beside)
     tried = _rollouts(
         scenario.actions, ego["speed_mps"], ego["target_speed_mps"], p.decisions - graph["step"], sides, p
@@ -62,6 +65,7 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     gap = np.full(len(tried.actions), np.inf)
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
         gap = np.minimum(gap, least_gap(tried, motion))
+    gap = np.where(_too_fast(road.paths[own], at_m, tried.travelled_m), np.minimum(gap, 0.0), gap)
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
     to_go = ego["zone_m"] + 15.0
     arrival = (tried.travelled_m < to_go).sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
@@ -71,6 +75,13 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     score = np.where(safe, -arrival, -1e3 + np.minimum(gap, 0.0))
     best: list[int] = np.flatnonzero(score >= score.max() - 1e-9).tolist()
     return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
+
+
+def _too_fast(way: Path, at_m: float, travelled_m: Floats) -> Floats:
+    """Whether a sequence takes a bend faster than tyres hold, per sequence."""
+    speed_mps = np.diff(travelled_m, axis=1) / STEP_S
+    places = np.searchsorted(way.arc_m, at_m + travelled_m[:, 1:]).clip(0, len(way.arc_m) - 1)
+    return np.asarray((speed_mps**2 * way.bends[places] > LATERAL_MPS2).any(axis=1))
 
 
 def _way(road: Road, ego: Mapping[str, Any]) -> tuple[str, str]:
@@ -108,12 +119,12 @@ def travelled_m(
     speed, target = np.full(len(sequences), speed_mps), np.full(len(sequences), target_mps)
     travelled = np.empty((len(sequences), steps))
     gone = np.zeros(len(sequences))
-    spacing = levels[-1] / (len(levels) - 1)
+    spacing = (levels[-1] - levels[0]) / (len(levels) - 1)
     for k in range(steps):
         n = k // every
         if k % every == 0 and n < left:
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
-            level = np.clip(np.round(speed / spacing).astype(int) + move, 0, len(levels) - 1)
+            level = np.clip(np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int) + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
         change = np.clip(
             (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2

@@ -20,6 +20,8 @@ from harness.core.arrays import Floats
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's name of it: two nodes, and a number from the left
 STEP_M = 0.25  # between the points of a path
+ONE_LANE_M = 1.0  # ways nearer to each other than this are in one lane
+BEND_M = 3.0  # before and behind, over which a bend is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
 NORTH = np.array([1.0, -1.0])  # from this frame to that of pictures
 
@@ -72,6 +74,15 @@ class Path:
         along = np.gradient(self.points, axis=0)
         heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
+
+    @cached_property
+    def bends(self) -> Floats:
+        """(n,) curvature in 1/m, whichever way it turns."""
+        reach = round(BEND_M / float(self.arc_m[1]))
+        turned = np.unwrap(self.headings_rad)
+        padded = np.pad(turned, reach, mode="edge")
+        bends: Floats = np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M)
+        return bends
 
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
@@ -179,13 +190,23 @@ class Road:
     form: Literal[1, 2] = 2
     origin_m: tuple[float, float] = (0.0, 0.0)
 
-    def beside(self, key: PathKey) -> dict[str, PathKey]:
-        """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such."""
+    def beside(self, key: PathKey, arc_m: float | None = None) -> dict[str, PathKey]:
+        """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such.
+
+        At an arc length, those alone that are in a lane of their own there.
+        """
         if key not in self.ways:
             return {"own": key}
         place = self.ways.index(key)
         places = {"own": place, "left": place - 1, "right": place + 1}
-        return {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
+        found = {side: self.ways[n] for side, n in places.items() if 0 <= n < len(self.ways)}
+        if arc_m is None:
+            return found
+        x, y, _ = self.paths[key].at(arc_m)
+        return {
+            side: way for side, way in found.items()
+            if side == "own" or self.paths[way].project(x, y)[1] > ONE_LANE_M
+        }  # fmt: skip
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:

@@ -6,7 +6,6 @@ for every viewer, since helpers judge what the ego should do; a helper knows the
 from the last beacon that it heard, not from its sensors.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -25,7 +24,6 @@ OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
 ALIKE = 0.05  # paths that share a lane cost the same but for rounding
 STANDING_MPS = 0.5  # below that, a sensor's noise
-ONE_LANE_M = 1.0  # ways nearer to each other than this are in one lane
 ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 
 Graph = dict[str, Any]
@@ -186,13 +184,10 @@ def _along(
 
     Of who is behind whom only the one behind has a way to go; of two that meet head-on, both.
     """
-    its_heading, own = path.at(arc)[2], road.paths[ego.approach, ego.route]
-    beside = own.at(own.project(d.x_m, d.y_m)[0])
-    for side, key in road.beside((ego.approach, ego.route)).items():
+    its_heading, own = path.at(arc)[2], (ego.approach, ego.route)
+    for side, key in road.beside(own, road.paths[own].project(d.x_m, d.y_m)[0]).items():
         way = road.paths[key]
         at, lateral, heading = way.project(d.x_m, d.y_m)
-        if side != "own" and math.dist(way.at(at)[:2], beside[:2]) < ONE_LANE_M:
-            continue  # here both ways are one lane
         turned, gap = float(np.cos(its_heading - heading)), at - ego_arc
         if lateral > ON_PATH_M or abs(turned) < np.cos(ALIGNED_RAD) or (turned < 0 and gap < 0):
             continue
