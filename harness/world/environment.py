@@ -26,8 +26,8 @@ CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 REACH_M = 500.0  # from the middle of an episode: as far as paths are drawn
 BEHIND_M, BEYOND_M = 30.0, 40.0  # watched of the ego's ways, behind its start and beyond its goal
 BEFORE_M = (5.0, 45.0)  # watched of a path that meets the ego's, before that point
-HALFWAY_S = 2.0  # where the ego is then, the origin lies: in the middle of pictures
-GOAL_S = 5.0
+HALFWAY = 0.4  # of the way to the goal lies the origin, the middle of pictures
+AFTER, LIMIT = 2, 5  # decision periods after the last decision, from which the goal and the time limit follow
 
 
 @dataclass(frozen=True)
@@ -36,26 +36,28 @@ class Parameters(Common):
 
     Attributes:
         helpers: how many vehicles help: other controlled ones first, then those nearest to the ego.
-        goal_s: the ego's goal is as far away as it would come in so many seconds at its first target speed.
     """
 
     braking_mps2: float = 20.0  # highway-env's own controller has no limits
     acceleration_mps2: float = 20.0
-    decisions: int = 4
-    time_limit_s: float = 8.0
     helpers: int = 3
-    goal_s: float = GOAL_S
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, most in (("decisions", 9), ("helpers", 9), ("goal_s", 60)):
+        for name, most in (("decisions", 9), ("helpers", 9)):
             if not 0 < getattr(self, name) <= most:
                 raise UserError(
                     f"scenario: {name} is {getattr(self, name)}; it must be above 0, at most {most}"
                 )
 
 
-DIALS = ("decisions", "helpers", "goal_s", "time_limit_s", "delay_allowance_s")
+    @property
+    def goal_s(self) -> float:
+        """The ego's goal is as far away as it would come in this time at its first target speed."""
+        return (self.decisions + AFTER) * self.decision_period_s
+
+
+DIALS = ("decisions", "helpers", "time_limit_s", "delay_allowance_s")
 
 
 def named(env: str, config: Mapping[str, Any] | None = None) -> str:
@@ -92,28 +94,36 @@ def scenario(name: str) -> Scenario:
             f"{shown}: simulation_frequency {hz:g} is no multiple of policy_frequency {decisions_hz:g}; "
             "set one in its config"
         )
-    parameters = Parameters(
-        target_speeds_mps=tuple(float(speed) for speed in ego.target_speeds),
-        decision_period_s=1 / decisions_hz,
-        decision_lag_s=min(Common.decision_lag_s, 1 / decisions_hz),
-        simulation_hz=int(hz),
-        beacon_hz=min(Common.beacon_hz, hz),
-    )
-    path_names = {key[1] for key in _prepared(name).ways}
     return Scenario(
         name=name,
         description=f"Scenario {name}: {type(env).__name__} with the traffic that it brings along.\n",
         actions=actions,
-        parameters=parameters,
+        parameters=_parameters(env),
         road=partial(road, name),
         layout=_layout,
         cleared=_arrived,
         words={
-            "task": f"follow your road, {sorted(path_names)[0].partition(' lane ')[0]}, and keep up speed",
+            "task": f"follow your road, {_prepared(name).road.ego[1].partition(' lane ')[0]}, and keep up speed",
             "hiding": "other vehicles",
         },
         brake_lamps=True,
         start=_start,
+    )
+
+
+def _parameters(env: Any) -> Parameters:
+    hz, period_s = env.config["simulation_frequency"], 1 / env.config["policy_frequency"]
+    # A tree has some hundred decision points: three actions lead to 2.4 new ones, five to 3.4.
+    decisions = 6 if len(_meta_actions(env, "").actions) == 3 else 4
+    return Parameters(
+        target_speeds_mps=tuple(float(speed) for speed in env.vehicle.target_speeds),
+        decisions=decisions,
+        decision_period_s=period_s,
+        decision_lag_s=min(Common.decision_lag_s, period_s / 2),
+        simulation_hz=int(hz),
+        time_limit_s=(decisions + LIMIT) * period_s,
+        delay_allowance_s=period_s,
+        beacon_hz=min(Common.beacon_hz, hz),
     )
 
 
@@ -273,16 +283,16 @@ def _prepared(name: str) -> Prepared:
     lane = lane_of(ego.target_lane_index)
     rough = routes(printable(name, 80), network, lane[:2], (0.0, 0.0), math.inf)
     key = rough.keys(lane, ego.route)[0]
-    travelled_m = first_target_mps(ego)
+    p, speed_mps = _parameters(env), first_target_mps(ego)
     way = rough.paths[key]
     here_m = way.project(*ego.position)[0]
-    origin_m = way.at(here_m + HALFWAY_S * travelled_m)[:2]
+    origin_m = way.at(here_m + HALFWAY * p.goal_s * speed_mps)[:2]
     found = routes(printable(name, 80), network, lane[:2], origin_m, REACH_M)
     ways = next(ways for ways in found.ways.values() if key in ways) if key in {
         k for ways in found.ways.values() for k in ways
     } else (key,)
     begin_m = found.paths[key].project(*(ego.position - origin_m))[0]
-    goal_m = begin_m + GOAL_S * travelled_m
+    goal_m = begin_m + p.goal_s * speed_mps
     meetings = {
         other: at for way in (key, *ways) for other, at in crossings(found.paths, way).items()
         if begin_m < at.ego_arc_m < goal_m + BEYOND_M
@@ -298,6 +308,7 @@ def _prepared(name: str) -> Prepared:
         network=lambda: network,
         ground=partial(ground, network, origin_m=origin_m),
         ways=ways,
+        goal_m=lambda p: begin_m + float(p.goal_s) * speed_mps,
         origin_m=origin_m,
     )
     return Prepared(found, ways, built, outline_of(network))

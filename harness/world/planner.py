@@ -6,6 +6,7 @@ the sequence that passes the conflict zone soonest without meeting anyone. Who i
 brake until it stands. It does not guess at what it cannot see, which is what makes occlusion cost something.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.world.road import Path, Road
 from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
@@ -62,12 +63,13 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     tried = _rollouts(
         scenario.actions, ego["speed_mps"], ego["target_speed_mps"], p.decisions - graph["step"], sides, p
     )
+    # The goal lies well behind the conflict points, so that a late burst of speed counts too.
+    to_go = ego["zone_m"] + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
+    under_way = tried.travelled_m < (math.inf if road.goal_m is None else to_go)
     gap = np.full(len(tried.actions), np.inf)
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
-        gap = np.minimum(gap, least_gap(tried, motion))
-    gap = np.where(_too_fast(road.paths[own], at_m, tried.travelled_m), np.minimum(gap, 0.0), gap)
-    # The goal lies well behind the conflict points, so that a late burst of speed counts too.
-    to_go = ego["zone_m"] + 15.0
+        gap = np.minimum(gap, least_gap(tried, motion, under_way))
+    gap = np.where(_too_fast(road.paths[own], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
     arrival = (tried.travelled_m < to_go).sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
     if road.ways:
         arrival += AWAY_S * (road.ways.index(beside["own"]) + tried.ends != road.ways.index(road.ego))
@@ -77,11 +79,11 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
 
 
-def _too_fast(way: Path, at_m: float, travelled_m: Floats) -> Floats:
-    """Whether a sequence takes a bend faster than tyres hold, per sequence."""
-    speed_mps = np.diff(travelled_m, axis=1) / STEP_S
-    places = np.searchsorted(way.arc_m, at_m + travelled_m[:, 1:]).clip(0, len(way.arc_m) - 1)
-    return np.asarray((speed_mps**2 * way.bends[places] > LATERAL_MPS2).any(axis=1))
+def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools) -> Bools:
+    """Whether a sequence takes a bend faster than tyres hold, (n,)."""
+    speed_mps = np.diff(tried.travelled_m, axis=1, prepend=tried.travelled_m[:, :1]) / STEP_S
+    places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)
+    return np.asarray(((speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
 
 
 def _way(road: Road, ego: Mapping[str, Any]) -> tuple[str, str]:
@@ -208,8 +210,8 @@ def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
     return np.asarray(other["speed_mps"] * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
 
 
-def least_gap(tried: Rollouts, motion: Motion) -> Floats:
-    """Smallest gap (m) to another vehicle, per sequence; below zero they meet."""
+def least_gap(tried: Rollouts, motion: Motion, under_way: Bools) -> Floats:
+    """Smallest gap (m) to another vehicle while the ego is under way, per sequence; below zero they meet."""
     away, reach = cover(*motion.size_m)
     own, own_reach = cover(*SIZES_M["car"])
     ego = _discs(motion.way, motion.begin_m + tried.travelled_m, own, tried.right_m)
@@ -218,7 +220,7 @@ def least_gap(tried: Rollouts, motion: Motion) -> Floats:
     for its_x, its_y in _discs(motion.path, motion.arc_m, away):
         for x, y in ego:
             np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
-    return np.asarray(np.sqrt(squared.min(axis=1)) - reach - own_reach - MARGIN_M)
+    return np.asarray(np.sqrt(squared.min(axis=1, where=under_way, initial=np.inf)) - reach - own_reach - MARGIN_M)
 
 
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:

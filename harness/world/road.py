@@ -176,6 +176,8 @@ class Road:
         network: gives highway-env's network, always the same one; nobody writes to it.
         ground: gives what a picture shows that reaches so many metres from the origin.
         origin_m: where the origin is in highway-env's own frame.
+        goal_m: gives the arc length of the ego's path at which its episode is over, of the scenario's parameters:
+            whom it would meet beyond does not matter. None where that is no place on its path.
     """
 
     facts: Mapping[str, str | float]
@@ -189,6 +191,7 @@ class Road:
     ways: tuple[PathKey, ...] = ()
     form: Literal[1, 2] = 2
     origin_m: tuple[float, float] = (0.0, 0.0)
+    goal_m: Callable[[Any], float] | None = None
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[str, PathKey]:
         """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such.
