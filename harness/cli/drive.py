@@ -31,9 +31,11 @@ def command(
     engine: options.Engine = None,
     prompt: options.ScenarioPrompt = None,
     condition: options.Conditions = None,
-    scenario: str = typer.Option(
-        "occluded-intersection", help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons."
+    scenario: str | None = typer.Option(
+        None, help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons. Default: occluded-intersection."
     ),
+    env: options.Env = None,
+    env_config: options.EnvConfig = None,
     episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
@@ -62,6 +64,8 @@ def command(
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
+    from harness.world.environment import examine
+    from harness.world.scenarios import DEFAULT
 
     if condition and ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
@@ -75,7 +79,10 @@ def command(
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
-    source = LiveSource(first_seed, episodes, scenario, sample, sample_seed)
+    name = options.scenario_name(scenario if scenario or env else DEFAULT, env, env_config)
+    source = LiveSource(first_seed, episodes, name, sample, sample_seed)
+    if source.scenario.start:
+        examine(source.scenario, first_seed)
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)
     spec = Spec(

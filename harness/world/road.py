@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -301,12 +302,12 @@ def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0
 
 
 def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> Iterator[Floats]:
-    """Lines between lanes that lie side by side."""
-    for lane in lanes:
-        if lane.line_types[0] == STRIPED:  # on its left; what is on its right is another's left, or an edge
+    """Lines between lanes that lie side by side, which may be either one's."""
+    for lane, side in product(lanes, (0, 1)):
+        if lane.line_types[side] == STRIPED:
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
-            side = np.array([lane.position(s, -lane.width / 2) for s in along]) - origin_m
-            line = LineString(side).intersection(view)
+            edge_m = (side - 0.5) * lane.width
+            line = LineString([lane.position(s, edge_m) for s in along] - np.array(origin_m)).intersection(view)
             yield from (np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1)
 
 

@@ -29,6 +29,8 @@ def ground(
     axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[], facecolor=PAPER)
     for building in buildings:
         corners = north_up(building.corners())
+        if np.abs(corners).min(axis=0).max() > VIEW_M:
+            continue
         axes.add_patch(Polygon(corners, facecolor=WALL, edgecolor="#A79F8A", linewidth=0.8))
         x, y = np.sign(corners.mean(axis=0)) * (VIEW_M - 13.0)
         axes.text(x, y, printable(building.id), color="#877E68", size=TEXT_PT, ha="center", va="center")

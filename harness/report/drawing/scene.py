@@ -139,6 +139,8 @@ def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
     ego = printable(scene.state.ego.id)
     conflicts, points = conflict_points(scene, viewer)
     for conflict, point in zip(conflicts, points, strict=True):
+        if np.abs(point).max() > VIEW_M:
+            continue
         axes.plot(*point, markeredgewidth=0.7, zorder=4, **CROSS)
         labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))
         text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
