@@ -32,7 +32,8 @@ def command(
     prompt: options.ScenarioPrompt = None,
     condition: options.Conditions = None,
     scenario: str | None = typer.Option(
-        None, help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons. Default: occluded-intersection."
+        None,
+        help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons. Default: occluded-intersection.",
     ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,

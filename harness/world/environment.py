@@ -6,6 +6,7 @@ what its configuration changes are the scenario's name, so that a name is enough
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -49,7 +50,6 @@ class Parameters(Common):
                 raise UserError(
                     f"scenario: {name} is {getattr(self, name)}; it must be above 0, at most {most}"
                 )
-
 
     @property
     def goal_s(self) -> float:
@@ -159,12 +159,15 @@ def reset(name: str, seed: int) -> Any:
         highway_env._register_highway_envs()
     shown = printable(name, 80)
     env_id, _, changes = name.removeprefix(PREFIX).partition(":config=")
+    if not re.search(r"-v\d+$", env_id):
+        raise UserError(f"{shown}: give its version too, as in merge-v0")
     _constants().restore()
     try:
         env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{shown}: {printable(error)}; install the package, or put its folder on PYTHONPATH"
+            f"{shown}: {printable(str(error).partition('. ')[0])}; install the package, or put its folder on "
+            "PYTHONPATH"
         ) from None
     except gymnasium.error.Error as error:
         raise UserError(f"{shown}: {printable(error)}; give an id that gymnasium.make knows") from None
@@ -288,9 +291,11 @@ def _prepared(name: str) -> Prepared:
     here_m = way.project(*ego.position)[0]
     origin_m = way.at(here_m + HALFWAY * p.goal_s * speed_mps)[:2]
     found = routes(printable(name, 80), network, lane[:2], origin_m, REACH_M)
-    ways = next(ways for ways in found.ways.values() if key in ways) if key in {
-        k for ways in found.ways.values() for k in ways
-    } else (key,)
+    ways = (
+        next(ways for ways in found.ways.values() if key in ways)
+        if key in {k for ways in found.ways.values() for k in ways}
+        else (key,)
+    )
     begin_m = found.paths[key].project(*(ego.position - origin_m))[0]
     goal_m = begin_m + p.goal_s * speed_mps
     meetings = {
@@ -326,7 +331,9 @@ def _sectors(
         points = _points(found.paths[key], np.linspace(begin_m, end_m, 15))
         before = np.concatenate([*sectors.values(), np.full((1, 2), np.inf)])
         apart_m = np.hypot(*(points[:, None] - before).T).min(axis=0)
-        if (own := points[apart_m > 1.0]).size:  # of a way that parts later what is not in its neighbour's lane
+        if (
+            own := points[apart_m > 1.0]
+        ).size:  # of a way that parts later what is not in its neighbour's lane
             sectors[key[1]] = own
     for key, at in meetings.items():
         if key[0] not in sectors:
@@ -398,7 +405,12 @@ def _driven(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Diges
     env = reset(scenario.name, seed)
     found = []
     for action in actions:
-        *_, terminated, truncated, _ = env.step(index_of(env, action))
+        try:
+            *_, terminated, truncated, _ = env.step(index_of(env, action))
+        except Exception as error:
+            raise UserError(
+                f"{printable(scenario.name, 80)}: its step() fails: {type(error).__name__}: {printable(error)}"
+            ) from None
         found.append(_digest(env))
         if terminated or truncated:
             break

@@ -136,7 +136,9 @@ class EnvironmentWorld(World):
     def target(self) -> Target:
         """The lane and the speed that the ego aims at."""
         ego = self.cast[0]
-        return f"{lane_of(ego.target_lane_index)} {round(float(ego.target_speed), DECIMALS)}", int(ego.speed_index)
+        return f"{lane_of(ego.target_lane_index)} {round(float(ego.target_speed), DECIMALS)}", int(
+            ego.speed_index
+        )
 
     def target_after(self, action: str) -> Target:
         """What the ego would aim at if it took an action now."""

@@ -126,7 +126,11 @@ def travelled_m(
         n = k // every
         if k % every == 0 and n < left:
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
-            level = np.clip(np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int) + move, 0, len(levels) - 1)
+            level = np.clip(
+                np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int) + move,
+                0,
+                len(levels) - 1,
+            )
             target = np.where(move == 0, target, levels[level])
         change = np.clip(
             (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2
@@ -220,7 +224,9 @@ def least_gap(tried: Rollouts, motion: Motion, under_way: Bools) -> Floats:
     for its_x, its_y in _discs(motion.path, motion.arc_m, away):
         for x, y in ego:
             np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
-    return np.asarray(np.sqrt(squared.min(axis=1, where=under_way, initial=np.inf)) - reach - own_reach - MARGIN_M)
+    return np.asarray(
+        np.sqrt(squared.min(axis=1, where=under_way, initial=np.inf)) - reach - own_reach - MARGIN_M
+    )
 
 
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:

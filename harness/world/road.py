@@ -307,7 +307,9 @@ def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> It
         if lane.line_types[side] == STRIPED:
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
             edge_m = (side - 0.5) * lane.width
-            line = LineString([lane.position(s, edge_m) for s in along] - np.array(origin_m)).intersection(view)
+            line = LineString([lane.position(s, edge_m) for s in along] - np.array(origin_m)).intersection(
+                view
+            )
             yield from (np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1)
 
 

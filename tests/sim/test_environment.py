@@ -1,0 +1,319 @@
+"""Environments of highway-env as scenarios: stock ones, and one that a user wrote."""
+
+import io
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from evaluating import scenes_of
+from highway_env.envs import HighwayEnv, MergeEnv
+from my_roads import Breakdown
+
+from harness.core.errors import UserError
+from harness.dataset.build import build
+from harness.dataset.load import load
+from harness.dataset.verify import check
+from harness.report.drawing.scene import draw
+from harness.world import scenarios
+from harness.world.drivers import DRIVERS
+from harness.world.environment import CAREFUL_FIRST, examine, named, reset
+from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.reference import drive
+from harness.world.state import WorldState
+from harness.world.world import World
+
+OWN = "env:my_roads:breakdown-v0"
+SPEED_ONLY = {"action": {"type": "DiscreteMetaAction", "lateral": False, "target_speeds": [0, 4.5, 9]}}
+
+
+def places(env):
+    return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in env.road.vehicles]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built") / "breakdown"
+    build(scenarios.get(f"{OWN}:decisions=2,helpers=2"), folder, 2, 0, 1, lambda done: None)
+    return folder
+
+
+@pytest.mark.parametrize("env", ["merge-v0", "roundabout-v0", "two-way-v0", "highway-fast-v0"])
+def test_its_frames_are_those_of_its_own_step(env):
+    scenario = scenarios.get(f"env:{env}")
+    theirs, ours = reset(scenario.name, 3), World.start(scenario, 3)
+    for number in (1, 3, 0, 4):
+        *_, terminated, _, _ = theirs.step(number)
+        ours.take(theirs.action_type.actions[number])
+        ours.advance(ours.frame + ours.period)
+        if terminated:
+            break
+        assert places(ours.env) == places(theirs)
+        assert (ours.env.steps, ours.env.time) == (theirs.steps, theirs.time)
+
+
+def test_traffic_that_it_spawns_enters():
+    scenario = scenarios.get(named("intersection-v1", SPEED_ONLY))
+    assert (scenario.actions, scenario.parameters.decisions) == (CAREFUL_FIRST[:3], 6)
+    theirs, ours = reset(scenario.name, 0), World.start(scenario, 0)
+    born = {v.id for v in ours.state().vehicles}
+    for _ in range(8):
+        theirs.step(1)
+        ours.advance(ours.frame + ours.period)
+        now = {v.id for v in ours.state().vehicles}
+        assert places(ours.env) == places(theirs)
+        assert len(now) == len(theirs.road.vehicles)
+    assert now > born
+    assert ours.state().ego.route == "left"
+
+
+class Leaving(MergeEnv):
+    """Lets a vehicle go after each second."""
+
+    def step(self, action):
+        result = super().step(action)
+        self.road.vehicles = self.road.vehicles[:-1]
+        return result
+
+
+gymnasium.register("leaving-v0", entry_point=Leaving)
+
+
+def test_traffic_that_it_takes_away_has_gone():
+    world = World.start(scenarios.get("env:leaving-v0:decisions=2"), 0)
+    seen = []
+    for _ in range(3):
+        seen.append({v.id for v in world.state().vehicles})
+        world.advance(world.frame + world.period)
+    assert [len(ids) for ids in seen] == [5, 4, 3]
+    assert seen[0] > seen[1] > seen[2]
+    assert {beacon.sender for beacon in world.state().beacons} <= seen[2]
+
+
+def test_another_environment_does_not_change_its_traffic():
+    """highway-env's intersection sets constants of the class of all IDM vehicles."""
+    scenario = scenarios.get("env:merge-v0")
+    world = World.start(scenario, 0)
+    alone, beside = world.branch(), world.branch()
+    alone.advance(45)
+    reset(named("intersection-v1", SPEED_ONLY), 0)
+    beside.advance(45)
+    assert beside.state() == alone.state()
+    again = World.start(scenario, 0)
+    again.advance(45)
+    assert again.state() == alone.state()
+
+
+def test_the_state_says_who_is_where_and_helpers_are_the_nearest():
+    state = World.start(scenarios.get(f"{OWN}:helpers=2"), 0).state()
+    assert [(v.id, v.part, v.kind) for v in state.vehicles] == [
+        ("v1", "ego", "car"), ("v2", "helper", "car"), ("v3", "helper", "truck"), ("v4", "other", "car"),
+        ("v5", "other", "car"),
+    ]  # fmt: skip
+    gaps = [np.hypot(v.x_m - state.ego.x_m, v.y_m - state.ego.y_m) for v in state.vehicles]
+    assert gaps == sorted(gaps)
+    assert {v.route for v in state.vehicles} == {"to b lane 1", "to b lane 2"}
+
+
+def test_the_truck_hides_the_breakdown_from_the_ego_and_helpers_see_it():
+    scenario = scenarios.get(OWN)
+    state = World.start(scenario, 0).state()
+    conflicts = {
+        viewer: [(c["with"], c["kind"], c["lane"]) for c in graph["conflicts"]]
+        for viewer, graph in {
+            "truth": truth_graph(scenario, state),
+            **{v.id: scene_graph(scenario, state, v.id) for v in (state.ego, *state.helpers)},
+        }.items()
+    }
+    assert ("v5", "ahead", "own") in conflicts["truth"]
+    assert ("v5", "ahead", "own") not in conflicts["v1"]
+    assert ("v5", "ahead", "own") in conflicts["v3"]
+    sectors = {s["sector"]: s for s in scene_graph(scenario, state, "v1")["sectors"]}
+    assert sectors["to b lane 2"]["seen_share"] < 0.5
+    assert "v3" in sectors["to b lane 2"]["by"]
+
+
+def test_cruising_hits_what_stands_and_full_view_passes():
+    scenario = scenarios.get(OWN)
+    cruise, full_view = (drive(scenario, driver, 0) for driver in ("cruise", "full-view"))
+    assert (cruise.result, cruise.striker) == ("collision", "ego")
+    assert full_view.result == "cleared"
+
+
+def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from():
+    scenario = scenarios.get("env:roundabout-v0")
+    world = World.start(scenario, 1)
+    world.act("FASTER")
+    world.advance(world.frame + 4)
+    world.take("SLOWER")
+    state, snapshot = json.loads(json.dumps([world.state().to_dict(), world.snapshot()]))
+    thawed, branch = World.thaw(scenario, WorldState.from_dict(state), snapshot), world.branch()
+    for each in (world, thawed, branch):
+        each.act("IDLE")
+    assert world.state() == thawed.state() == branch.state()
+
+
+def test_its_dataset_is_sound_and_pins_its_configuration(folder):
+    assert check(folder) == []
+    data = load(folder)
+    assert data.scenario == scenarios.get(f"{OWN}:decisions=2,helpers=2")
+    assert data.manifest.environment["stands_m"] == 95.0
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["environment"]["stands_m"] = 90.0
+    changed = folder.parent / "changed"
+    changed.mkdir()
+    (changed / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"its configuration has another stands_m; build the dataset again"):
+        load(changed)
+
+
+def test_equal_builds_are_equal_bytes(folder, tmp_path):
+    build(scenarios.get(f"{OWN}:decisions=2,helpers=2"), tmp_path / "breakdown", 2, 0, 1, lambda done: None)
+    assert (tmp_path / "breakdown/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("env", "config"), [("merge-v0", None), ("roundabout-v0", None), ("intersection-v1", SPEED_ONLY)]
+)
+def test_stock_environments_freeze_as_they_drive_and_are_drawn(env, config, tmp_path):
+    """`build` drives every reference driver too, and compares."""
+    scenario = scenarios.get(named(env, config))
+    scenario = replace(scenario, parameters=replace(scenario.parameters, decisions=2, time_limit_s=4.0))
+    build(scenario, tmp_path / "stock", 1, 0, 1, lambda done: None)
+    assert check(tmp_path / "stock") == []
+    scenes = scenes_of(load(tmp_path / "stock"))
+    assert {driver for tree in load(tmp_path / "stock").trees for driver in tree.levels[0][0].drivers} == {
+        *DRIVERS
+    }
+    picture = io.BytesIO()
+    draw(scenes[0], picture, "svg")
+    assert picture.getvalue().startswith(b"<?xml")
+
+
+def test_the_commands_take_it_from_end_to_end(harness, folder):
+    assert harness("dataset", "show", folder, "00000-0", "--out", "scene.png")[0] == 0
+    for model in ("proxy", "swarm-tiny"):
+        if model == "swarm-tiny":
+            pytest.importorskip("torch")
+        ran = harness(
+            "eval", "--model", model, "--dataset", folder, "--seeds", "0", "--condition", "6g", "--out", model
+        )
+        assert ran[0] == 0, ran
+        answers = [json.loads(line) for line in Path(model, "answers.jsonl").read_text().splitlines()]
+        assert answers
+    assert harness("report", "proxy", "swarm-tiny", "--out", "page.html")[0] == 0
+    drove = harness(
+        "drive", "--env", f"{OWN.removeprefix('env:')}:decisions=2", "--episodes", "1", "--seeds", "0",
+        "--condition", "single-local", "--workers", "1", "--out", "driven",
+    )  # fmt: skip
+    assert drove[0] == 0, drove
+    assert harness("report", "driven", "--out", "driven.html")[0] == 0
+
+
+class Forgetful(MergeEnv):
+    """Draws from nobody's generator."""
+
+    def _reset(self):
+        super()._reset()
+        self.road.vehicles[1].speed += np.random.default_rng().uniform()
+
+
+class Locked(MergeEnv):
+    def _reset(self):
+        super()._reset()
+        self.lock = threading.Lock()
+
+
+class Hasty(MergeEnv):
+    """Changes something before its frames."""
+
+    def step(self, action):
+        self.road.vehicles[1].target_speed = 5.0
+        return super().step(action)
+
+
+class Broken(MergeEnv):
+    def _reward(self, action):
+        return 1 / 0
+
+
+class Rebuilt(HighwayEnv):
+    """Has another road for each seed."""
+
+    def _reset(self):
+        self.config["lanes_count"] = int(self.np_random.integers(2, 6))
+        super()._reset()
+
+
+class Unlike(Breakdown):
+    """Starts without an ego."""
+
+    def _reset(self):
+        raise ValueError("nobody\nis here")
+
+
+for kind in (Forgetful, Locked, Hasty, Broken, Rebuilt, Unlike):
+    gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
+
+
+@pytest.mark.parametrize(
+    ("env", "config", "said"),
+    [
+        ("merge", {}, "give its version too, as in merge-v0"),
+        ("mrge-v0", {}, "`mrge` doesn't exist"),
+        ("no_such_package:MyEnv-v0", {}, "No module named 'no_such_package'; install the package"),
+        ("CartPole-v1", {}, "is a CartPoleEnv, no environment of highway-env; its class must be a subclass"),
+        ("racetrack-v0", {}, "has no meta-actions but ContinuousAction; config"),
+        ("intersection-v1", {}, "has no meta-actions but ContinuousAction; config"),
+        ("racetrack-v0", SPEED_ONLY, "cannot be reset: AttributeError: 'functools.partial'"),
+        ("merge-v0", {"action": {"type": "DiscreteMetaAction", "longitudinal": False}}, "has no action FASTER, SLOWER"),
+        ("merge-v0", {"policy_frequency": 2}, "simulation_frequency 15 is no multiple of policy_frequency 2"),
+        ("merge-v0", {"policy_freqency": 1}, "did you mean 'policy_frequency'?"),
+        ("forgetful-v0", {}, "its traffic differs between two runs of seed 0; draw from env.np_random"),
+        ("locked-v0", {}, "cannot be copied: TypeError: cannot pickle '_thread.lock' object"),
+        ("hasty-v0", {}, "frame by frame its traffic is another than by its step()"),
+        ("broken-v0", {}, "its step() fails: ZeroDivisionError: division by zero"),
+        ("unlike-v0", {}, r"cannot be made: ValueError: nobody\\nis here"),
+    ],
+)  # fmt: skip
+def test_what_an_environment_lacks_is_said_in_a_line(env, config, said):
+    with pytest.raises(UserError) as error:
+        examine(scenarios.get(named(env, config)), 0)
+    assert said.replace(r"\\n", r"\n") in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_road_of_another_seed_is_refused():
+    scenario = scenarios.get("env:rebuilt-v0")
+    with pytest.raises(UserError, match=r"its road in seed \d is another than in seed 0; fix the road"):
+        for seed in range(1, 6):
+            World.start(scenario, seed)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "give a scenario or --env, one of the two"),
+        (("do-not-pass", "--env", "merge-v0"), "give a scenario or --env, one of the two"),
+        (("do-not-pass", "--env-config", "c.json"), "--env-config is of an environment"),
+        (("--env", "merge-v0", "--env-config", "missing.json"), "--env-config missing.json cannot be read"),
+        (("--env", "merge-v0", "--env-config", "list.json"), "its config is no JSON object"),
+        (("--env", "merge-v0:decisions=0"), "decisions is 0; it must be above 0, at most 9"),
+        (("--env", "merge-v0:decisions=many"), "decisions is 'many'; give a number"),
+        (("--env", "merge-v0:goals=3"), "unknown setting of scenario env:merge-v0 'goals'"),
+        (("--env", "\x1b[31mred"), r"\x1b[31mred"),
+    ],
+)
+def test_bad_input_is_a_line(harness, tmp_path, arguments, said):
+    (tmp_path / "list.json").write_text("[1]")
+    code, _, err = harness("dataset", "build", *arguments, "--out", "made")
+    assert (code, err.count("\n")) == (2, 1)
+    assert said in err
+
+
+def test_the_page_shows_the_environment_of_these_tests():
+    root = Path(__file__).parents[2]
+    assert (root / "tests/my_roads.py").read_text() in (root / "docs/environments.md").read_text()
