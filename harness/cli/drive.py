@@ -65,7 +65,7 @@ def command(
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
-    from harness.world.environment import examine
+    from harness.world.environments.examination import examine
     from harness.world.scenarios import DEFAULT
 
     if condition and ALL in condition and len(condition) > 1:

@@ -80,7 +80,7 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     """The scenario that is meant by a name, or by an environment and what its configuration changes."""
     import json
 
-    from harness.world import environment
+    from harness.world.environments import environment
 
     if (name is None) == (env is None):
         raise UserError("give a scenario or --env, one of the two; `harness scenario list` lists scenarios")

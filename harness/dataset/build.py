@@ -37,8 +37,10 @@ from harness.dataset.schema import (
     tree_schema,
 )
 from harness.dataset.verify import level_name, read_manifest, tree_name
-from harness.world import environment, scenarios
+from harness.world import scenarios
 from harness.world.audit import Audit, audit
+from harness.world.environments import environment
+from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
@@ -101,7 +103,7 @@ def build(
     if begun := work.begun(out, work.Begun):
         work.same(out, config, begun.settings)
     elif scenario.start:
-        environment.examine(scenario, seed)
+        examine(scenario, seed)
     with work.working(out, begun or work.Begun(settings=config)) as place:
         manifest = _built(scenario, out, place, config, workers, progress, audits, more)
         work.tidy(out)

@@ -203,7 +203,7 @@ class Snapshot(Closed, frozen=True):
 
 
 class Taken(Closed, frozen=True):
-    """What an environment needs to come to the same again from its seed: the frame and name of each action."""
+    """What leads an environment from its seed to here again: the frame and the name of each action."""
 
     frame: Count
     taken: list[tuple[Count, Text]]

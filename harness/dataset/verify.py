@@ -16,8 +16,9 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_bytes, sha256_file
 from harness.dataset.schema import LAYOUTS, Manifest, Record, Taken, Tree, record_type
-from harness.world import environment, scenarios
+from harness.world import scenarios
 from harness.world.drivers import DRIVERS
+from harness.world.environments import environment
 from harness.world.scenario import Scenario
 
 _MANIFEST = msgspec.json.Decoder(Manifest)

@@ -82,8 +82,7 @@ class Path:
         reach = round(BEND_M / float(self.arc_m[1]))
         turned = np.unwrap(self.headings_rad)
         padded = np.pad(turned, reach, mode="edge")
-        bends: Floats = np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M)
-        return bends
+        return np.asarray(np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M))
 
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
@@ -177,8 +176,8 @@ class Road:
         network: gives highway-env's network, always the same one; nobody writes to it.
         ground: gives what a picture shows that reaches so many metres from the origin.
         origin_m: where the origin is in highway-env's own frame.
-        goal_m: gives the arc length of the ego's path at which its episode is over, of the scenario's parameters:
-            whom it would meet beyond does not matter. None where that is no place on its path.
+        goal_m: gives, of the scenario's parameters, the arc length of the ego's path at which its episode is
+            over: whom it would meet beyond does not matter. None where that is no place on its path.
     """
 
     facts: Mapping[str, str | float]

@@ -3,7 +3,6 @@
 Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -11,7 +10,8 @@ from pkgutil import iter_modules
 from typing import Any
 
 from harness.core.errors import UserError, printable, unknown
-from harness.world import environment
+from harness.world.environments import environment
+from harness.world.environments import scenario as environments
 from harness.world.scenario import BEACON_DIALS, Parameters, Scenario
 
 GROUP = "swarmdrive.scenarios"
@@ -42,7 +42,7 @@ def get(text: str) -> Scenario:
 
 def dials(scenario: Scenario) -> tuple[str, ...]:
     """The parameters that a name may set: `NAME:beacon_loss=0.3`."""
-    return (*BEACON_DIALS, *(environment.DIALS if scenario.start else ()))
+    return (*BEACON_DIALS, *(environments.DIALS if scenario.start else ()))
 
 
 def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float]:
@@ -60,7 +60,7 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float]:
 
 def _named(name: str) -> Scenario:
     if name.startswith(environment.PREFIX):
-        return environment.scenario(name)
+        return environments.scenario(name)
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario

@@ -64,7 +64,10 @@ def _together(ahead: Route, lanes: Sequence[Lane]) -> int:
     return sum(a == b for a, b in zip(ahead, rest, strict=False))
 
 
-def routes(name: str, network: Any, begin: Street, origin_m: tuple[float, float], reach_m: float) -> Routes:
+def routes(
+    name: str, network: Any, begin: Street, origin_m: tuple[float, float] = (0.0, 0.0),
+    reach_m: float = math.inf,
+) -> Routes:  # fmt: skip
     """Every path of a network as far as it lies within reach.
 
     Args:

@@ -5,24 +5,18 @@ simulated here, as `env._simulate` does, and at the end of each period `env.step
 its own: whatever an environment adds to it, new traffic, rewards, ends, happens as it would.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.world import beacons
-from harness.world.environment import (
-    Constants,
-    ego_actions,
-    first_target_mps,
-    index_of,
-    lane_of,
-    outline_of,
-    prepared,
-    reset,
-)
+from harness.world.environments.environment import Constants, lane_of, meta_actions, numbered, reset, shown
+from harness.world.environments.scenario import Parameters, ends_of, first_target_mps, place
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
@@ -39,7 +33,8 @@ class EnvironmentWorld(World):
     Attributes:
         env: highway-env's environment.
         constants: highway-env's class constants as this environment wants them.
-        cast: its vehicles in the order of their ids, the ego first.
+        here: what is the same for every seed.
+        everybody: its vehicles in the order of their ids, the ego first.
         born: how many vehicles there have been.
         action: the action that was taken last.
         taken: the frame and the name of each action.
@@ -48,7 +43,8 @@ class EnvironmentWorld(World):
 
     env: Any = None
     constants: Constants = field(default_factory=lambda: Constants({}))
-    cast: list[Any] = field(default_factory=list)
+    here: Any = None
+    everybody: list[Any] = field(default_factory=list)
     born: int = 0
     action: str = "IDLE"
     taken: tuple[tuple[int, str], ...] = ()
@@ -56,29 +52,27 @@ class EnvironmentWorld(World):
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """The start of a seed's episode."""
-        env, same, p = reset(scenario.name, seed), prepared(scenario.name), scenario.parameters
-        ego, shown = env.vehicle, printable(scenario.name, 80)
-        if outline_of(env.road.network) != same.outline:
+        """The start of a seed's episode. Raises UserError if its road or the ego's way is not seed 0's."""
+        name, env = scenario.name, reset(scenario.name, seed)
+        here, ego = place(name), env.vehicle
+        if ends_of(env.road.network) != here.ends:
             raise UserError(
-                f"{shown}: its road in seed {seed} is another than in seed 0; fix the road in its config"
+                f"{shown(name)}: its road is another in seed {seed} than in seed 0; fix it in its config"
             )
-        if not set(same.routes.keys(lane_of(ego.target_lane_index), ego.route)) & set(same.ways):
+        if not set(here.routes.keys(lane_of(ego), ego.route)).intersection(here.road.ways):
             raise UserError(
-                f"{shown}: in seed {seed} the ego starts on another road than in seed 0; fix that in its config"
+                f"{shown(name)}: the ego starts on another road in seed {seed} than in seed 0; fix it in its "
+                "config"
             )
-        world = cls(
-            scenario, seed, Layout((), _buildings(env, same.road.origin_m), None, None), env.road,
-            env=env, constants=Constants.now(),
-        )  # fmt: skip
-        others = sorted(
-            (v for v in env.road.vehicles if v is not ego),
-            key=lambda v: (v not in env.controlled_vehicles, float(np.hypot(*(v.position - ego.position)))),
-        )
-        ego.to_go_m = p.goal_s * first_target_mps(ego)  # type: ignore[attr-defined]
+        layout = Layout((), _buildings(env, here.road.origin_m), None, None)
+        p = cast("Parameters", scenario.parameters)
+        world = cls(scenario, seed, layout, env.road, env=env, here=here, constants=Constants.now())
+        ego.to_go_m = p.goal_s * first_target_mps(ego)
         world._enter(ego, "ego")
-        for place, v in enumerate(others):
-            world._enter(v, "helper" if place < p.helpers else "other")  # type: ignore[attr-defined]
+        others = (v for v in env.road.vehicles if v is not ego)
+        nearest = sorted(others, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
+        for n, v in enumerate(nearest):
+            world._enter(v, "helper" if n < p.helpers else "other")
         poses = beacons.lead_in(p, np.array(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
@@ -86,7 +80,7 @@ class EnvironmentWorld(World):
     @property
     def vehicles(self) -> Sequence[Any]:
         """highway-env's vehicles, the ego first."""
-        return self.cast
+        return self.everybody
 
     @property
     def period(self) -> int:
@@ -98,27 +92,24 @@ class EnvironmentWorld(World):
         self.born += 1
         v.spawn, v.braking = Spawn(f"v{self.born}", _kind(v), part, "", "", 0.0, 0.0), False
         self._place(v)
-        self.cast.append(v)
+        self.everybody.append(v)
 
     def _place(self, v: Any) -> None:
         """Note which path a vehicle is on: the one that it was on, if that can be."""
-        same = prepared(self.scenario.name)
-        lane = v.target_lane_index if hasattr(v, "target_lane_index") else v.lane_index
-        keys: list[PathKey] = same.routes.keys(lane_of(lane), getattr(v, "route", None))
-        now = v.spawn.approach, v.spawn.route
+        road, now = self.here.road, (v.spawn.approach, v.spawn.route)
+        keys: list[PathKey] = self.here.routes.keys(lane_of(v), getattr(v, "route", None))
         if v.spawn.part == "ego":
-            keys = [key for key in same.ways if key in keys] or [same.road.ego if now == ("", "") else now]
+            keys = [key for key in road.ways if key in keys] or [now]
         if now not in keys:
-            approach, route = (keys or [same.road.ego])[0]
+            approach, route = (keys or [road.ego])[0]
             v.spawn = replace(v.spawn, approach=approach, route=route)
 
     def branch(self) -> "EnvironmentWorld":
         """A copy that goes its own way."""
-        import copy
-
-        lanes = self.road.network.lanes_list()
+        network = self.road.network
         shared = (
-            self.scenario, self.layout, self.road.network, self.beacons, self.constants, self.taken, *lanes,
+            self.scenario, self.layout, self.here, self.beacons, self.constants, self.taken, network,
+            *network.lanes_list(),
         )  # fmt: skip
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
@@ -128,21 +119,21 @@ class EnvironmentWorld(World):
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now."""
-        ego_actions(self.env, "").act(ego_actions(self.env, "").actions_indexes[action])
+        kind = meta_actions(self.scenario.name, self.env)
+        kind.act(kind.actions_indexes[action])
         self.action, self.taken = action, (*self.taken, (self.frame, action))
-        self._place(self.cast[0])
+        self._place(self.everybody[0])
 
     @property
     def target(self) -> Target:
         """The lane and the speed that the ego aims at."""
-        ego = self.cast[0]
-        return f"{lane_of(ego.target_lane_index)} {round(float(ego.target_speed), DECIMALS)}", int(
-            ego.speed_index
-        )
+        ego = self.everybody[0]
+        aim = *lane_of(ego), round(float(ego.target_speed), DECIMALS)
+        return " ".join(map(str, aim)), int(ego.speed_index)
 
     def target_after(self, action: str) -> Target:
         """What the ego would aim at if it took an action now."""
-        ego, kept = self.cast[0], (self.action, self.taken)
+        ego, kept = self.everybody[0], (self.action, self.taken)
         own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
         self.take(action)
         target = self.target
@@ -159,9 +150,9 @@ class EnvironmentWorld(World):
     def _recast(self) -> None:
         """Let vehicles that have left go, and new ones enter."""
         there = {id(v) for v in self.road.vehicles}
-        self.cast = [v for v in self.cast if id(v) in there]
-        known = {id(v) for v in self.cast}
-        for v in self.cast:
+        self.everybody = [v for v in self.everybody if id(v) in there]
+        known = {id(v) for v in self.everybody}
+        for v in self.everybody:
             self._place(v)
         for v in self.road.vehicles:
             if id(v) not in known:
@@ -169,10 +160,10 @@ class EnvironmentWorld(World):
 
     def _move(self) -> None:
         self.constants.restore()
-        env, ego = self.env, self.cast[0]
+        env, ego = self.env, self.everybody[0]
         before = ego.position.copy()
         env.road.act()
-        for v in self.cast:
+        for v in self.everybody:
             v.braking = v.action["acceleration"] < -LAMPS_MPS2
         env.road.step(1 / self.scenario.parameters.simulation_hz)
         env.steps += 1
@@ -181,7 +172,7 @@ class EnvironmentWorld(World):
             self._end_period()
 
     def _end_period(self) -> None:
-        env, ego = self.env, self.cast[0]
+        env, ego = self.env, self.everybody[0]
         env._simulate = lambda action=None: None  # its frames are simulated already
         if not _reads_observations(env):
 
@@ -190,7 +181,8 @@ class EnvironmentWorld(World):
 
             env.observation_type.observe = nothing
         try:
-            *_, terminated, _, info = env.step(index_of(env, self.action))
+            kind = meta_actions(self.scenario.name, env)
+            *_, terminated, _, info = env.step(numbered(env, kind, self.action))
         finally:
             del env._simulate
         if terminated and not ego.crashed and ego.on_road:
@@ -219,11 +211,13 @@ def _kind(v: Any) -> Kind:
 
 def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
     """Solid objects on or beside the road, by their outlines along the axes; the nearest to the ego."""
-    ego = env.vehicle.position
-    solid = [thing for thing in env.road.objects if thing.solid]
-    solid.sort(key=lambda thing: float(np.hypot(*(thing.position - ego))))
+    solid = sorted((thing for thing in env.road.objects if thing.solid), key=partial(_apart_m, env.vehicle))
     boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
     return tuple(
-        Building(f"b{n + 1}", *box.min(axis=0).round(3).tolist(), *box.max(axis=0).round(3).tolist())
-        for n, box in enumerate(boxes)
+        Building(f"b{n}", *box.min(axis=0).round(3).tolist(), *box.max(axis=0).round(3).tolist())
+        for n, box in enumerate(boxes, 1)
     )
+
+
+def _apart_m(one: Any, other: Any) -> float:
+    return float(np.hypot(*(one.position - other.position)))

@@ -1,0 +1,64 @@
+"""Whether an environment can be frozen: tried once, before a dataset is built or an episode is driven."""
+
+from collections.abc import Sequence
+
+from harness.core.errors import UserError, printable
+from harness.world.environments.environment import meta_actions, numbered, reset, shown
+from harness.world.environments.world import EnvironmentWorld
+from harness.world.scenario import Scenario
+
+TRIED = ("IDLE", "FASTER", "SLOWER")
+Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
+
+
+def examine(scenario: Scenario, seed: int) -> None:
+    """Raise UserError unless equal seeds give equal traffic, which copies and single frames go on with.
+
+    Some decisions are taken by the environment's own `step`, twice, and frame by frame, by copies of copies.
+    """
+    name = shown(scenario.name)
+    once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))
+    if once != again:
+        raise UserError(
+            f"{name}: its traffic differs between two runs of seed {seed}; draw from env.np_random, and keep "
+            "nothing between episodes"
+        )
+    world = EnvironmentWorld.begun(scenario, seed)
+    for action, expected in zip(TRIED, once, strict=False):
+        try:
+            world = world.branch()
+        except Exception as error:
+            raise UserError(
+                f"{name} cannot be copied: {type(error).__name__}: {printable(error)}; keep files, locks and "
+                "the like out of its attributes"
+            ) from None
+        world.take(action)
+        world.advance(world.frame + world.period)
+        if world.outcome.ended:
+            return
+        if _places(world.env) != expected:
+            raise UserError(
+                f"{name}: frame by frame its traffic is another than by its step(); what its step() changes "
+                "must come after super().step()"
+            )
+
+
+def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Places]:
+    """Where everybody is after each decision."""
+    env, found = reset(scenario.name, seed), []
+    kind = meta_actions(scenario.name, env)
+    for action in actions:
+        try:
+            *_, terminated, _, _ = env.step(numbered(env, kind, action))
+        except Exception as error:
+            what = f"{type(error).__name__}: {printable(error)}"
+            raise UserError(f"{shown(scenario.name)}: its step() fails: {what}") from None
+        found.append(_places(env))
+        if terminated:
+            break
+    return found
+
+
+def _places(env: object) -> Places:
+    vehicles = env.road.vehicles  # type: ignore[attr-defined]
+    return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in vehicles]
