@@ -113,7 +113,8 @@ class Path:
 def _middle(lane: Any, origin_m: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """(n, 2) m, points of the middle of one of highway-env's lanes, its ends among them."""
     along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
-    return np.array([lane.position(s, 0.0) for s in along]) - origin_m
+    middle: Floats = np.array([lane.position(s, 0.0) for s in along]) - origin_m
+    return middle
 
 
 def _within(points: Floats, reach_m: float) -> Floats:
