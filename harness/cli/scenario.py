@@ -7,6 +7,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import as_mapping, console, echo_json, interval, shown, table
 from harness.cli.progress import bar
+from harness.core.errors import UserError, printable
 from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def check(
     scenario = ready_to_drive(name, episodes, seed, workers)
     from harness.world import reference as live
 
-    with bar(f"driving {name}", episodes) as progress:
+    with bar(f"driving {printable(name, 30)}", episodes) as progress:
         outcomes = live.check(scenario, episodes, seed, workers, progress)
     if as_json:
         echo_json(_as_mapping(name, episodes, seed, outcomes))
@@ -84,6 +85,8 @@ def audit(
 ) -> None:
     """Try to tell the hidden danger from what the ego sees. Exit code 1 if that can be done."""
     scenario = ready_to_drive(name, layouts, seed, workers, "--layouts")
+    if scenario.start:
+        raise UserError(f"{printable(name)} is an environment, of which no danger is known: nothing to audit")
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:
