@@ -214,7 +214,7 @@ def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
     return np.asarray(other["speed_mps"] * until_s - EMERGENCY_MPS2 / 2 * until_s**2)
 
 
-def least_gap(tried: Rollouts, motion: Motion, under_way: Bools) -> Floats:
+def least_gap(tried: Rollouts, motion: Motion, under_way: Bools | bool = True) -> Floats:
     """Smallest gap (m) to another vehicle while the ego is under way, per sequence; below zero they meet."""
     away, reach = cover(*motion.size_m)
     own, own_reach = cover(*SIZES_M["car"])

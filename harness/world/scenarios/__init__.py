@@ -53,7 +53,7 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float]:
     if key == "perfect_knowledge" and value in ("true", "false"):
         return key, value == "true"
     try:
-        return key, type(getattr(scenario.parameters, key))(value)
+        return key, (int if type(getattr(scenario.parameters, key)) is int else float)(value)
     except ValueError:
         raise UserError(f"scenario {shown}: {key} is {printable(value)!r}; give a number") from None
 
