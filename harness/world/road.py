@@ -120,7 +120,8 @@ def _middle(lane: Any, origin_m: tuple[float, float] = (0.0, 0.0)) -> Floats:
 def _within(points: Floats, reach_m: float) -> Floats:
     """Those of the points that lie so near the origin, or the nearest."""
     away_m = np.hypot(*points.T)
-    return points[away_m <= max(reach_m, away_m.min())]
+    near: Floats = points[away_m <= max(reach_m, away_m.min())]
+    return near
 
 
 @dataclass(frozen=True)
