@@ -7,6 +7,7 @@ alone.
 
 import json
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -209,7 +210,7 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
         f"{dial}={canonical_json(getattr(p, dial))}"
         for dial in scenarios.dials(scenario) if getattr(p, dial) != getattr(usual, dial)
     ]  # fmt: skip
-    name = environment.joined(scenario.name, dials)
+    name = shlex.quote(environment.joined(scenario.name, dials))
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != usual.decision_lag_s else ""
     unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"

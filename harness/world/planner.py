@@ -126,11 +126,8 @@ def travelled_m(
         n = k // every
         if k % every == 0 and n < left:
             move = moves[:, n] if n < moves.shape[1] else np.ones(len(sequences), dtype=int)
-            level = np.clip(
-                np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int) + move,
-                0,
-                len(levels) - 1,
-            )
+            nearest = np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int)
+            level = np.clip(nearest + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
         change = np.clip(
             (target - speed) / RESPONSE_S, -parameters.braking_mps2, parameters.acceleration_mps2

@@ -112,7 +112,7 @@ def _merged(default: Any, value: Any) -> Any:
 
 def config(name: str) -> dict[str, Any]:
     """An environment's whole configuration."""
-    whole: dict[str, Any] = json.loads(json.dumps(_made(name).config, default=str))
+    whole: dict[str, Any] = json.loads(json.dumps(_made(name).config, default=str), parse_constant=str)
     return whole
 
 

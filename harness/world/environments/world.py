@@ -23,7 +23,7 @@ from harness.world.simulator import DECIMALS, LAMPS_MPS2
 from harness.world.state import SIZES_M, Building, Kind, Part
 from harness.world.world import Snapshot, Target, World
 
-MOST_BUILDINGS = 9
+MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # that have an id in a record
 
 
 @dataclass
@@ -90,6 +90,10 @@ class EnvironmentWorld(World):
 
     def _enter(self, v: Any, part: Part) -> None:
         self.born += 1
+        if self.born > MOST_VEHICLES:
+            raise UserError(
+                f"{shown(self.scenario.name)}: more than {MOST_VEHICLES} vehicles; set fewer in its config"
+            )
         v.spawn, v.braking = Spawn(f"v{self.born}", _kind(v), part, "", "", 0.0, 0.0), False
         self._place(v)
         self.everybody.append(v)
