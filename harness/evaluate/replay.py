@@ -19,7 +19,7 @@ from harness.world.scenario import Parameters, Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 
-EVERY_FRAMES = 5  # between two stills, where no decision is open
+STILLS_HZ = 10  # where no decision is open
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
         yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, ending)
         if outcome.ended:
             return
-        until = world.frame + (1 if thinking else EVERY_FRAMES)
+        until = world.frame + (1 if thinking else max(1, round(p.simulation_hz / STILLS_HZ)))
         for frame in sorted(f for f in {*acts, *begins} if world.frame < f < until):
             until = min(until, frame)
         world.advance(until)

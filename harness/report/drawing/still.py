@@ -82,7 +82,8 @@ def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
     for viewer, ids in seen.items():
         colour = ROLES["ego" if viewer == state.ego.id else "helper"]
-        lines = [np.array([at[viewer], at[other]]) for other in ids]
+        there = [other for other in ids if viewer in at and other in at]  # traffic may have left since
+        lines = [np.array([at[viewer], at[other]]) for other in there]
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
 
@@ -112,7 +113,10 @@ def _messages(played: Played, still: Still) -> Iterator[Artist]:
     latency = played.manifest.latency
     sent_s = max(latency.ego_s, latency.helper_s)
     ego = still.state.ego
+    there = {v.id for v in still.state.vehicles}
     for message in still.decision.messages if still.open else ():
+        if message.sender not in there:
+            continue
         end_s = (message.arrival_ms or still.decision.latency_ms or 0.0) / 1000
         share = np.clip((still.since_s - sent_s) / max(end_s - sent_s, 1e-9), 0.0, 1.0)
         lost = not message.delivered
