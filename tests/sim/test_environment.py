@@ -23,6 +23,7 @@ from harness.world.drivers import DRIVERS
 from harness.world.environments.environment import named, reset
 from harness.world.environments.examination import examine
 from harness.world.environments.scenario import CAREFUL_FIRST
+from harness.world.environments.world import EnvironmentWorld
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.reference import drive
 from harness.world.state import WorldState
@@ -48,7 +49,7 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("env", ["merge-v0", "roundabout-v0", "two-way-v0", "highway-fast-v0"])
 def test_its_frames_are_those_of_its_own_step(env):
     scenario = scenarios.get(f"env:{env}")
-    theirs, ours = reset(scenario.name, 3), World.start(scenario, 3)
+    theirs, ours = reset(scenario.name, 3), EnvironmentWorld.begun(scenario, 3)
     for number in (1, 3, 0, 4):
         *_, terminated, _, _ = theirs.step(number)
         ours.take(theirs.action_type.actions[number])
@@ -62,7 +63,7 @@ def test_its_frames_are_those_of_its_own_step(env):
 def test_traffic_that_it_spawns_enters():
     scenario = scenarios.get(named("intersection-v1", SPEED_ONLY))
     assert (scenario.actions, scenario.parameters.decisions) == (CAREFUL_FIRST[:3], 6)
-    theirs, ours = reset(scenario.name, 0), World.start(scenario, 0)
+    theirs, ours = reset(scenario.name, 0), EnvironmentWorld.begun(scenario, 0)
     born = {v.id for v in ours.state().vehicles}
     for _ in range(8):
         theirs.step(1)
@@ -87,7 +88,7 @@ gymnasium.register("leaving-v0", entry_point=Leaving)
 
 
 def test_traffic_that_it_takes_away_has_gone():
-    world = World.start(scenarios.get("env:leaving-v0:decisions=2"), 0)
+    world = EnvironmentWorld.begun(scenarios.get("env:leaving-v0:decisions=2"), 0)
     seen = []
     for _ in range(3):
         seen.append({v.id for v in world.state().vehicles})
