@@ -172,7 +172,7 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
             f"{decisions_hz:g}; set one in its config"
         )
     period_s = 1 / decisions_hz
-    # A tree has some hundred decision points: three actions lead to 2.4 new ones, five to 3.4.
+    # A tree has about a hundred decision points: three actions lead to 2.4 new ones each, five to 3.4.
     decisions = 6 if actions == 3 else 4
     return Parameters(
         target_speeds_mps=tuple(float(speed) for speed in env.vehicle.target_speeds),
