@@ -123,6 +123,27 @@ def test_the_state_says_who_is_where_and_helpers_are_the_nearest():
     assert {v.route for v in state.vehicles} == {"to b lane 1", "to b lane 2"}
 
 
+def test_other_controlled_vehicles_help_first_and_keep_to_their_course():
+    several = {
+        "controlled_vehicles": 2,
+        "vehicles_count": 5,
+        "action": {"type": "MultiAgentAction", "action_config": {"type": "DiscreteMetaAction"}},
+        "observation": {
+            "type": "MultiAgentObservation",
+            "observation_config": {"type": "Kinematics"},
+        },
+    }
+    scenario = scenarios.get(named("highway-fast-v0", several))
+    examine(scenario, 0)
+    world = EnvironmentWorld.begun(scenario, 0)
+    _, other = world.env.controlled_vehicles
+    assert (other.spawn.id, other.spawn.part) == ("v2", "helper")
+    before = other.target_lane_index, other.target_speed
+    world.act("LANE_LEFT")
+    assert (other.target_lane_index, other.target_speed) == before
+    assert world.state().ego.route == "to 1 lane 2"
+
+
 def test_the_truck_hides_the_breakdown_from_the_ego_and_helpers_see_it():
     scenario = scenarios.get(OWN)
     state = World.start(scenario, 0).state()
