@@ -5,7 +5,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -74,12 +74,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 
 def scenario_of(manifest: Manifest) -> Scenario:
     """The scenario of a manifest, with the manifest's parameters."""
-    scenario = scenarios.get(manifest.scenario)
-    values: Any = {
-        name: tuple(value) if isinstance(value, list) else type(getattr(scenario.parameters, name))(value)
-        for name, value in manifest.parameters.items()
-    }
-    return replace(scenario, parameters=replace(scenario.parameters, **values))
+    return scenarios.stated(manifest.scenario, manifest.parameters)
 
 
 def check(path: Path) -> list[str]:

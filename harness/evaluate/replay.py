@@ -44,9 +44,10 @@ class Played:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What was driven."""
+        """What was driven, with the parameters of then."""
         assert isinstance(self.manifest.world, ClosedLoop)
-        return scenarios.get(self.manifest.world.scenario["name"])
+        of = self.manifest.world.scenario
+        return scenarios.stated(of["name"], of["parameters"])
 
 
 @dataclass(frozen=True)

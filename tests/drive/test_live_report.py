@@ -12,7 +12,7 @@ from run_on_disk import change, rows_of
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
-from harness.evaluate.replay import scene_of
+from harness.evaluate.replay import find, scene_of
 from harness.prompts import versions as prompts
 from harness.report.choose import failures, pick
 from harness.report.compare.pair import pair
@@ -67,6 +67,21 @@ def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     paired = pair(tmp_path / "run", tmp_path / "beacons")
     ours, theirs = (side.settings["scenario.perfect_knowledge"] for side in (paired.a, paired.b))
     assert (ours, theirs) == ("True", "False")
+
+
+def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
+    found = read(driven)
+    scene = next(iter(found.decisions.scenes))
+    earlier = edited(
+        driven, tmp_path, "run.json", lambda text: text.replace('"time_limit_s": 10.0', '"time_limit_s": 0.5')
+    )
+    assert find(earlier, 0, None, None).scenario.parameters.time_limit_s == 0.5
+    assert scene_of(read(earlier), scene).id == scene
+    gone = edited(
+        driven, tmp_path / "gone", "run.json", lambda text: text.replace('"time_limit_s"', '"patience_s"')
+    )
+    with pytest.raises(UserError, match="scenario occluded-intersection has other parameters here"):
+        scene_of(read(gone), scene)
 
 
 def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):

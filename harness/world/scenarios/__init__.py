@@ -3,6 +3,7 @@
 Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -73,6 +74,22 @@ def _named(name: str) -> Scenario:
 def is_here(name: str) -> bool:
     """Whether a scenario is one of this package."""
     return name in _files()
+
+
+def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
+    """A scenario with the parameters that a manifest states. Raises UserError where it has no such ones."""
+    scenario = get(name)
+    try:
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else type(getattr(scenario.parameters, key))(value)
+            for key, value in parameters.items()
+        }
+        return replace(scenario, parameters=replace(scenario.parameters, **values))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(
+            f"scenario {printable(scenario.name)} has other parameters here ({printable(error)}); "
+            "use the version that its manifest names"
+        ) from None
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:
