@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -11,7 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, show
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.resources import DATASET, folder
+from harness.core.resources import folder
 from harness.core.seeds import purpose, stated
 
 ALL = "all"
@@ -37,7 +38,7 @@ def command(
     ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the shipped dataset's."),
+    episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the scenario's dataset's."),
     first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
     sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
     sample_seed: int = typer.Option(0, help="Seed of the draw: those that eval draws of as many."),
@@ -70,7 +71,8 @@ def command(
 
     if condition and ALL in condition and len(condition) > 1:
         raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
-    shipped = json.loads((folder("datasets") / DATASET / "manifest.json").read_text())
+    name = options.scenario_name(scenario if scenario or env else DEFAULT, env, env_config)
+    shipped = _shipped(name.partition(":")[0], DEFAULT)
     episodes = shipped["episodes"] if episodes is None else episodes
     first_seed = shipped["seed"] if first_seed is None else first_seed
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
@@ -80,7 +82,6 @@ def command(
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
-    name = options.scenario_name(scenario if scenario or env else DEFAULT, env, env_config)
     source = LiveSource(first_seed, episodes, name, sample, sample_seed)
     if source.scenario.start:
         examine(source.scenario, first_seed)
@@ -129,3 +130,10 @@ def command(
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {page}")
+
+
+def _shipped(scenario: str, otherwise: str) -> dict[str, Any]:
+    """Manifest of the dataset that ships of a scenario; where none does, of the one `otherwise`."""
+    manifests = [json.loads(file.read_text()) for file in sorted(folder("datasets").glob("*/manifest.json"))]
+    by_scenario: dict[str, dict[str, Any]] = {manifest["scenario"]: manifest for manifest in manifests}
+    return by_scenario.get(scenario) or by_scenario[otherwise]

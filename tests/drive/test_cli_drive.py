@@ -52,6 +52,7 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
     [
         ("--episodes 3 --sample 4", "--sample 4: give 1 to 3 episodes"),
         ("--sample 0", "give 1 to 200 episodes"),
+        ("--scenario parking-exit --sample 0", "give 1 to 100 episodes"),
         ("--episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
         ("--first-seed -1", "--first-seed -1 is out of range"),
         ("--workers 0", "--workers 0 is out of range; give 1 to 256"),
