@@ -114,7 +114,7 @@ def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
             seen = moment(world, state, number, (state.ego, *state.helpers))
             children: dict[str, World] = {}
             ends_s = dict.fromkeys(world.actions, float(np.inf))
-            for edge in list(edges(world, number, children)):
+            for edge in edges(world, number, children):
                 if edge.end:
                     outcome = Outcome(edge.end.result, edge.end.time_s)
                 else:

@@ -6,7 +6,6 @@ the sequence that passes the conflict zone soonest without meeting anyone. Who i
 brake until it stands. It does not guess at what it cannot see, which is what makes occlusion cost something.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -65,7 +64,7 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     )
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
     to_go = ego["zone_m"] + 15.0 if road.goal_m is None else road.goal_m(p) - at_m
-    under_way = tried.travelled_m < (math.inf if road.goal_m is None else to_go)
+    under_way = True if road.goal_m is None else tried.travelled_m < to_go
     gap = np.full(len(tried.actions), np.inf)
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
         gap = np.minimum(gap, least_gap(tried, motion, under_way))
@@ -79,7 +78,7 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
     return min((tried.actions[i] for i in best), key=lambda s: [CALM[a] for a in s])[0]
 
 
-def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools) -> Bools:
+def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
     """Whether a sequence takes a bend faster than tyres hold, (n,)."""
     speed_mps = np.diff(tried.travelled_m, axis=1, prepend=tried.travelled_m[:, :1]) / STEP_S
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)

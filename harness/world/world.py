@@ -62,7 +62,7 @@ class World:
             return begun
         layout = scenario.layout(seed, scenario.parameters)
         world = cls(scenario, seed, layout, populated(scenario, layout))
-        poses = beacons.lead_in(scenario.parameters, np.array(world._poses()))
+        poses = beacons.lead_in(scenario.parameters, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
 
@@ -183,7 +183,7 @@ class World:
             self._step()
             frames.append(self._poses())
         if frames:
-            poses = np.array(frames)
+            poses = self._in_road_frame(frames)
             self._broadcast(poses, first)
             least_m = least_gap_m(poses[..., :3], vehicles, self.outcome.least_gap_m)
             self.outcome = replace(self.outcome, least_gap_m=least_m)
@@ -195,12 +195,14 @@ class World:
             self.braking_hard = bool(hard[-1])
 
     def _poses(self) -> list[tuple[float, ...]]:
-        """x, y, heading and speed of each vehicle."""
-        x_m, y_m = self.scenario.road().origin_m
-        return [
-            (float(v.position[0] - x_m), float(v.position[1] - y_m), float(v.heading), float(v.speed))
-            for v in self.vehicles
-        ]
+        """x, y, heading and speed of each vehicle, in highway-env's own frame."""
+        return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in self.vehicles]
+
+    def _in_road_frame(self, poses: Sequence[Any]) -> Floats:
+        """Poses (..., V, 4) from the origin of the scenario's road."""
+        found = np.array(poses)
+        found[..., :2] -= self.scenario.road().origin_m
+        return found
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """What the ego and the helpers say of themselves in some frames, (F, V, 4)."""

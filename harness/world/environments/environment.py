@@ -43,13 +43,13 @@ def shown(name: str) -> str:
 
 
 def reset(name: str, seed: int) -> Any:
-    """An environment at the start of a seed's episode. Raises UserError if that cannot be had, in a line."""
+    """An environment at the start of a seed's episode. Raises UserError, in a line, if there is no such."""
     env = _made(name)
     _constants().restore()
     try:
         env.reset(seed=seed)
     except Exception as error:
-        raise UserError(f"{shown(name)} cannot be reset: {_of(error)}; mind its config") from None
+        raise UserError(f"{shown(name)} cannot be reset: {raised(error)}; mind its config") from None
     meta_actions(name, env)
     return env
 
@@ -75,7 +75,7 @@ def _made(name: str) -> Any:
     except gymnasium.error.Error as error:
         raise UserError(f"{shown(name)}: {printable(error)}; give an id that gymnasium.make knows") from None
     except Exception as error:
-        raise UserError(f"{shown(name)} cannot be made: {_of(error)}") from None
+        raise UserError(f"{shown(name)} cannot be made: {raised(error)}") from None
     if not isinstance(env, AbstractEnv):
         raise UserError(
             f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class must be a "
@@ -88,7 +88,7 @@ def _made(name: str) -> Any:
     return env
 
 
-def _of(error: Exception) -> str:
+def raised(error: Exception) -> str:
     """What a user's code raised."""
     return f"{type(error).__name__}: {printable(error)}"
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from harness.core.errors import UserError, printable
-from harness.world.environments.environment import meta_actions, numbered, reset, shown
+from harness.core.errors import UserError
+from harness.world.environments.environment import meta_actions, numbered, raised, reset, shown
 from harness.world.environments.world import EnvironmentWorld
 from harness.world.scenario import Scenario
 
@@ -29,8 +29,8 @@ def examine(scenario: Scenario, seed: int) -> None:
             world = world.branch()
         except Exception as error:
             raise UserError(
-                f"{name} cannot be copied: {type(error).__name__}: {printable(error)}; keep files, locks and "
-                "the like out of its attributes"
+                f"{name} cannot be copied: {raised(error)}; keep files, locks and the like out of its "
+                "attributes"
             ) from None
         world.take(action)
         world.advance(world.frame + world.period)
@@ -51,8 +51,7 @@ def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Plac
         try:
             *_, terminated, _, _ = env.step(numbered(env, kind, action))
         except Exception as error:
-            what = f"{type(error).__name__}: {printable(error)}"
-            raise UserError(f"{shown(scenario.name)}: its step() fails: {what}") from None
+            raise UserError(f"{shown(scenario.name)}: its step() fails: {raised(error)}") from None
         found.append(_places(env))
         if terminated:
             break

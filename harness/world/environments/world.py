@@ -73,7 +73,7 @@ class EnvironmentWorld(World):
         nearest = sorted(others, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
         for n, v in enumerate(nearest):
             world._enter(v, "helper" if n < p.helpers else "other")
-        poses = beacons.lead_in(p, np.array(world._poses()))
+        poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
 
