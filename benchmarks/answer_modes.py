@@ -28,6 +28,7 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset import load
+from harness.evaluate.agent import Agent
 from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
@@ -73,7 +74,7 @@ def asked_of(card: cards.Card, mode: str, count: int, most: int | None) -> list[
     """The ego's requests, spread over the shipped dataset."""
     dataset = load.load(load.find(DATASET))
     source, points = FrozenSource(dataset), tuple(POINTS.values())
-    spec = Spec(card, prompts.load("v2"), source, points, (0,), answer=mode)  # type: ignore[arg-type]
+    spec = Spec(Agent(card, prompts.load("v2"), mode), source, points, (0,))  # type: ignore[arg-type]
     ids = dataset.courses()
     scenes = dataset.scenes(ids[:: max(1, len(ids) // count)][:count])
     egos = [r for r in requests(spec, scenes) if r.role == "ego"]

@@ -25,6 +25,7 @@ from harness.backends import cards
 from harness.backends.proxy import Proxy
 from harness.coordination.operating_point import POINTS
 from harness.dataset import freeze
+from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker
 from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.run import evaluate
@@ -55,8 +56,8 @@ def main() -> None:
     arguments.add_argument("--repeats", type=int, default=5)
     given = arguments.parse_args()
     spec = Spec(
-        cards.resolve("proxy"), prompts.load("v2"), LiveSource(0, given.episodes), tuple(POINTS.values()),
-        tuple(range(given.seeds)),
+        Agent(cards.resolve("proxy"), prompts.load("v2")), LiveSource(0, given.episodes),
+        tuple(POINTS.values()), tuple(range(given.seeds)),
     )  # fmt: skip
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 

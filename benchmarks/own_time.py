@@ -29,6 +29,7 @@ from harness.core.files import canonical_json
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate import asking, run, walk
+from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
@@ -62,7 +63,7 @@ def main() -> None:
     dataset = load.load(load.find(given.dataset))
     loading_ms = (process_time() - start) * 1000 / len(dataset.forest.ids)
     specs = [
-        Spec(cards.resolve("proxy"), prompts.load(given.prompt), FrozenSource(copies(dataset, size)),
+        Spec(Agent(cards.resolve("proxy"), prompts.load(given.prompt)), FrozenSource(copies(dataset, size)),
              tuple(POINTS.values()), tuple(range(5)))
         for size in given.sizes
     ]  # fmt: skip

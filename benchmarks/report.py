@@ -25,6 +25,7 @@ from harness.backends import cards
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
+from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
@@ -51,8 +52,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
         base = Path(scratch)
         spec = Spec(
-            cards.resolve("proxy"),
-            prompts.load("v2"),
+            Agent(cards.resolve("proxy"), prompts.load("v2")),
             FrozenSource(load(find(DATASET))),
             tuple(POINTS.values()),
             tuple(range(5)),

@@ -16,6 +16,7 @@ from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene
 from harness.dataset.schema import Branching, Edge, End
 from harness.dataset.select import Selection
+from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.live_world import LiveSource
@@ -37,14 +38,20 @@ def spec_of(
     dataset: Dataset, model: str = "proxy", prompt: str = "v2", limit: int | None = None, **options: Any
 ) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(
-        cards.resolve(model), prompts.load(prompt), FrozenSource(dataset, Selection(limit)), **options
-    )
+    asked = {name: options.pop(name) for name in ("answer", "thinking") if name in options}
+    ego = Agent(cards.resolve(model), prompts.load(prompt), **asked)
+    return Spec(ego, FrozenSource(dataset, Selection(limit)), **options)
+
+
+def with_ego(spec: Spec, **changes: Any) -> Spec:
+    """The evaluation with another card, prompt, answer mode or thinking."""
+    return replace(spec, ego=replace(spec.ego, **changes))
 
 
 def live_spec_of(model: str = "proxy", episodes: int = 2, first_seed: int = 0, **options: Any) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
-    return Spec(cards.resolve(model), prompts.load("v2"), LiveSource(first_seed, episodes), **options)
+    ego = Agent(cards.resolve(model), prompts.load("v2"))
+    return Spec(ego, LiveSource(first_seed, episodes), **options)
 
 
 def run(spec: Spec, out: Path) -> Evaluated:

@@ -24,6 +24,7 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset, load
+from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
@@ -44,10 +45,12 @@ CHANGED: dict[str, Any] = {
     "thinking": True,
     "reasons_first": True,
     "sample": 1,
+    "agent": 1,
     "view": {"nodes": []},
     "truth": {"nodes": []},
     "scenario": SCENARIO,
 }
+READ_BY_NO_MODEL = ("id", "agent", "reasons_first", "view", "truth", "scenario")
 
 
 class Talker(Scripted):
@@ -82,7 +85,7 @@ def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None
         assert same == (name in NOT_IN_KEY), name
 
 
-@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"id", "reasons_first", "view", "truth", "scenario"}))
+@pytest.mark.parametrize("name", sorted(set(CHANGED) - set(READ_BY_NO_MODEL)))
 def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str, file: Path) -> None:
     talker = Talker()
     Cached(talker, file).complete([BASE])
@@ -254,7 +257,9 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     card = replace(cards.resolve(str(tiny)), max_new_tokens=6, latency=latency)
     points = tuple(POINTS.values())
     source = FrozenSource(data)
-    spec = Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
+    spec = Spec(
+        Agent(card, prompts.load("v2")), source, points, (0,), device="cpu", dtype="float32", **options
+    )
     return evaluate(spec, out, lambda done: None, cache)
 
 
@@ -301,7 +306,7 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
         card = cards.load("openai-example")
         assert card.server is not None
         card = replace(card, server=replace(card.server, base_url=there.url))
-        spec = Spec(card, prompts.load("v2"), FrozenSource(data), tuple(POINTS.values()), (0,))
+        spec = Spec(Agent(card, prompts.load("v2")), FrozenSource(data), tuple(POINTS.values()), (0,))
         manifests = [
             evaluate(spec, tmp_path / name, lambda done: None, file).manifest for name in ("first", "again")
         ]
@@ -322,7 +327,7 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     gguf_export.export(folder, tmp_path / "tiny.gguf", "F32")
     card = replace(cards.resolve(str(tmp_path / "tiny.gguf")), max_new_tokens=6)
     source = FrozenSource(load(small_path, limit=1))
-    spec = Spec(card, prompts.load("v2"), source, tuple(POINTS.values()), (0,))
+    spec = Spec(Agent(card, prompts.load("v2")), source, tuple(POINTS.values()), (0,))
     for name in ("first", "again"):
         done = evaluate(spec, tmp_path / name, lambda done: None, file)
     answers = answers_of(tmp_path / "again")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from evaluating import run, spec_of
+from evaluating import run, spec_of, with_ego
 from tokenizers import Tokenizer, models
 
 from harness import __version__, cli
@@ -310,7 +310,7 @@ def test_a_run_has_the_first_free_folder_or_goes_on_where_it_was_stopped(
     holder.communicate()
     (second / ".work" / "config.json").write_text("{")
     assert default_out(spec) == third, "it is damaged"
-    hostile = replace(spec, card=replace(spec.card, name="../../etc/\x00\n"))
+    hostile = with_ego(spec, card=replace(spec.ego.card, name="../../etc/\x00\n"))
     assert default_out(hostile).parent == Path("reports")
     assert "/" not in default_out(hostile).name
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from evaluating import Scripted, run, says, scenes_of, spec_of
+from evaluating import Scripted, run, says, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
@@ -26,8 +26,10 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
+from harness.evaluate.agent import Agent
 from harness.evaluate.latency import PAPER, as_declared, declared, known, times
 from harness.evaluate.timing import IDLE, measured
+from harness.prompts import versions
 from harness.runs.records import Latency, Times
 
 LANGUAGE_MODEL = "swarm-tiny"
@@ -38,8 +40,10 @@ ROWS = ("decisions.parquet", "episodes.csv", "summary.csv")
 
 
 def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
-    silent, nobody = resolve(LANGUAGE_MODEL), Scripted({})
-    fast = replace(silent, latency=CardLatency("card", 0.03, "measured: my car, today"))
+    prompt, nobody = versions.load("v2"), [Scripted({})]
+    silent = [Agent(resolve(LANGUAGE_MODEL), prompt)]
+    latency = CardLatency("card", 0.03, "measured: my car, today")
+    fast = [Agent(replace(resolve(LANGUAGE_MODEL), latency=latency), prompt)]
     of_card = Latency("card", "measured: my car, today", 0.03, 0.03, 0.03)
     assert known(None, silent, nobody) == known("paper", silent, nobody) == PAPER
     assert (PAPER.ego_s, PAPER.helper_s, PAPER.fusion_s) == (0.145, 0.145, 0.145)
@@ -150,7 +154,7 @@ def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset)
     assert (latency.sample["helper"].n, latency.sample["merge"].n) == (helpers, len(scenes))
     assert latency.source == "measured"
     # Letters have no messages to fuse, and a role without a time has the ego's.
-    readout = measured(replace(spec, answer="readout"), Clock({}), scenes)
+    readout = measured(with_ego(spec, answer="readout"), Clock({}), scenes)
     assert (readout.fusion_s, sorted(readout.sample)) == (0.2, ["ego", "helper"])
 
 

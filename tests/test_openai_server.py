@@ -12,10 +12,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from evaluating import run, scenes_of, spec_of
+from evaluating import run, scenes_of, spec_of, with_ego
 from run_on_disk import answers_of
 
-from harness.backends import cards
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
@@ -97,7 +96,7 @@ def data(small_path: Path) -> Dataset:
 
 
 def some(data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int = 24) -> list[Request]:
-    spec = replace(spec_of(data, prompt=prompt), card=cards.load("openai-example"), answer=answer)
+    spec = spec_of(data, "openai-example", prompt=prompt, answer=answer)
     asked = list(requests(spec, scenes_of(data)))[:8]
     # The server tells its template nothing about thinking, which opens no thought and closes none.
     return [replace(r, max_tokens=max_tokens, thinking=True) for r in asked]
@@ -162,7 +161,7 @@ def test_a_constrained_answer_of_a_server_keeps_to_the_form(prompt: str, card: C
 
 
 def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset, tmp_path: Path) -> None:
-    spec = replace(spec_of(data), card=replace(card, max_new_tokens=120), answer="constrained", batch_size=1)
+    spec = with_ego(spec_of(data, batch_size=1), card=replace(card, max_new_tokens=120), answer="constrained")
     done = run(spec, tmp_path / "run")
     answers = answers_of(tmp_path / "run")
     assert {a.error for a in answers} == {None}

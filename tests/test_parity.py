@@ -52,7 +52,7 @@ def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     asked = list(requests(spec, scenes_of(data)))[:PROMPTS]
     letters = list(requests(spec_of(data, str(folder), answer="readout"), scenes_of(data)))[:PROMPTS]
     passes: list[int] = []
-    found = compare(spec.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
+    found = compare(spec.ego.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
     assert passes == [1] * PASSES
     assert {finding.n for finding in found} == {PROMPTS}
     return {finding.what: finding for finding in found}

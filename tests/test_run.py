@@ -23,6 +23,7 @@ from evaluating import (
     same_scores,
     scenes_of,
     spec_of,
+    with_ego,
 )
 from run_on_disk import answers_of, rows_of
 
@@ -31,6 +32,7 @@ from harness.backends.cards import Latency
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
+from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
@@ -79,7 +81,9 @@ def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
     )
     points = tuple(POINTS.values())
     source = FrozenSource(data)
-    return Spec(card, prompts.load("v2"), source, points, (0,), device="cpu", dtype="float32", **options)
+    return Spec(
+        Agent(card, prompts.load("v2")), source, points, (0,), device="cpu", dtype="float32", **options
+    )
 
 
 def test_the_batch_size_changes_no_answer_of_a_language_model(
@@ -248,7 +252,7 @@ def test_a_prompt_that_does_not_render_some_scene_leaves_no_run(small: Dataset, 
     text = prompt.texts["ego"].replace("Distribution:", "{{ graph.step + (0 if graph.step < 2 else 'x') }}")
     broken = replace(prompt, texts={**prompt.texts, "ego": text})
     with pytest.raises(UserError, match=r"prompt v2 ego\.j2 does not render"):
-        run(replace(spec_of(small), prompt=broken), tmp_path / "out")
+        run(with_ego(spec_of(small), prompt=broken), tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".work"}
 
 
@@ -275,17 +279,17 @@ def test_settings_that_mean_nothing_are_refused(options: dict[str, Any], said: s
     assert str(caught.value).startswith(said)
 
 
-def test_a_served_model_thinks_where_its_card_says_so(small: Dataset) -> None:
-    card, source = cards.load("openai-example"), FrozenSource(small)
-    assert Spec(card, prompts.load("v2"), source, (), (0,), thinking=True).thinking is True
+def test_a_served_model_thinks_where_its_card_says_so() -> None:
+    card = cards.load("openai-example")
+    assert Agent(card, prompts.load("v2"), thinking=True).thinking is True
     with pytest.raises(UserError, match="--thinking: openai-example cannot think; leave it out"):
-        Spec(replace(card, thinking="none"), prompts.load("v2"), source, (), (0,), thinking=True)
+        Agent(replace(card, thinking="none"), prompts.load("v2"), thinking=True)
 
 
-def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to(small: Dataset) -> None:
-    card, source = replace(cards.load("qwen3-4b"), thinking="always"), FrozenSource(small)
-    assert Spec(card, prompts.load("v2"), source, (), (0,)).thinking is True
-    assert Spec(cards.load("qwen3-4b"), prompts.load("v2"), source, (), (0,)).thinking is False
+def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to() -> None:
+    card = replace(cards.load("qwen3-4b"), thinking="always")
+    assert Agent(card, prompts.load("v2")).thinking is True
+    assert Agent(cards.load("qwen3-4b"), prompts.load("v2")).thinking is False
 
 
 # -- conditions -------------------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
 def answers(small: Dataset, tmp_path: Path) -> bytes:
     """All answers of a run, as they are kept while it goes on."""
     spec = spec_of(small)
-    walked(spec, open_backend(spec.card), PAPER, tmp_path / "answers.jsonl")
+    walked(spec, open_backend(spec.ego.card), PAPER, tmp_path / "answers.jsonl")
     return (tmp_path / "answers.jsonl").read_bytes()
 
 
@@ -88,7 +88,7 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
     """Killed twice: the answers of the second try stand on lines of their own."""
     kept, spec = tmp_path / "answers.jsonl", spec_of(small)
     kept.write_bytes(answers[:5000])
-    walked(spec, open_backend(spec.card), PAPER, kept)
+    walked(spec, open_backend(spec.ego.card), PAPER, kept)
     (tmp_path / "whole.jsonl").write_bytes(answers)
     assert read_kept(kept) == read_kept(tmp_path / "whole.jsonl")
 

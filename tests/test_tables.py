@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from evaluating import live_spec_of, run, spec_of
+from evaluating import live_spec_of, run, spec_of, with_ego
 from run_on_disk import answers_of, made_up, rows_of
 
 import harness
@@ -23,7 +23,7 @@ ACTIONS = ("SLOWER", "IDLE", "FASTER")
 def frozen(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose answers fail in many ways, by a model whose name pandas takes for a missing value."""
     spec = spec_of(small, "proxy-faulty", points=(POINTS["single-local"], POINTS["6g"]))
-    spec = replace(spec, card=replace(spec.card, name="null"))
+    spec = with_ego(spec, card=replace(spec.ego.card, name="null"))
     return run(spec, tmp_path_factory.mktemp("tables") / "frozen").out
 
 

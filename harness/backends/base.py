@@ -33,6 +33,7 @@ class Request:
         thinking: whether the model was asked to think first (where its template can).
         reasons_first: whether the prompt asks for reasons before the answer.
         sample: which of several answers to one question; 0 where one is asked for.
+        agent: which of the run's agents is asked: 0 is the ego's.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
@@ -49,6 +50,7 @@ class Request:
     thinking: bool = False
     reasons_first: bool = False
     sample: int = 0
+    agent: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
     scenario: "Scenario | None" = None

@@ -26,6 +26,7 @@ T = TypeVar("T")
 NOT_IN_KEY = {
     "id": "names the place in a run; the model never reads it",
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
+    "agent": "which model is asked; what it is, is in the identity",
     "reasons_first": "how the answer is read; the prompt asks for it in words",
     "view": "no language model reads it",
     "truth": "no language model reads it",

@@ -1,16 +1,20 @@
-"""Replay: the answers of an earlier run, so that a changed parser or rule is scored without a model."""
+"""Replay: the answers of an earlier run, so that a changed parser, rule or mix is scored without a model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import Completion, Request
+import msgspec
+
+from harness.backends.base import Backend, Completion, Request
+from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card
-from harness.backends.registry import find
+from harness.backends.registry import find, open_backend
+from harness.core.config import convert
 from harness.core.errors import UserError, printable
-from harness.core.files import digest, sha256_file
+from harness.core.files import canonical_json, digest, sha256_file
 from harness.runs.folder import Run, read
-from harness.runs.records import Latency
+from harness.runs.records import Answer, Latency
 
 
 def open(card: Card, **_: Any) -> "Replay":
@@ -30,33 +34,76 @@ def open(card: Card, **_: Any) -> "Replay":
 
 
 class Replay:
-    """Looks answers up by scene and viewer. A prompt that was never asked is an error, not a guess."""
+    """Looks answers up by scene and viewer. A prompt that was never asked is an error, not a guess.
+
+    Where other decisions lead to a decision point that the run did not come to, its model is asked: the same,
+    by its identity.
+    """
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._answers = {answer.id: answer for answer in run.answers}
+        self._episodes = {_episode(answer.scene) for answer in run.answers}
+        self._models: dict[str, Backend] = {}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        return [self._completion(request) for request in requests]
+        known = [self._answers.get(request.id) for request in requests]
+        lacking: dict[str, list[Request]] = {}
+        for request, answer in zip(requests, known, strict=True):
+            if answer is None:
+                lacking.setdefault(request.role, []).append(request)
+        asked = {
+            c.request_id: c for role, some in lacking.items() for c in self._model(role, some).complete(some)
+        }
+        return [
+            asked[request.id] if answer is None else self._completion(request, answer)
+            for request, answer in zip(requests, known, strict=True)
+        ]
 
-    def _completion(self, request: Request) -> Completion:
-        answer, shown, manifest = self._answers.get(request.id), printable(self._run.path), self._run.manifest
-        if answer is None:
-            raise UserError(
-                f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
-                + (", whose conditions delivered the same messages" if "+" in request.id else "")
-            )
+    def _model(self, role: str, requests: Sequence[Request]) -> Backend:
+        """The model that answered in a role. Raises UserError where it cannot be asked what the run lacks."""
+        manifest, shown = self._run.manifest, printable(self._run.path)
+        agent = manifest.agent(0 if role == "ego" else 1)
+        for request in requests:
+            # A run has an answer wherever an episode begins, if it has the episode.
+            other = _step(request.id) == "0" or _episode(request.id) not in self._episodes
+            if other or "+" in request.id or (role == "helper" and len(manifest.helpers) > 1):
+                raise UserError(
+                    f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
+                    + (", whose conditions delivered the same messages" if "+" in request.id else "")
+                )
+            self._check(request, agent)
+        if role not in self._models:
+            card = convert(agent["model"], Card, f"{shown}: its model")
+            model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
+            stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
+            if manifest.helpers and role == "helper":
+                stored = manifest.identity["helpers"][0]
+            if msgspec.json.decode(canonical_json(model.identity())) != stored:
+                raise UserError(
+                    f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} is not the "
+                    "model that it was; run it again"
+                )
+            self._models[role] = cached(model, card, default_file())
+        return self._models[role]
+
+    def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
+        shown = printable(self._run.path)
         # Free and constrained answers have the same prompt.
-        if manifest.answer != request.answer:
-            raise UserError(f"{shown} was run with --answer {manifest.answer}; replay it with the same")
-        if answer.prompt_sha256 != digest(request.messages):
-            raise UserError(
-                f"{shown} was asked {request.id} with another prompt or dataset; "
-                "replay it with that run's --prompt and --dataset"
-            )
-        if request.thinking != manifest.thinking:
+        if agent["answer"] != request.answer:
+            raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
+        if request.thinking != agent["thinking"]:
             how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
             raise UserError(f"{shown} was run with thinking {how}")
+
+    def _completion(self, request: Request, answer: Answer) -> Completion:
+        agent = self._run.agent(answer)
+        self._check(request, agent)
+        if answer.prompt_sha256 != digest(request.messages):
+            raise UserError(
+                f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "
+                "replay it with that run's --prompt and --dataset"
+            )
         return Completion(
             request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
@@ -72,3 +119,11 @@ class Replay:
             "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
+
+
+def _episode(scene: str) -> str:
+    return scene.partition("-")[0]
+
+
+def _step(scene: str) -> str:
+    return scene.split("-")[1]

@@ -80,6 +80,7 @@ def closed_loop(
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
+    from harness.evaluate.agent import Agent
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
@@ -91,16 +92,14 @@ def closed_loop(
     options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(
-        cards.resolve(model),
-        versions.load(prompt),
+        Agent(cards.resolve(model), versions.load(prompt), answer),
         LiveSource(first_seed, episodes),
         tuple(points.values()),
         options.parse_seeds(seeds),
-        answer=answer,
         batch_size=batch_size,
         latency=latency,
     )
-    where = out or Path("reports") / f"closed-loop-{file_name(spec.card.name)}-{prompt}"
+    where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
     silent = as_json or quiet
     with bar("layouts", episodes, silent) as progress:
         summary = run_closed_loop(spec, where, workers, progress, default_file())

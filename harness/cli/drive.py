@@ -9,7 +9,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
-from harness.cli.run import Column, as_mapping, default_out, show
+from harness.cli.run import Column, Swarm, as_mapping, default_out, show
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.resources import folder
@@ -45,6 +45,10 @@ def command(
     seeds: options.Seeds = "0:5",
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
+    helper_model: options.HelperModel = None,
+    helper_prompt: options.HelperPrompt = None,
+    helper_answer: options.HelperAnswer = None,
+    helper_thinking: options.HelperThinking = None,
     batch_size: options.BatchSize = 8,
     workers: options.ModelWorkers = 2,
     device: options.Device = None,
@@ -58,14 +62,12 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Drive closed-loop episodes in highway-env. The same command continues one that was stopped."""
-    from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.run import evaluate
     from harness.evaluate.spec import Spec
-    from harness.prompts import versions
     from harness.world.environments.examination import examine
     from harness.world.scenarios import DEFAULT
 
@@ -88,13 +90,20 @@ def command(
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)
     spec = Spec(
-        card=cards.resolve(model, engine),
-        prompt=versions.load(prompt or source.scenario.prompt),
+        **Swarm(
+            model,
+            engine,
+            prompt,
+            answer,
+            thinking,
+            helper_model,
+            helper_prompt,
+            helper_answer,
+            helper_thinking,
+        ).agents(source.scenario),
         source=source,
         points=tuple(named_point(name) for name in dict.fromkeys(names)),
         seeds=options.parse_seeds(seeds),
-        thinking=thinking,
-        answer=answer,
         batch_size=batch_size,
         device=device,
         dtype=dtype,
@@ -103,7 +112,7 @@ def command(
     )
     where = out or default_out(spec)
     silent = as_json or quiet
-    with bar(f"driving {printable(spec.card.name, 30)}", driven, silent) as progress:
+    with bar(f"driving {printable(spec.ego.card.name, 30)}", driven, silent) as progress:
         cache = None if no_cache else default_file()
         done = evaluate(spec, where, progress, cache, workers=workers)
     # They draw with matplotlib, which no episode waits for.

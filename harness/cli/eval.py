@@ -9,7 +9,7 @@ import typer
 from harness.cli import options, suite
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
-from harness.cli.run import Column, as_mapping, default_out, show
+from harness.cli.run import Column, Swarm, as_mapping, default_out, show
 from harness.core import resources, work
 from harness.core.errors import printable
 from harness.core.seeds import stated
@@ -46,6 +46,10 @@ def command(
     sample_seed: int = typer.Option(0, help="Seed of the draw."),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
+    helper_model: options.HelperModel = None,
+    helper_prompt: options.HelperPrompt = None,
+    helper_answer: options.HelperAnswer = None,
+    helper_thinking: options.HelperThinking = None,
     batch_size: options.BatchSize = 8,
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -59,14 +63,12 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes. The same command continues one that was stopped."""
-    from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS, named_point
     from harness.dataset import load, suites
     from harness.dataset.select import Selection
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
-    from harness.prompts import versions
 
     named = suites.named(dataset)
     selection = Selection(limit, only, danger, sample, sample_seed)
@@ -74,16 +76,16 @@ def command(
         selection.of(load.load(load.find(name), None if selection.given else limit))
         for name in (named.datasets if named else (dataset,))
     ]
-    card, channel_seeds = cards.resolve(model, engine), options.parse_seeds(seeds)
+    swarm = Swarm(
+        model, engine, prompt, answer, thinking, helper_model, helper_prompt, helper_answer, helper_thinking
+    )
+    channel_seeds = options.parse_seeds(seeds)
     specs = [
         Spec(
-            card=card,
-            prompt=versions.load(prompt or each.scenario.prompt),
+            **swarm.agents(each.scenario),
             source=FrozenSource(each, selection),
             points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
             seeds=channel_seeds,
-            thinking=thinking,
-            answer=answer,
             batch_size=batch_size,
             device=device,
             dtype=dtype,
@@ -129,7 +131,7 @@ def _evaluated(
     """Evaluate, and write the run and its page."""
     from harness.evaluate.run import evaluate
 
-    with bar(f"asking {printable(spec.card.name, 30)}", quiet=silent) as progress:
+    with bar(f"asking {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
         done = evaluate(spec, folder, progress, cache, progress.more, opens=opens)
     from harness.cli.report import write
 
@@ -144,7 +146,7 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
     from harness.backends.tokens import counter, spread_of
     from harness.evaluate.asking import requests
 
-    count = counter(tokenizer, spec.card)
+    count = counter(tokenizer, spec.ego.card)
     sizes: dict[str, list[int]] = {}
     asked, scenes = 0, dataset.scenes(dataset.courses())
     for request in requests(spec, scenes):

@@ -88,7 +88,7 @@ def check(
     if as_json:
         typer.echo(
             json.dumps(
-                {**head, "model_free": False, "thinking_asked": spec.thinking, **asdict(seen)}, indent=2
+                {**head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen)}, indent=2
             )
         )
         raise typer.Exit(_failed(seen))
@@ -106,23 +106,25 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
     from harness.backends.checkup import check as look
     from harness.backends.registry import open_backend
     from harness.dataset import load
+    from harness.evaluate.agent import Agent
     from harness.evaluate.asking import requests
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions as prompts
 
     data = load.load(load.find(DATASET), 1)
-    spec = Spec(card, prompts.load(PROMPT), FrozenSource(data), (), (0,), thinking, "json", 1, device, dtype)
-    ways = ("json",) if spec.thinking else get_args(AnswerMode)
+    ego = Agent(card, prompts.load(PROMPT), thinking=thinking)
+    spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
+    ways = ("json",) if ego.thinking else get_args(AnswerMode)
     scenes = data.scenes(data.forest.ids[:1])
     # The first of a scene's questions is the ego's.
-    asked = [next(requests(replace(spec, answer=way), scenes)) for way in ways]
+    asked = [next(requests(replace(spec, ego=replace(ego, answer=way)), scenes)) for way in ways]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
     return spec, look(cast("Rendering", backend), asked)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:
-    card, what = spec.card, seen.identity
+    card, what = spec.ego.card, seen.identity
     where = " on ".join(printable(what[key]) for key in ("dtype", "device") if what.get(key))
     typer.echo(f"model        {printable(card.name)}  {card.engine}  {where}")
     typer.echo(f"licence      {printable(card.licence or 'not in its card')}")
@@ -131,7 +133,7 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
     else:
         typer.echo(f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS")
     typer.echo(f"thinking     {seen.thinking or 'as the server is set'}; "
-               f"{'asked' if spec.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
+               f"{'asked' if spec.ego.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
     typer.echo(f"prompt       {PROMPT}, the ego of {DATASET}'s first scene")
     for line in seen.prompt.split("\n"):
         typer.echo(f"  | {printable(line, 1000)}")

@@ -38,6 +38,16 @@ Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,
 FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
 Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
 Answer = Annotated[AnswerMode, Option(help="json: free text; constrained: to the schema; readout: letters.")]
+HelperModel = Annotated[
+    str | None,
+    Option(help="Model of the helpers; several, such as a,b,c, take them in turn. Default: the ego's."),
+]
+HelperPrompt = Annotated[str | None, Option(help="Prompt version of the helpers. Default: the ego's.")]
+HelperAnswer = Annotated[AnswerMode | None, Option(help="How helpers answer. Default: as the ego.")]
+HelperThinking = Annotated[
+    bool | None,
+    Option("--helper-thinking/--no-helper-thinking", help="Ask helpers to think first. Default: as the ego."),
+]
 BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
 Workers = Annotated[int, Option(help="Processes.")]
 ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded.")]

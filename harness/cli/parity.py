@@ -24,6 +24,7 @@ def command(
     from harness.backends.registry import missing
     from harness.coordination.operating_point import POINTS
     from harness.dataset import load
+    from harness.evaluate.agent import Agent
     from harness.evaluate.asking import requests
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
@@ -39,7 +40,7 @@ def command(
                 f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
             )
     data = load.load(load.find(dataset))
-    spec = Spec(reference, versions.load(prompt), FrozenSource(data), tuple(POINTS.values()), (0,))
+    spec = Spec(Agent(reference, versions.load(prompt)), FrozenSource(data), tuple(POINTS.values()), (0,))
     asked = list(requests(spec, data.scenes(data.courses())))
     asked = asked[:: max(1, len(asked) // prompts)][:prompts]
     letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]

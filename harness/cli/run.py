@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from harness.cli.estimates import console, interval, table
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode
+    from harness.evaluate.agent import Agent
     from harness.evaluate.run import Evaluated
     from harness.evaluate.spec import Spec
     from harness.runs.records import Manifest, Score
+    from harness.world.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,39 @@ class Column:
         return f"{score.value * self.scale:.1f}{self.unit}"
 
 
+@dataclass(frozen=True)
+class Swarm:
+    """Who is asked, as it was typed: of the helpers, what is None is the ego's."""
+
+    model: str
+    engine: str | None
+    prompt: str | None
+    answer: "AnswerMode"
+    thinking: bool
+    helper_model: str | None
+    helper_prompt: str | None
+    helper_answer: "AnswerMode | None"
+    helper_thinking: bool | None
+
+    def agents(self, scenario: "Scenario") -> "dict[str, Any]":
+        """The fields of a `Spec` that say who answers in a scenario: `ego` and `helpers`."""
+        from harness.backends import cards
+        from harness.evaluate.agent import Agent
+        from harness.prompts import versions
+
+        version = self.prompt or scenario.prompt
+        card = cards.resolve(self.model, self.engine)
+        ego = Agent(card, versions.load(version), self.answer, self.thinking)
+        models = self.helper_model.split(",") if self.helper_model else []
+        prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
+        thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
+        others = [cards.resolve(name.strip()) for name in models] or [card]
+        try:
+            return {"ego": ego, "helpers": tuple(Agent(other, prompt, mode, thinks) for other in others)}
+        except UserError as error:
+            raise UserError(f"helpers: {error}") from None
+
+
 def file_name(model: str) -> str:
     """A model's name as part of a folder's."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
@@ -50,12 +86,18 @@ def default_out(spec: "Spec") -> Path:
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
     """The first folder of a name under reports/ that is not there, or in which this goes on."""
-    first = specs[0]
-    prompts = "-".join(dict.fromkeys(spec.prompt.version for spec in specs))
-    mode = "" if first.answer == "json" else f"-{first.answer}"
-    name = f"{file_name(first.card.name)}-{prompts}{mode}-{scenes}"
+    ego, *helpers = specs[0].agents
+    prompts = "-".join(dict.fromkeys(spec.ego.prompt.version for spec in specs))
+    name = f"{file_name(ego.card.name)}-{prompts}{_mode(ego)}"
+    for helper in helpers:
+        name += f"-with-{file_name(helper.card.name)}-{helper.prompt.version}{_mode(helper)}"
+    name += f"-{scenes}"
     folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
     return next(folder for folder in folders if not folder.exists() or goes_on(folder))
+
+
+def _mode(agent: "Agent") -> str:
+    return "" if agent.answer == "json" else f"-{agent.answer}"
 
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:
@@ -82,6 +124,8 @@ def show(
     names = [point["name"] for point in m.conditions]
     text = console()
     text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
+    if m.helpers:
+        text.print(f"helpers: {printable(m.variant.helpers)}")
     for caveat in caveats(m, done.scores):
         text.print(caveat)
     table(

@@ -27,7 +27,6 @@ MOST_INTERVALS = 3  # conditions whose intervals fit into a line
 
 def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     """Raise UserError unless a model can be evaluated on a suite."""
-    from harness.backends.registry import capabilities
     from harness.evaluate.latency import MEASURED
 
     families = [spec.scenario.name for spec in specs]
@@ -42,10 +41,10 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
             f"--latency {MEASURED}: its own first runs would keep the machine busy; measure on one dataset, "
             "and give the seconds that its run.json has"
         )
-    if not capabilities(first.card.engine).closed_loop:
-        raise UserError(
-            f"--model {printable(first.card.name)}: a replay has the answers of one run; replay its dataset"
-        )
+    for agent in first.agents:
+        if not agent.can.closed_loop:
+            name = printable(agent.card.name)
+            raise UserError(f"--model {name}: a replay has the answers of one run; replay its dataset")
 
 
 def _left(specs: "Sequence[Spec]", out: Path) -> None:

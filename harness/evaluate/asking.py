@@ -20,45 +20,37 @@ from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
-from harness.prompts import readout
 from harness.runs.records import Answer, Latency
 from harness.world.perception.graph import truth_graph
 
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
-def most_tokens(spec: Spec, role: Role) -> int:
-    """Most tokens that an answer may have, its thought included if the model thinks first."""
-    answer = spec.card.max_new_tokens or spec.prompt.max_answer_tokens[role]
-    return answer + (spec.card.thinking_tokens if spec.thinking else 0)
-
-
 def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     """The requests, scene by scene, the ego first."""
     for scene in scenes:
-        truth = truth_graph(spec.scenario, scene.state) if spec.card.privileged else None
-        for viewer in spec.viewers(scene):
-            graph = scene.record["graphs"][viewer]
-            role: Role = graph["role"]
-            yield Request(
-                id=f"{scene.id}/{viewer}",
-                role=role,
-                messages=_messages(spec, graph),
-                actions=spec.actions,
-                max_tokens=most_tokens(spec, role),
-                form=spec.prompt.helper_answer,
-                answer=spec.answer,
-                thinking=spec.thinking,
-                reasons_first=role in spec.prompt.reasons_first,
-                view=graph,
-                truth=truth,
-                scenario=spec.scenario,
-            )
+        truth = None
+        if any(agent.card.privileged for agent in spec.agents):
+            truth = truth_graph(spec.scenario, scene.state)
+        for place, viewer in enumerate(spec.viewers(scene)):
+            graph, who = scene.record["graphs"][viewer], spec.agent(place)
+            agent = spec.agents[who]
+            yield _request(
+                spec, who, f"{scene.id}/{viewer}", graph["role"],
+                agent.messages(graph, spec.actions, spec.scenario.prompt_words),
+                view=graph, truth=truth if agent.card.privileged else None, scenario=spec.scenario,
+            )  # fmt: skip
 
 
-def _messages(spec: Spec, graph: Mapping[str, Any]) -> tuple[Mapping[str, str], ...]:
-    rendered = spec.prompt.render(graph, spec.actions, words=spec.scenario.prompt_words)
-    return readout.asked(rendered, spec.actions) if spec.answer == "readout" else rendered
+def _request(
+    spec: Spec, who: int, name: str, role: Role, messages: tuple[Mapping[str, str], ...], **more: Any
+) -> Request:
+    agent = spec.agents[who]
+    return Request(
+        id=name, role=role, messages=messages, actions=spec.actions, max_tokens=agent.most_tokens(role),
+        form=agent.prompt.helper_answer, answer=agent.answer, thinking=agent.thinking,
+        reasons_first=role in agent.prompt.reasons_first, agent=who, **more,
+    )  # fmt: skip
 
 
 def fusion_request(
@@ -66,17 +58,8 @@ def fusion_request(
 ) -> Request:
     """The fusion call with these helpers' messages; `answers` by viewer."""
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
-    return Request(
-        id=_fusion_id(scene, senders),
-        role="ego",
-        messages=spec.prompt.render(graph, spec.actions, heard, spec.scenario.prompt_words),
-        actions=spec.actions,
-        max_tokens=most_tokens(spec, "ego"),
-        form=spec.prompt.helper_answer,
-        answer=spec.answer,
-        thinking=spec.thinking,
-        reasons_first="ego" in spec.prompt.reasons_first,
-    )
+    messages = spec.ego.prompt.render(graph, spec.actions, heard, spec.scenario.prompt_words)
+    return _request(spec, 0, _fusion_id(scene, senders), "ego", messages)
 
 
 def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:

@@ -5,16 +5,17 @@ beside them.
 """
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle, islice
 from typing import cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from harness.backends.base import Backend, Timed
-from harness.backends.cards import Card
-from harness.backends.registry import capabilities
 from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
+from harness.evaluate.agent import Agent
 from harness.runs.records import Answer, Latency, Times
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
@@ -23,48 +24,74 @@ NAMES = ("card", MEASURED, "paper")
 EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 
-def known(choice: str | None, card: Card, backend: Backend) -> Latency | None:
+def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]) -> Latency | None:
     """The latency that `--latency` chooses; None where it is to be measured.
 
-    Without a choice it is the replayed run's, else the card's, else the paper's.
+    Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
+
+    Args:
+        choice: what was chosen, if anything.
+        agents: the ego's, then the helpers' where they are others.
+        backends: of each.
     """
-    if choice is None and capabilities(card.engine).own_latency:
-        return cast("Timed", backend).latency()
-    choice = choice or card.latency.source
+    if choice not in (None, *NAMES):
+        return declared(choice)
     if choice == MEASURED:
         return None
-    if choice == "paper":
+    each = [_of_agent(choice, agent, backend) for agent, backend in zip(agents, backends, strict=True)]
+    return mixed(each[0], each[1:])
+
+
+def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
+    if choice is None and agent.can.own_latency:
+        return cast("Timed", backend).latency()
+    if (choice or agent.card.latency.source) == "paper":
         return PAPER
-    if choice != "card":
-        return declared(choice)
-    seconds = cast("float", card.latency.inference_s)
-    return Latency("card", card.latency.basis, seconds, seconds, seconds)
+    seconds = cast("float", agent.card.latency.inference_s)
+    return Latency("card", agent.card.latency.basis, seconds, seconds, seconds)
+
+
+def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
+    """The ego's times, and those of helpers that are others."""
+    if not helpers:
+        return ego
+    basis = " + ".join(dict.fromkeys(each.basis for each in helpers))
+    return replace(
+        ego, basis=ego.basis if basis == ego.basis else f"ego: {ego.basis}; helpers: {basis}",
+        helper_s=helpers[0].helper_s,
+        helpers_s=tuple(each.helper_s for each in helpers) if len(helpers) > 1 else helpers[0].helpers_s,
+    )  # fmt: skip
 
 
 def declared(text: str) -> Latency:
     """The seconds in a text such as `ego=0.171,helper=0.164,fusion=0.2`; one left out is the ego's.
+
+    Several helper models have a time each: `helper=0.164:0.2`.
 
     Raises:
         UserError: the text is nothing that `--latency` takes.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     try:
-        seconds = {role: float(value) for role, _, value in pairs}
+        seconds = {role: [float(part) for part in value.split(":")] for role, _, value in pairs}
     except ValueError:
         seconds = {}
-    ego, helper, fusion = (seconds.get(r, seconds.get("ego", np.nan)) for r in ("ego", "helper", "fusion"))
+    ego, helper, fusion = (seconds.get(r, seconds.get("ego", [np.nan])) for r in ("ego", "helper", "fusion"))
     roles_once = len(seconds) == len(pairs) and seconds.keys() <= {"ego", "helper", "fusion"}
-    if not roles_once or not all(0 <= s <= LONGEST_S for s in (ego, helper, fusion)):
+    one_each = len(ego) == len(fusion) == 1
+    if not (roles_once and one_each and all(0 <= s <= LONGEST_S for s in (*ego, *helper, *fusion))):
         raise UserError(
             f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or seconds of one answer, "
             f"0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed)"
         )
-    return Latency("declared", "declared: --latency " + text, ego, helper, fusion)
+    several = tuple(helper) if len(helper) > 1 else ()
+    return Latency("declared", "declared: --latency " + text, ego[0], helper[0], fusion[0], helpers_s=several)
 
 
 def as_declared(latency: Latency) -> str:
     """A latency as a text that `declared` reads."""
-    return f"ego={latency.ego_s},helper={latency.helper_s},fusion={latency.fusion_s}"
+    helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))
+    return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
 
 def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) -> Floats:
@@ -73,7 +100,8 @@ def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) ->
     What an answer is declared to be slower than its card comes on top.
     """
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
-    by_place = [latency.ego_s, *[latency.helper_s] * (slow.shape[1] - 1)]
+    of_helpers = latency.helpers_s or (latency.helper_s,)
+    by_place = [latency.ego_s, *islice(cycle(of_helpers), slow.shape[1] - 1)]
     return np.asarray(slow + np.array(by_place))
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from harness.backends.base import Backend
-from harness.backends.cache import cached
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
+from harness.backends.swarm import open_each, together
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
@@ -121,15 +121,17 @@ def _frozen(
     cache: Path | None, more: Callable[[int], None], opens: Opens,
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
-    backend = opens(spec.card, device=spec.device, dtype=spec.dtype, batch_size=spec.batch_size)
-    latency = _latency(spec, begun, backend, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
-    begun = _begin(spec, out, begun, backend.identity(), latency)
+    options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
+    models = open_each(spec.cards, partial(opens, **options))
+    identity = together(spec.cards, models).identity()
+    latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
+    begun = _begin(spec, out, begun, identity, latency)
     with work.working(out, begun, "run.json") as place:
-        asked = cached(backend, spec.card, cache)
+        asked = together(spec.cards, models, cache)
         asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", progress=progress, more=more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
-            return _written(spec, out, begun, dataset.episodes, walked, backend.identity())
+            return _written(spec, out, begun, dataset.episodes, walked, identity)
 
 
 def _closed_loop(
@@ -137,7 +139,8 @@ def _closed_loop(
     cache: Path | None, workers: int,
 ) -> Evaluated:  # fmt: skip
     # Compiled templates do not travel between processes.
-    spec = replace(spec, prompt=replace(spec.prompt))
+    ego, *helpers = (replace(agent, prompt=replace(agent.prompt)) for agent in spec.agents)
+    spec = replace(spec, ego=ego, helpers=tuple(helpers))
     # Engines are opened where they answer: a forked process has none of their threads.
     [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
     begun = _begin(spec, out, begun, identity, latency)
@@ -165,9 +168,7 @@ def _driven(
 
     part = place / f"episodes-{chunk[0]:06d}"
     if not part.is_dir():
-        asker = Asker(
-            spec, partial(_opened, spec.card, spec.device, spec.dtype, spec.batch_size, cache), latency
-        )
+        asker = Asker(spec, lambda: together(spec.cards, _opened_all(spec), cache), latency)
         world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
         walked = _walked(spec, world, asker)
         folder.write_part(part, walked.decisions, walked.episodes, list(walked.answers.values()))
@@ -175,31 +176,29 @@ def _driven(
 
 
 def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
-    """Identity of the model and latency of its decisions in the closed loop."""
-    backend = _opened(spec.card, spec.device, spec.dtype, spec.batch_size, None)
-    source = cast("LiveSource", spec.source)
-    return backend.identity(), _latency(
-        spec, begun, backend, lambda: source.trial(timing.SCENES, spec.ego_alone)
-    )
+    """Identity of the models and latency of their decisions in the closed loop."""
+    models, source = _opened_all(spec), cast("LiveSource", spec.source)
+    latency = _latency(spec, begun, models, lambda: source.trial(timing.SCENES, spec.ego_alone))
+    return together(spec.cards, models).identity(), latency
 
 
 def _latency(
-    spec: Spec, begun: Begun | None, backend: Backend, trial: Callable[[], Sequence[Scene]]
+    spec: Spec, begun: Begun | None, models: Sequence[Backend], trial: Callable[[], Sequence[Scene]]
 ) -> Latency:
     """What the run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
     if begun:
         return begun.latency
-    return latencies.known(spec.latency, spec.card, backend) or timing.measured(spec, backend, trial())
+    declared = latencies.known(spec.latency, spec.agents, models)
+    return declared or timing.measured(spec, together(spec.cards, models), trial())
 
 
-@lru_cache(maxsize=2)
-def _opened(
-    card: Card, device: str | None, dtype: str | None, batch_size: int, cache: Path | None
-) -> Backend:
-    """This process's backend, with the cache in front of a language model's."""
-    if cache is not None:
-        backend = _opened(card, device, dtype, batch_size, None)
-        return cached(backend, card, cache)
+def _opened_all(spec: Spec) -> list[Backend]:
+    """This process's backends of a run's agents."""
+    return [_opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
+
+
+@lru_cache(maxsize=8)
+def _opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
@@ -266,8 +265,9 @@ def _begin(spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any],
             identity=digest(identity), tags=spec.tags, latency=latency,
         )  # fmt: skip
     if begun.identity != digest(identity):
+        names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
         raise UserError(
-            f"--out {printable(out)} was begun with another model behind {printable(spec.card.name)} (its "
-            "files, package versions or device differ); delete it, or choose another folder"
+            f"--out {printable(out)} was begun with another model behind {names} (its files, package "
+            "versions or device differ); delete it, or choose another folder"
         )
     return begun

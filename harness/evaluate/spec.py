@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol
 
 import msgspec
 
 from harness import __version__
-from harness.backends.base import AnswerMode
 from harness.backends.cards import Card, argument
-from harness.backends.registry import capabilities, registrations
+from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
+from harness.evaluate.agent import Agent
 from harness.evaluate.latency import MEASURED, NAMES, declared
-from harness.prompts.versions import Prompt, fits
+from harness.prompts.versions import fits
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
@@ -68,28 +68,25 @@ class Spec:
     """One evaluation.
 
     Attributes:
-        card: the model.
-        prompt: the prompt version.
+        ego: who answers for the ego.
         source: which world is walked.
         points: conditions, each an operating point.
         seeds: of the channel's draws.
-        thinking: whether the model thinks first.
-        answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
-        batch_size: most requests that go through the engine together.
-        device: engine's device, or None for its choice.
-        dtype: number format, or None for the card's.
+        helpers: who answers for the helpers, who take them in turn in the order they were spawned; empty if
+            the ego's agent does.
+        batch_size: most requests that go through an engine together.
+        device: engines' device, or None for their choice.
+        dtype: number format, or None for the cards'.
         latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
-            reads them; None for the card's, else the paper's.
+            reads them; None for each card's, else the paper's.
         tags: words to find the run by, which change nothing in it.
     """
 
-    card: Card
-    prompt: Prompt
+    ego: Agent
     source: Source
     points: tuple[OperatingPoint, ...]
     seeds: tuple[int, ...]
-    thinking: bool = False
-    answer: AnswerMode = "json"
+    helpers: tuple[Agent, ...] = ()
     batch_size: int = 8
     device: str | None = None
     dtype: str | None = None
@@ -97,6 +94,8 @@ class Spec:
     tags: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if all(agent == self.ego for agent in self.helpers):
+            object.__setattr__(self, "helpers", ())
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise UserError(
                 f"--seeds {list(self.seeds)}: give one or more different whole numbers, such as 0:5"
@@ -109,70 +108,94 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
-        if not fits(self.prompt.version, self.scenario.prompt):
+        for agent in self.agents:
+            self._check(agent)
+        lone = [agent for agent in self.agents if not agent.can.asks_helpers]
+        if self.helpers and lone:
             raise UserError(
-                f"--prompt {self.prompt.version} speaks of a crossing, which {self.scenario.name} is not; "
-                f"give {self.scenario.prompt}, or one of your own"
+                f"--helper-model: {printable(lone[0].card.name)} is a driver, which decides for an ego "
+                "alone; give models that are none"
             )
-        can = capabilities(self.card.engine)
-        if self.source.kind == "closed-loop" and not can.closed_loop:
-            raise UserError(
-                f"--model {printable(self.card.name)}: a replay has answers to frozen scenes alone; "
-                "give the model that it replays"
-            )
-        thinks = can.thinks == "always" or (can.thinks == "card" and self.card.thinking != "none")
-        if self.thinking and not thinks:
-            raise UserError(f"--thinking: {printable(self.card.name)} cannot think; leave it out")
-        if self.card.thinking == "always":  # its answers hold a thought, asked for or not
-            object.__setattr__(self, "thinking", True)
-        if self.answer not in get_args(AnswerMode):
-            raise unknown("answer mode", self.answer, get_args(AnswerMode))
-        if self.answer not in can.answer_modes:
-            reason = "cannot answer so" if can.language_model else "is no language model"
-            modes = " or ".join(can.answer_modes)
-            raise UserError(f"--answer {self.answer}: {printable(self.card.name)} {reason}; use {modes}")
-        if self.answer != "json" and self.thinking:
-            raise UserError(
-                f"--answer {self.answer}: {printable(self.card.name)} thinks first, "
-                "which only json leaves room for"
-            )
-        self._check_latency()
-        for point in self.points:
-            if point.messages != "own" and self.source.kind != "frozen":
+        if self.latency not in (None, *NAMES):
+            several = len(declared(self.latency).helpers_s)
+            if several and several != len(self.helpers):
                 raise UserError(
-                    f"condition {printable(point.name)}: messages={point.messages} is for frozen scenes; "
-                    "use harness eval"
+                    f"--latency {printable(self.latency)}: {several} times for {len(self.helpers)} helper "
+                    "models; give one, or one each"
                 )
-            if point.asks_again and (not can.language_model or self.answer == "readout"):
-                raise UserError(
-                    f"condition {printable(point.name)}: "
-                    + ("a readout gives no messages to merge; use --answer json or constrained"
-                       if self.answer == "readout"
-                       else f"{printable(self.card.name)} is no language model and cannot merge messages")
-                )  # fmt: skip
+        for point in self.points:
+            self._check_point(point)
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
-            if value is not None and not can.has_weights:
+            if value is not None and not any(agent.can.has_weights for agent in self.agents):
                 able = [name for name, engine in registrations().items() if engine.capabilities.has_weights]
                 raise UserError(
-                    f"{flag} {printable(value)}: {printable(self.card.name)} has no weights here "
+                    f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "
                     f"(engines {' and '.join(able)} have); leave it out"
                 )
 
-    def _check_latency(self) -> None:
-        shown, can = f"--latency {printable(self.latency)}", capabilities(self.card.engine)
-        if self.latency is None:
-            return
-        if self.latency not in NAMES:
-            declared(self.latency)
-        elif can.own_latency and self.latency != "paper":
-            raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
-        elif self.latency == MEASURED and not can.language_model:
-            raise UserError(f"{shown}: {printable(self.card.name)} is no language model; use card or paper")
-        elif self.latency == "card" and self.card.latency.inference_s is None:
+    def _check(self, agent: Agent) -> None:
+        name, version = printable(agent.card.name), agent.prompt.version
+        if not fits(version, self.scenario.prompt):
             raise UserError(
-                f"{shown}: the card of {printable(self.card.name)} declares no inference time; "
+                f"--prompt {version} speaks of a crossing, which {self.scenario.name} is not; "
+                f"give {self.scenario.prompt}, or one of your own"
+            )
+        if self.source.kind == "closed-loop" and not agent.can.closed_loop:
+            raise UserError(
+                f"--model {name}: a replay has answers to frozen scenes alone; give the model that it replays"
+            )
+        shown = f"--latency {printable(self.latency)}"
+        if self.latency not in NAMES:
+            return
+        if agent.can.own_latency and self.latency != "paper":
+            raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
+        elif self.latency == MEASURED and not agent.can.language_model:
+            raise UserError(f"{shown}: {name} is no language model; use card or paper")
+        elif self.latency == "card" and agent.card.latency.inference_s is None:
+            raise UserError(
+                f"{shown}: the card of {name} declares no inference time; "
                 "use paper or measured, or add inference_s to the card"
             )
+
+    def _check_point(self, point: OperatingPoint) -> None:
+        shown, ego = f"condition {printable(point.name)}", self.ego
+        if point.messages != "own" and self.source.kind != "frozen":
+            raise UserError(f"{shown}: messages={point.messages} is for frozen scenes; use harness eval")
+        if not point.asks_again:
+            return
+        reason = self.unmergeable
+        if not ego.can.language_model:
+            reason = f"{printable(ego.card.name)} is no language model and cannot merge messages"
+        if reason:
+            raise UserError(f"{shown}: {reason}")
+
+    @property
+    def unmergeable(self) -> str | None:
+        """Why the helpers' messages cannot be in the ego's prompt; None if they can."""
+        if "readout" in [agent.answer for agent in self.agents]:
+            return "a readout gives no messages to merge; use --answer json or constrained"
+        mine, wants = self.ego.prompt.version, self.ego.prompt.helper_answer
+        for prompt in (helper.prompt for helper in self.helpers):
+            if prompt.helper_answer != wants:
+                return (
+                    f"prompt {mine} merges messages with a {wants}, those of {prompt.version} have a "
+                    f"{prompt.helper_answer}; use another --helper-prompt"
+                )
+        return None
+
+    @property
+    def agents(self) -> tuple[Agent, ...]:
+        """The ego's, then the helpers' where they are others."""
+        return self.ego, *self.helpers
+
+    @property
+    def cards(self) -> tuple[Card, ...]:
+        """Of the agents."""
+        return tuple(agent.card for agent in self.agents)
+
+    def agent(self, place: int) -> int:
+        """Which of the agents answers for a scene's viewer at this place; the ego is at 0."""
+        return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -187,7 +210,7 @@ class Spec:
     @property
     def ego_alone(self) -> bool:
         """Whether the model answers for the ego only, as a driver does."""
-        return not capabilities(self.card.engine).asks_helpers
+        return not self.ego.can.asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
         """The vehicles of a scene that the model answers for, the ego first."""
@@ -195,16 +218,13 @@ class Spec:
 
     def settings(self) -> dict[str, Any]:
         """What a run that goes on must have in common with what it began as, as plain values."""
-        world = msgspec.to_builtins(self.source.record())
         return {
-            "model": asdict(self.card),
-            "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
-            "world": world,
+            **self.ego.settings(),
+            "helpers": [agent.settings() for agent in self.helpers],
+            "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
             "conditions": [asdict(point) for point in self.points],
             "seeds": list(self.seeds),
-            "thinking": self.thinking,
-            "answer": self.answer,
             "batch_size": self.batch_size,
             "dtype": self.dtype,
             "latency_source": self.latency,
@@ -215,15 +235,28 @@ class Spec:
         first = self.seeds[0]
         seeds = ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}"
         options = [
-            ("--model", argument(self.card)), ("--prompt", self.prompt.version),
-            *self.source.options(), ("--seeds", seeds),
-            *(("--condition", point.name) for point in self.points), ("--answer", self.answer),
+            ("--model", argument(self.ego.card)), ("--prompt", self.ego.prompt.version),
+            *self._helper_options(), *self.source.options(), ("--seeds", seeds),
+            *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
-        command = ["harness", self.source.command, *parts, *(["--thinking"] if self.thinking else [])]
-        return shlex.join(command)
+        flags = ["--thinking"] if self.ego.thinking else []
+        asked = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
+        if self.helpers and asked != self.ego.thinking:
+            flags.append("--helper-thinking" if asked else "--no-helper-thinking")
+        return shlex.join(["harness", self.source.command, *parts, *flags])
+
+    def _helper_options(self) -> list[tuple[str, object]]:
+        if not self.helpers:
+            return []
+        first = self.helpers[0]
+        return [
+            ("--helper-model", ",".join(argument(agent.card) for agent in self.helpers)),
+            ("--helper-prompt", first.prompt.version),
+            ("--helper-answer", first.answer),
+        ]
 
 
 def versions(

@@ -43,9 +43,9 @@ def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
 
 
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
-    """The median time of a role's answers in these scenes, each asked alone.
+    """The median time of an agent's answers in a role in these scenes, each asked alone.
 
-    A role without an answer that can be timed is given the ego's time.
+    Where no answer can be timed it is the ego's time.
 
     Args:
         spec: the evaluation.
@@ -59,16 +59,23 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     backend.complete(first[:1])  # the first answer of a process pays for warming up
     answers = {r.id: answer_of(r, backend.complete([r])[0]) for r in first}
     fusion = []
-    for scene in scenes if spec.answer != "readout" else ():
+    for scene in scenes if spec.unmergeable is None else ():
         said = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
         if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
             fusion.append(fusion_request(spec, scene, said, heard))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
+        name = printable(spec.ego.card.name)
         raise UserError(
-            f"--latency {MEASURED}: no answer of {printable(spec.card.name)} could be timed in {len(scenes)} "
-            f"scenes; see what `harness model check` says, or declare times such as {EXAMPLE}"
+            f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; see what "
+            f"`harness model check` says, or declare times such as {EXAMPLE}"
         )
     ego, helper, merge = (sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge"))
+    several = len(spec.helpers) > 1
+    of_helpers = tuple(
+        times(answers[r.id] for r in first if r.agent == who).get("helper", sample["ego"]).median_s
+        for who in range(1, len(spec.agents)) if several
+    )  # fmt: skip
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
-    return Latency("measured", basis, ego, helper, merge, sample)
+    helper = of_helpers[0] if of_helpers else helper
+    return Latency("measured", basis, ego, helper, merge, sample, of_helpers)

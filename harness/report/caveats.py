@@ -71,11 +71,12 @@ def of_run(run: Run) -> Iterator[str]:
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
     """One sentence about the runs whose model reads no prompt; empty where there are none."""
     rules = [
-        manifest.variant for manifest in manifests
-        if (engine := find(str(manifest.model.get("engine")))) and not engine.capabilities.language_model
+        (str(agent["model"]["name"]), str(agent["prompt"]["version"]))
+        for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)
+        if (engine := find(str(agent["model"].get("engine")))) and not engine.capabilities.language_model
     ]  # fmt: skip
-    models = list(dict.fromkeys(printable(rule.model, 30) for rule in rules))
-    versions = " or ".join(dict.fromkeys(printable(rule.prompt, 20) for rule in rules))
+    models = list(dict.fromkeys(printable(model, 30) for model, _ in rules))
+    versions = " or ".join(dict.fromkeys(printable(prompt, 20) for _, prompt in rules))
     if not models:
         return []
     if len(models) == 1:

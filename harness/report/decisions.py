@@ -36,18 +36,22 @@ LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
 
 
 def prompts_of(run: Run) -> Sent | None:
-    """Gives the chat messages that a viewer was sent; None if the run's prompt is not here as it was."""
-    version, actions = run.manifest.prompt["version"], run.actions
-    if version not in versions.names():
-        return None
-    prompt = versions.load(version)
-    if prompt.sha256 != run.manifest.prompt["sha256"]:
-        return None
+    """Gives the chat messages that a viewer was sent; None if a prompt of the run is not here as it was."""
+    manifest, prompts = run.manifest, dict[str, versions.Prompt]()
+    for agent in (manifest.agent(0), *manifest.helpers):
+        version = agent["prompt"]["version"]
+        if version not in versions.names():
+            return None
+        prompts[version] = versions.load(version)
+        if prompts[version].sha256 != agent["prompt"]["sha256"]:
+            return None
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
         words = scenarios.get(scene.state.scenario).prompt_words
-        messages = prompt.render(scene.record["graphs"][viewer], actions, heard, words)
-        return readout.asked(messages, actions) if run.manifest.answer == "readout" else messages
+        agent = manifest.agent(scene.viewers.index(viewer))
+        prompt = prompts[agent["prompt"]["version"]]
+        messages = prompt.render(scene.record["graphs"][viewer], run.actions, heard, words)
+        return readout.asked(messages, run.actions) if agent["answer"] == "readout" else messages
 
     return sent
 
@@ -181,6 +185,11 @@ class Decisions:
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
+            if run.manifest.helpers:
+                agent = run.agent(answer)
+                shown["agent"] = " · ".join(
+                    (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
+                )
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
@@ -201,7 +210,7 @@ def _shown(d: Decision) -> dict[str, Any]:
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
     role = "helper" if answer.role == "helper" else "ego"
-    return spans(answer.raw, role, run.actions, run.manifest.thinking)
+    return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
 
 
 def _episodes(run: Run) -> dict[int, list[dict[str, Any]]]:

@@ -98,7 +98,7 @@ def lines(runs: Runs) -> list[Line]:
             if condition in run.conditions:
                 scores = {metric: _score(run, condition, metric) for metric in METRICS}
                 who = run.manifest.variant
-                of_line = runs.names[n], who.model, who.prompt, who.answer, condition
+                of_line = runs.names[n], f"{who.model}{who.mix}", who.prompt, who.answer, condition
                 rows.append(Line(*of_line, scores, lengths[n], *marks[n]))
     return rows
 

@@ -116,7 +116,9 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
+                "inference_s": {
+                    "ego": [latency.ego_s], "helper": latency.helpers_s or [latency.helper_s],
+                },
                 "merge_s": latency.fusion_s,
                 "points": {
                     c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import astuple
-
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
@@ -100,8 +98,12 @@ def _shown(run: Run) -> str:
 
 
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:
-    parts = [(*astuple(run.manifest.variant), run.path.name) for run in runs]
-    for many in (2, 3, 4):
+    variants = [run.manifest.variant for run in runs]
+    parts = [
+        (f"{v.model} · {v.prompt}", v.answer, run.path.name) if not v.helpers else (str(v), run.path.name)
+        for v, run in zip(variants, runs, strict=True)
+    ]
+    for many in (1, 2, 3):
         names = [" · ".join(part[:many]) for part in parts]
         if len(set(names)) == len(names):
             return tuple(names)

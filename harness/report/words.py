@@ -41,7 +41,7 @@ def interval(score: Score) -> str:
 
 def headline(run: Run | SuiteRun) -> str:
     """The result in one short sentence: the best condition, and the one without V2V beside it."""
-    model = run.manifest.model.get("name")
+    model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
@@ -118,8 +118,9 @@ def latency_source(latency: Latency) -> str:
         "paper": "the paper's, not measured here",
         "declared": "declared by who ran it, not measured here",
     }[latency.source]
-    by_role = {"ego": latency.ego_s, "helper": latency.helper_s, "ego with messages": latency.fusion_s}
-    times = ", ".join(f"{role} {s * 1000:.0f} ms" for role, s in by_role.items())
+    of_helpers = latency.helpers_s or (latency.helper_s,)
+    by_role = {"ego": (latency.ego_s,), "helper": of_helpers, "ego with messages": (latency.fusion_s,)}
+    times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
     return f"{times}; {source} ({latency.basis})"
 
 
@@ -140,6 +141,8 @@ def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
             for key, inner in value.items()
             for line in facts(inner, f"{name}.{key}" if name else str(key))
         ]
+    if isinstance(value, list | tuple) and any(isinstance(inner, Mapping) for inner in value):
+        return facts({str(n): inner for n, inner in enumerate(value, 1)}, name)
     if isinstance(value, list):
         return [(name, ", ".join(map(str, value)))]
     return [(name, value)]

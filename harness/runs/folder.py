@@ -121,6 +121,14 @@ class Run:
             by_scene.setdefault(answer.scene, []).append(answer)
         return by_scene
 
+    def agent(self, answer: Answer) -> dict[str, Any]:
+        """Who gave an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
+        if answer.role != "helper" or not self.manifest.helpers:
+            return self.manifest.agent(0)
+        # A scene's viewers answer in the order in which the agents take them, the ego first.
+        first = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
+        return self.manifest.agent(first.index(answer.viewer))
+
     def score(self, condition: str, metric: str) -> Score | None:
         """A metric's value in one condition; where it has several intervals, the one over episodes."""
         candidates = [

@@ -190,7 +190,7 @@ def _summed(path: str, listed: Listed) -> Listed:
 def _described(made: Listed, config: dict[str, Any]) -> Listed:
     return replace(
         made,
-        model=str(config["model"]["name"]),
+        model=" + ".join(str(agent["model"]["name"]) for agent in (config, *config.get("helpers", ()))),
         prompt=str(config["prompt"]["version"]),
         answer=str(config["answer"]),
         tags=tuple(map(str, config["tags"])),

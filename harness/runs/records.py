@@ -90,8 +90,9 @@ class Latency(Struct, frozen=True, omit_defaults=True):
         source: `card`, `paper`, `declared` (by the user) or `measured`.
         basis: where the numbers come from.
         ego_s: seconds of one inference of the ego.
-        helper_s: of a helper.
+        helper_s: of a helper; with several helper models the first one's.
         fusion_s: of the ego's fusion call.
+        helpers_s: of each of several helper models; empty where there is one.
         sample: the answers behind a measured time, by role.
     """
 
@@ -101,6 +102,7 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     helper_s: Seconds
     fusion_s: Seconds
     sample: dict[str, Times] = {}
+    helpers_s: tuple[Seconds, ...] = ()
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
@@ -224,14 +226,21 @@ class Variant(Struct, frozen=True):
         model: name of the card.
         prompt: its version.
         answer: the answer mode.
+        helpers: the same of the helpers, one or several; empty where the ego's model answers for them.
     """
 
     model: str
     prompt: str
     answer: str
+    helpers: str = ""
 
     def __str__(self) -> str:
-        return f"{self.model} · {self.prompt} · {self.answer}"
+        return f"{self.model} · {self.prompt} · {self.answer}{self.mix}"
+
+    @property
+    def mix(self) -> str:
+        """The helpers as they are added to a name; empty where the ego's model answers for them."""
+        return self.helpers and f" + {self.helpers}"
 
 
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
@@ -312,6 +321,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     tags: tuple[str, ...]
     model: dict[str, Any]
     prompt: dict[str, Any]
+    helpers: tuple[dict[str, Any], ...] = ()
     world: FrozenScenes | ClosedLoop
     actions: tuple[str, ...]
     conditions: tuple[dict[str, Any], ...]
@@ -333,6 +343,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
         for where, table, keys in (
             ("model", self.model, ("name", "engine")), ("prompt", self.prompt, ("version", "sha256")),
             *(("conditions", point, ("name",)) for point in self.conditions),
+            *(("helpers", helper, ("answer",)) for helper in self.helpers),
+            *(("helpers", helper.get("model", {}), ("name", "engine")) for helper in self.helpers),
+            *(("helpers", helper.get("prompt", {}), ("version", "sha256")) for helper in self.helpers),
         ):  # fmt: skip
             if lacks := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{where}: {lacks[0]} is no text")
@@ -346,4 +359,13 @@ class Manifest(Struct, frozen=True, kw_only=True):
     @property
     def variant(self) -> Variant:
         """Who answered, and how they were asked."""
-        return Variant(self.model["name"], self.prompt["version"], self.answer)
+        helpers = [(h["model"]["name"], h["prompt"]["version"], h["answer"]) for h in self.helpers]
+        return Variant(
+            self.model["name"], self.prompt["version"], self.answer, " + ".join(map(" · ".join, helpers))
+        )
+
+    def agent(self, place: int) -> dict[str, Any]:
+        """Who answers for a scene's viewer at this place, as `helpers` has it; the ego is at 0."""
+        if place and self.helpers:
+            return self.helpers[(place - 1) % len(self.helpers)]
+        return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking")}

@@ -1,6 +1,6 @@
 """A finished run as a source: its answers are coordinated again, and no model is asked what the run has."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -11,9 +11,10 @@ import msgspec
 import numpy as np
 
 from harness.backends.base import AnswerMode, Backend
-from harness.backends.cache import cached, default_file
+from harness.backends.cache import default_file
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
+from harness.backends.swarm import open_each, together
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import nearest
 from harness.coordination.intents import Intents
@@ -23,6 +24,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Scene
+from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
@@ -138,28 +140,36 @@ class Stored:
 
     def _spec(self) -> Spec:
         """The evaluation that made the run, with all that decides its answers."""
-        manifest, shown = self.run.manifest, printable(self.run.path)
-        prompt = versions.load(manifest.prompt["version"])
+        manifest = self.run.manifest
+        ego, *helpers = map(self._agent, (manifest.agent(0), *manifest.helpers))
         return Spec(
-            convert(manifest.model, Card, f"{shown}: its model"), prompt, FrozenSource(self._dataset), (),
-            manifest.seeds, thinking=manifest.thinking, answer=cast("AnswerMode", manifest.answer),
+            ego, FrozenSource(self._dataset), (), manifest.seeds, tuple(helpers),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
         )  # fmt: skip
 
+    def _agent(self, stated: Mapping[str, Any]) -> Agent:
+        card = convert(stated["model"], Card, f"{printable(self.run.path)}: its model")
+        prompt = versions.load(stated["prompt"]["version"])
+        return Agent(card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"])
+
     def _open(self) -> Backend:
-        spec, shown = self._asker.spec, printable(self.run.path)
-        if spec.prompt.sha256 != self.run.manifest.prompt["sha256"]:
-            raise UserError(
-                f"{shown}: prompt {printable(spec.prompt.version)} has changed since; restore it or run again"
-            )
-        backend = open_backend(spec.card, dtype=spec.dtype, batch_size=spec.batch_size)
-        stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(backend.identity()))
+        spec, shown, manifest = self._asker.spec, printable(self.run.path), self.run.manifest
+        for agent, stated in zip(spec.agents, (manifest.agent(0), *manifest.helpers), strict=True):
+            if agent.prompt.sha256 != stated["prompt"]["sha256"]:
+                raise UserError(
+                    f"{shown}: prompt {printable(agent.prompt.version)} has changed since; restore it or run "
+                    "again"
+                )
+        opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)
+        models = open_each(spec.cards, opens)
+        identity = together(spec.cards, models).identity()
+        stored, now = manifest.identity, msgspec.json.decode(canonical_json(identity))
         if now != stored:
             other = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
                 f"{shown}: the model is not what it was ({printable(', '.join(other))}); run again"
             )
-        return cached(backend, spec.card, default_file())
+        return together(spec.cards, models, default_file())
 
 
 class _Nearest:

@@ -75,8 +75,8 @@ def case(
     asked = list(requests(spec, data.scenes(data.forest.ids[:1])))  # where every walk begins
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
-    device = "cpu" if spec.card.engine in WITH_WEIGHTS else None
-    yield Case(open_backend(spec.card, device=device, batch_size=3), tuple(asked[:5]))
+    device = "cpu" if spec.ego.card.engine in WITH_WEIGHTS else None
+    yield Case(open_backend(spec.ego.card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:

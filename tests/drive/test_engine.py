@@ -183,7 +183,7 @@ def test_the_luck_is_the_frozen_runs(small):
     """The draws of every decision, frozen and in the closed loop, for the layouts of `small`."""
 
     def draws(of, world):
-        asker = Asker(of, lambda: open_backend(of.card), PAPER)
+        asker = Asker(of, lambda: open_backend(of.ego.card), PAPER)
         for step, [decided] in enumerate(walk(world, of.points, asker)):
             due = decided.due
             for n, (episode, seed) in enumerate(zip(due.episode.tolist(), due.seed.tolist(), strict=True)):

@@ -20,7 +20,9 @@ from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.scenario import BEACON_DIALS
 
-SETTINGS = ("model", "prompt", "answer", "thinking", "dtype", "latency", "identity", "versions")
+SETTINGS = (
+    "model", "prompt", "answer", "thinking", "helpers", "dtype", "latency", "identity", "versions",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

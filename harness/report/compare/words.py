@@ -100,7 +100,7 @@ def findings(comparison: Comparison) -> list[tuple[str, str]]:
 def who(side: Side) -> str:
     """Model, prompt and answer mode of a run."""
     variant = side.run.manifest.variant
-    return f"{variant.model} · prompt {variant.prompt} · {variant.answer}"
+    return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
 
 def sides(pair: Pair) -> list[tuple[str, str]]:

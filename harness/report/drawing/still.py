@@ -111,7 +111,7 @@ def _outline(name: str) -> Outline:
 def _messages(played: Played, still: Still) -> Iterator[Artist]:
     """Each reply on its way from its helper to the ego; one that was lost goes half of it."""
     latency = played.manifest.latency
-    sent_s = max(latency.ego_s, latency.helper_s)
+    sent_s = max(latency.ego_s, latency.helper_s, *latency.helpers_s)
     ego = still.state.ego
     there = {v.id for v in still.state.vehicles}
     for message in still.decision.messages if still.open else ():

@@ -58,13 +58,14 @@ function policyRows(told, chosen, actions) {
   return rows;
 }
 
-// Inference as the run took it: one time for all, one a role, or each answer's own.
+// Inference as the run took it: one time for all, one a role, or one each helper model, which take turns.
 function timelineRows(told, chosen, run) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
+  let turn = 0;
   for (const a of first(told.answers)) {
+    const times = run.inference_s[a.role], ready = 1000 * times[a.role === "helper" ? turn++ % times.length : 0];
     const m = chosen.messages.find((m) => m.from === a.viewer), who = `${a.viewer}, ${a.role}`;
     if (a.role !== "ego" && !m) continue;
-    const ready = 1000 * run.inference_s[a.role];
     if (ready) rows.push({ who, what: "inference", from: 0, to: ready });
     if (!m) continue;
     const to = m.delivered ? m.arrival_ms : Math.min(latency_ms, 1000 * (point.window_s ?? 0));

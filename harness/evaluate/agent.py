@@ -1,0 +1,76 @@
+"""An agent: the model that answers for a vehicle, and how it is asked."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, get_args
+
+from harness.backends.base import AnswerMode, Role
+from harness.backends.cards import Card
+from harness.backends.registry import Capabilities, capabilities
+from harness.core.errors import UserError, printable, unknown
+from harness.prompts import readout
+from harness.prompts.versions import Prompt
+
+
+@dataclass(frozen=True)
+class Agent:
+    """Who answers for a vehicle.
+
+    Attributes:
+        card: the model.
+        prompt: the prompt version.
+        answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
+        thinking: whether the model thinks first.
+    """
+
+    card: Card
+    prompt: Prompt
+    answer: AnswerMode = "json"
+    thinking: bool = False
+
+    def __post_init__(self) -> None:
+        name = printable(self.card.name)
+        thinks = self.can.thinks == "always" or (self.can.thinks == "card" and self.card.thinking != "none")
+        if self.thinking and not thinks:
+            raise UserError(f"--thinking: {name} cannot think; leave it out")
+        if self.card.thinking == "always":  # its answers hold a thought, asked for or not
+            object.__setattr__(self, "thinking", True)
+        if self.answer not in get_args(AnswerMode):
+            raise unknown("answer mode", self.answer, get_args(AnswerMode))
+        if self.answer not in self.can.answer_modes:
+            reason = "cannot answer so" if self.can.language_model else "is no language model"
+            modes = " or ".join(self.can.answer_modes)
+            raise UserError(f"--answer {self.answer}: {name} {reason}; use {modes}")
+        if self.answer != "json" and self.thinking:
+            raise UserError(f"--answer {self.answer}: {name} thinks first, which only json leaves room for")
+
+    @property
+    def can(self) -> Capabilities:
+        """What its engine can do."""
+        return capabilities(self.card.engine)
+
+    @property
+    def name(self) -> str:
+        """Model, prompt and answer mode, for people and tables."""
+        return f"{self.card.name} · {self.prompt.version} · {self.answer}"
+
+    def most_tokens(self, role: Role) -> int:
+        """Most tokens that an answer may have, its thought included if the model thinks first."""
+        answer = self.card.max_new_tokens or self.prompt.max_answer_tokens[role]
+        return answer + (self.card.thinking_tokens if self.thinking else 0)
+
+    def messages(
+        self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]
+    ) -> tuple[Mapping[str, str], ...]:
+        """The chat messages about a scene graph."""
+        rendered = self.prompt.render(graph, actions, words=words)
+        return readout.asked(rendered, actions) if self.answer == "readout" else rendered
+
+    def settings(self) -> dict[str, Any]:
+        """All that decides its answers, as plain values."""
+        return {
+            "model": asdict(self.card),
+            "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
+            "thinking": self.thinking,
+            "answer": self.answer,
+        }

@@ -1,0 +1,176 @@
+"""Mixed swarms: the ego and its helpers have different models, prompts or answer modes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluating import live_spec_of, run, same_decisions, spec_of
+from run_on_disk import answers_of
+
+from harness.backends import cards
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.evaluate.agent import Agent
+from harness.evaluate.latency import declared
+from harness.evaluate.spec import Spec
+from harness.prompts import versions
+from harness.runs.folder import read
+from harness.runs.records import Answer
+
+RULE = "proxy · v2 · json"
+
+
+def helper(model: str = "proxy", prompt: str = "v2", **asked: Any) -> Agent:
+    return Agent(cards.resolve(model), versions.load(prompt), **asked)
+
+
+def mixed(data: Dataset, *helpers: Agent, model: str = "proxy", **options: Any) -> Spec:
+    return spec_of(data, model, helpers=helpers, **options)
+
+
+def by_id(out: Path, role: str) -> dict[str, Answer]:
+    return {answer.id: answer for answer in answers_of(out) if answer.role == role}
+
+
+@pytest.fixture(scope="module")
+def mix(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The proxy as ego, with helpers that stumble."""
+    return run(mixed(small, helper("proxy-faulty")), tmp_path_factory.mktemp("mix") / "mix").out
+
+
+@pytest.fixture(scope="module")
+def pure(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Each of the two alone."""
+    where = tmp_path_factory.mktemp("pure")
+    return {name: run(spec_of(small, name), where / name).out for name in ("proxy", "proxy-faulty")}
+
+
+def test_each_half_answers_as_it_does_in_a_run_of_its_own(mix: Path, pure: dict[str, Path]) -> None:
+    for role, model in (("ego", "proxy"), ("helper", "proxy-faulty")):
+        here, there = by_id(mix, role), by_id(pure[model], role)
+        both = here.keys() & there.keys()
+        assert len(both) > 20
+        assert [here[name].raw for name in sorted(both)] == [there[name].raw for name in sorted(both)]
+    verdicts = {answer.verdict for answer in by_id(mix, "helper").values()}
+    assert verdicts == {"strict", "recovered", "failed"}
+    assert {answer.verdict for answer in by_id(mix, "ego").values()} == {"strict"}
+
+
+def test_helpers_like_the_ego_make_no_mix(small: Dataset, pure: dict[str, Path], tmp_path: Path) -> None:
+    same = mixed(small, helper(), helper())
+    assert same.helpers == ()
+    assert same_decisions(run(same, tmp_path / "same").out, pure["proxy"])
+
+
+def test_a_run_says_who_answered(mix: Path) -> None:
+    made = read(mix)
+    assert made.manifest.variant.helpers == "proxy-faulty · v2 · json"
+    assert str(made.manifest.variant) == f"{RULE} + proxy-faulty · v2 · json"
+    assert "--helper-model proxy-faulty --helper-prompt v2 --helper-answer json" in made.manifest.command
+    agents = {(a.role, made.agent(a)["model"]["name"]) for a in made.answers}
+    assert agents == {("ego", "proxy"), ("helper", "proxy-faulty")}
+    assert made.manifest.identity["helpers"][0]["engine"] == "proxy"
+
+
+def test_several_helper_models_take_the_helpers_in_turn(small: Dataset, tmp_path: Path) -> None:
+    spec = mixed(small, helper(), helper("proxy-faulty"))
+    assert [spec.agent(place) for place in range(5)] == [0, 1, 2, 1, 2]
+    made = read(run(spec, tmp_path / "run").out)
+    for answers in made.answers_by_scene.values():
+        names = [made.agent(a)["model"]["name"] for a in answers]
+        assert names == ["proxy", "proxy", "proxy-faulty", "proxy"][: len(names)]
+    faulty = {a.viewer for a in made.answers if a.verdict != "strict"}
+    assert faulty == {"v3"}
+
+
+def test_stored_runs_are_mixed_as_their_models_are(
+    small: Dataset, mix: Path, pure: dict[str, Path], tmp_path: Path
+) -> None:
+    """Where neither run came to a decision point, its model is asked."""
+    stored = mixed(small, helper(f"replay:{pure['proxy-faulty']}"), model=f"replay:{pure['proxy']}")
+    assert same_decisions(run(stored, tmp_path / "stored").out, mix)
+    again = spec_of(small, f"replay:{mix}")
+    assert same_decisions(run(again, tmp_path / "again").out, mix)
+
+
+def test_a_stored_run_whose_model_has_changed_is_not_asked_on(
+    small: Dataset, pure: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = mixed(small, helper(f"replay:{pure['proxy-faulty']}"), model=f"replay:{pure['proxy']}")
+    monkeypatch.setattr("harness.backends.proxy.Proxy.identity", lambda self: {"engine": "another"})
+    with pytest.raises(UserError, match="is not the model that it was; run it again"):
+        run(stored, tmp_path / "stored")
+    assert not (tmp_path / "stored" / "run.json").exists()
+
+
+def test_every_agent_takes_its_own_time(small: Dataset, tmp_path: Path) -> None:
+    def at(seconds: float) -> Agent:
+        agent = helper()
+        latency = replace(agent.card.latency, inference_s=seconds)
+        return replace(agent, card=replace(agent.card, latency=latency))
+
+    made = run(mixed(small, at(0.3), at(0.2)), tmp_path / "run").manifest.latency
+    assert (made.ego_s, made.helper_s, made.helpers_s, made.fusion_s) == (0.145, 0.3, (0.3, 0.2), 0.145)
+    decisions = read(tmp_path / "run").decisions
+    arrival = {
+        m.sender: m.arrival_ms
+        for d in decisions.records(0, len(decisions)) for m in d.messages if m.arrival_ms is not None
+    }  # fmt: skip
+    assert min(arrival["v2"], arrival["v4"]) > arrival["v3"] + 50
+
+
+def test_times_of_several_helper_models_are_declared_in_turn(small: Dataset) -> None:
+    said = declared("ego=0.1,helper=0.2:0.3")
+    assert (said.ego_s, said.helper_s, said.helpers_s, said.fusion_s) == (0.1, 0.2, (0.2, 0.3), 0.1)
+    with pytest.raises(UserError, match="2 times for 1 helper models; give one, or one each"):
+        mixed(small, helper("proxy-faulty"), latency="ego=0.1,helper=0.2:0.3")
+    with pytest.raises(UserError, match="ego is needed"):
+        declared("ego=0.1:0.2")
+
+
+def test_a_mix_drives_as_well(tmp_path: Path) -> None:
+    def driven(workers: int) -> Path:
+        from harness.core.work import tidy
+        from harness.evaluate.run import evaluate
+
+        spec = live_spec_of(helpers=(helper("proxy-faulty"),))
+        out = evaluate(spec, tmp_path / str(workers), lambda done: None, workers=workers).out
+        tidy(out)
+        return out
+
+    one, two = driven(1), driven(2)
+    assert same_decisions(one, two)
+    assert {a.verdict for a in by_id(one, "ego").values()} == {"strict"}
+    assert {a.verdict for a in by_id(one, "helper").values()} > {"strict"}
+
+
+@pytest.mark.parametrize(
+    ("ego", "helpers", "options", "said"),
+    [
+        ("proxy", ("full-view",), {}, "--helper-model: full-view is a driver, which decides for an ego"),
+        ("local-view", ("proxy",), {}, "--helper-model: local-view is a driver"),
+        (
+            "proxy",
+            ("swarm-tiny",),
+            {"device": "cpu", "latency": "measured"},
+            "--latency measured: proxy",
+        ),
+    ],
+)
+def test_a_mix_that_means_nothing_is_refused(
+    ego: str, helpers: tuple[str, ...], options: dict[str, Any], said: str, small: Dataset
+) -> None:
+    with pytest.raises(UserError) as caught:
+        mixed(small, *map(helper, helpers), model=ego, **options)
+    assert str(caught.value).startswith(said)
+
+
+def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:
+    from harness.coordination.operating_point import named_point
+
+    asks = (named_point("6g:consensus=ego-prompt"),)
+    with pytest.raises(UserError, match="prompt v2 merges messages with a distribution, those of paper"):
+        mixed(small, helper("swarm-tiny", "paper"), model="swarm-tiny", points=asks)
+    with pytest.raises(UserError, match="a readout gives no messages to merge"):
+        mixed(small, helper("swarm-tiny", answer="readout"), model="swarm-tiny", points=asks)
