@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -38,6 +39,7 @@ if TYPE_CHECKING:  # the simulator is loaded by who drives
     from harness.evaluate.live_world import LiveSource, LiveWorld
 
 Opens = Callable[..., Backend]  # as `open_backend` is called
+NOTHING: Mapping[str, Answer] = MappingProxyType({})
 EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
 
@@ -68,6 +70,7 @@ def evaluate(
     more: Callable[[int], None] = lambda count: None,
     workers: int = 1,
     opens: Opens | None = None,
+    given: Mapping[str, Answer] = NOTHING,
 ) -> Evaluated:
     """Evaluate a model with a prompt and write the run's folder; the same for any number of workers.
 
@@ -83,6 +86,7 @@ def evaluate(
         more: called with the number of answers that are owed next, where scenes are frozen.
         workers: processes that drive, each with a backend of its own.
         opens: in the place of `open_backend`, where scenes are frozen: what it gives may be open already.
+        given: answers that are there already, by request id, where scenes are frozen.
 
     Raises:
         UserError: the folder holds something else, or the model is not available. Nothing is written then.
@@ -97,7 +101,7 @@ def evaluate(
     if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens or open_backend)
+        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given)
     return _closed_loop(spec, cast("LiveSource", spec.source), out, begun, progress, cache, workers)
 
 
@@ -118,7 +122,7 @@ def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walke
 
 def _frozen(
     spec: Spec, source: FrozenSource, out: Path, begun: Begun | None, progress: Callable[[int], None],
-    cache: Path | None, more: Callable[[int], None], opens: Opens,
+    cache: Path | None, more: Callable[[int], None], opens: Opens, given: Mapping[str, Answer],
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
@@ -128,7 +132,7 @@ def _frozen(
     begun = _begin(spec, out, begun, identity, latency)
     with work.working(out, begun, "run.json") as place:
         asked = together(spec.cards, models, cache)
-        asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", progress=progress, more=more)
+        asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", given, progress, more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
             return _written(spec, out, begun, dataset.episodes, walked, identity)

@@ -236,9 +236,13 @@ def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Epis
 
 
 def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
-    """Answers in the order of their decision points; of each the ego's, the helpers', the fusion calls'."""
+    """Answers in the order of their decision points; of each the ego's, the helpers', the fusion calls'.
+
+    Those of decision points to which no decision came are left out.
+    """
     place = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
-    return sorted(answers, key=lambda answer: (place[answer.scene], answer.heard))
+    there = (answer for answer in answers if answer.scene in place)
+    return sorted(there, key=lambda answer: (place[answer.scene], answer.heard))
 
 
 def dataset_of(run: Run) -> Dataset:

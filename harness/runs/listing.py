@@ -15,7 +15,13 @@ from harness.core.formats import CONFIG, FORMAT, READ_BY, SUITE, WORK
 
 DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
-STUDIES = {"sweep.json": "sweep", "study.json": "study", "closed-loop.json": "study", "fidelity.csv": "study"}
+STUDIES = {
+    "sweep.json": "sweep",
+    "grid.json": "grid",
+    "study.json": "study",
+    "closed-loop.json": "study",
+    "fidelity.csv": "study",
+}
 SUCCESS, FAILED = "success_rate", "failed_rate_ego"
 UNREAD = 0.5  # least share of failed answers of which a run's headline speaks
 _BROKEN = (
@@ -122,7 +128,7 @@ def _one(path: str, root: str) -> Listed | None:
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
             try:
-                sources = _json(path, name)["sources"] if kind == "sweep" else ()
+                sources = _json(path, name)["sources"] if kind in ("sweep", "grid") else ()
                 model = ", ".join(str(source["name"]) for source in sources if "name" in source)
                 return Listed("", kind, "finished", written, model=model or None)
             except _BROKEN:

@@ -1,0 +1,141 @@
+"""`harness grid`: every combination of ego and helper agents."""
+
+from itertools import count, product
+from pathlib import Path
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import console, table
+from harness.cli.progress import bar
+from harness.cli.run import file_name
+from harness.core import extras, resources
+from harness.core.errors import UserError, printable
+
+MOST_CELLS = 256
+MOST_EFFECTS = 8  # that are printed
+
+
+def command(
+    model: str = typer.Option("proxy", help="Models of the ego, such as a,b."),
+    prompt: str | None = typer.Option(None, help="Prompt versions, such as v2,v3. Default: the scenario's."),
+    answer: str = typer.Option("json", help="Answer modes: json, constrained, readout."),
+    helper_model: str | None = typer.Option(None, help="Models of the helpers. Default: the ego's."),
+    helper_prompt: str | None = typer.Option(None, help="Prompts of the helpers. Default: the ego's."),
+    helper_answer: str | None = typer.Option(None, help="Answer modes of helpers. Default: the ego's."),
+    dataset: options.Dataset = resources.DATASET,
+    condition: options.Conditions = None,
+    seeds: options.Seeds = "0:5",
+    limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
+    batch_size: options.BatchSize = 8,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    latency: options.Latency = None,
+    out: Path | None = typer.Option(None, help="Folder. Default: reports/grid-<models>-<dataset>."),
+    no_cache: options.NoCache = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Evaluate all combinations of models, prompts and answer modes of ego and helpers.
+
+    Each is asked once in each role. The same command continues one that was stopped.
+    """
+    from harness.backends import cards
+    from harness.backends.cache import default_file
+    from harness.coordination.operating_point import POINTS, named_point
+    from harness.dataset import load
+    from harness.dataset.select import Selection
+    from harness.evaluate.agent import Agent
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+
+    extras.need("harness grid", "matplotlib")
+    frozen = load.load(load.find(dataset), limit)
+    prompt = prompt or frozen.scenario.prompt
+    egos, helpers = (
+        [
+            Agent(cards.resolve(m), versions.load(p), a)  # type: ignore[arg-type]  # Agent checks the mode
+            for m, p, a in product(*(_several(option, text) for option, text in choices.items()))
+        ]
+        for choices in (
+            {"--model": model, "--prompt": prompt, "--answer": answer},
+            {
+                "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
+                "--helper-answer": helper_answer or answer,
+            },
+        )
+    )  # fmt: skip
+    if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
+        raise UserError(f"{cells} combinations; vary something, and give {MOST_CELLS} at most")
+    spec = Spec(
+        ego=egos[0],
+        source=FrozenSource(frozen, Selection(limit)),
+        points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+        seeds=options.parse_seeds(seeds),
+        batch_size=batch_size,
+        device=device,
+        dtype=dtype,
+        latency=latency,
+    )
+    from harness.studies.grid import run_cells
+    from harness.studies.grid_page import in_a_sentence, ranked, strongest, tables, text, write_grid
+
+    names = "-".join(dict.fromkeys(file_name(agent.card.name) for agent in (*egos, *helpers)))
+    folder = out or _free(f"grid-{names}-{frozen.name}")
+    if (folder / "grid.json").exists():
+        raise UserError(
+            f"--out {printable(folder)} already holds a finished grid; choose another or delete it"
+        )
+    silent = as_json or quiet
+    with bar(f"{cells} combinations", quiet=silent) as progress:
+        cache = None if no_cache else default_file()
+        grid = run_cells(spec, egos, helpers, folder, progress, progress.more, cache)
+    page = write_grid(grid, spec, folder)
+    if as_json:
+        cells_and_effects = tables(grid)
+        parts = ",\n".join(f'"{k}": {v.to_json(orient="records")}' for k, v in cells_and_effects.items())
+        typer.echo(f"{{{parts}}}")
+    if silent:
+        return
+    last, plain = grid.conditions[-1], console()
+    table(
+        (f"ego + helpers, {last}", "success % [95 % CI]", "latency ms", "tokens"),
+        [
+            (
+                f"{printable(grid.name(c.ego, 'ego'), 24)} + {printable(grid.name(c.helper, 'helper'), 24)}",
+                text("success_rate", c.estimate("success_rate", last)),
+                *(text(m, c.estimate(m, last)).partition(" ")[0] for m in ("latency_proxy_ms", "tokens")),
+            )
+            for c in ranked(grid, last)
+        ],
+        tight=True,
+    )
+    table(
+        (f"effect, {last}", "points [95 % CI]", "p"),
+        [
+            (printable(e.what, 90), text("success_rate", e.estimate), "–" if e.p is None else f"{e.p:.3f}")
+            for e in strongest(grid.effects, last, MOST_EFFECTS)
+        ],
+        tight=True,
+    )
+    for sentence in in_a_sentence(grid):
+        plain.print(sentence)
+    plain.print(
+        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: Holm's, for all "
+        f"{len(grid.effects)} effects; {len(grid.conditions)} conditions are on the page"
+    )
+    typer.echo(f"wrote {printable(page)}")
+
+
+def _several(option: str, text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if "" in names or len(set(names)) < len(names):
+        raise UserError(f"{option} {printable(text)}: give different names, such as a,b")
+    return names
+
+
+def _free(name: str) -> Path:
+    """The first folder of the name under reports/ without a finished grid."""
+    folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
+    return next(folder for folder in folders if not (folder / "grid.json").exists())

@@ -1,0 +1,297 @@
+"""`harness grid`: every ego agent with every helper agent, and what each choice is worth.
+
+A full factorial design: a cell is a run of one ego agent with one helper agent. Cells share answers, so each
+agent is asked in each role once about a decision point, whatever cell comes to it. All cells have the same
+episodes and the same draws, so contrasts are paired by episode.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+
+from harness.backends.registry import open_backend
+from harness.core import noise, work
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
+from harness.core.formats import WORK
+from harness.core.multiplicity import LEVEL, holm
+from harness.core.statistics import Estimate
+from harness.evaluate.agent import Agent
+from harness.evaluate.run import evaluate, finished
+from harness.evaluate.spec import Spec
+from harness.runs.folder import Run, read
+from harness.runs.metrics import (
+    LATENCY,
+    METRICS,
+    SUCCESS,
+    by_episode,
+    difference,
+    mean_by_place,
+    over_episodes,
+    p_value,
+)
+from harness.runs.records import Answer
+
+RESAMPLES = 4000
+FIELDS = ("model", "prompt", "answer")
+HALVES = ("ego", "helper")
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What one half of a swarm chooses.
+
+    Attributes:
+        half: whose it is, `ego` or `helper`.
+        field: `model`, `prompt` or `answer`.
+        levels: what it may be, the base first.
+    """
+
+    half: str
+    field: str
+    levels: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """For tables: `helper prompt`."""
+        return f"{self.half} {self.field}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A combination: the ego's agent, the helpers', and their run."""
+
+    ego: Agent
+    helper: Agent
+    run: Run
+
+    def level(self, factor: Factor) -> str:
+        """Which level of a factor it has."""
+        return level(self.ego if factor.half == "ego" else self.helper, factor.field)
+
+    @cached_property
+    def values(self) -> Mapping[str, Floats]:
+        """Success, latency and tokens of a decision, each (C, S, E); NaN where unknown."""
+        run = self.run
+        of = by_episode([METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes)
+        places, n = run.grid.places(run.decisions), len(run.episodes)
+        return {**of, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
+
+    def estimate(self, metric: str, condition: str) -> Estimate:
+        """A metric under a condition, over episodes."""
+        return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a change of level is worth in success, averaged over all other factors.
+
+    Attributes:
+        condition: the operating point.
+        what: the factor and its two levels; two of them for an interaction.
+        estimate: b - a of a main effect; of an interaction half the difference of two such differences.
+        p: of no effect, by Holm's method corrected for all effects of the grid; None without an interval.
+    """
+
+    condition: str
+    what: str
+    estimate: Estimate
+    p: float | None
+
+    @property
+    def clear(self) -> bool:
+        """Whether it is more than chance explains."""
+        return self.p is not None and self.p <= LEVEL
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Shares of the variance of success between the cells that each half explains, by episode resampled.
+
+    Attributes:
+        condition: the operating point.
+        ego: which agent the ego has.
+        helpers: which the helpers have.
+        together: their interaction, the rest.
+        apart: `ego` - `helpers`.
+    """
+
+    condition: str
+    ego: Estimate
+    helpers: Estimate
+    together: Estimate
+    apart: Estimate
+
+
+def level(agent: Agent, field: str) -> str:
+    """A factor's level that an agent has."""
+    return {"model": agent.card.name, "prompt": agent.prompt.version, "answer": agent.answer}[field]
+
+
+def tokens(run: Run) -> Floats:
+    """Tokens in and out that a decision took, of the ego and of each helper that was to reply, (n,).
+
+    NaN throughout where a model of the run counts none.
+    """
+    of: dict[str | None, dict[str, list[float]]] = {}
+    for answer in run.answers:
+        counts = (answer.prompt_tokens, answer.completion_tokens)
+        total = math.nan if None in counts else float(sum(c or 0 for c in counts))
+        of.setdefault(answer.scene, {}).setdefault(answer.role, []).append(total)
+    each = {scene: [float(np.mean(roles.get(role, [0.0]))) for role in HALVES] for scene, roles in of.items()}
+    ego, helper = np.array([each[scene] for scene in run.decisions.labels("scene")]).T
+    messages = run.decisions["messages"]
+    total = ego + np.where(messages > 0, messages * helper, 0.0)
+    return np.full_like(total, np.nan) if np.isnan(total).any() else total
+
+
+def run_cells(
+    spec: Spec, egos: Sequence[Agent], helpers: Sequence[Agent], out: Path,
+    progress: Callable[[int], None], more: Callable[[int], None], cache_file: Path | None,
+) -> "Grid":  # fmt: skip
+    """Evaluate every combination in a folder of its own under `out`; those that are there stay.
+
+    Args:
+        spec: the evaluation, whose agents are replaced.
+        egos: agents of the ego.
+        helpers: agents of the helpers.
+        out: the grid's folder.
+        progress: called with the number of new answers.
+        more: called with the number of answers that are owed next.
+        cache_file: of completions kept between runs; None for no cache.
+
+    Raises:
+        UserError: the folder holds another grid, or a model is not available.
+    """
+    opens, asked = cache(open_backend), dict[tuple[str, str], dict[str, Answer]]()
+    specs = {
+        (i, j): replace(spec, ego=ego, helpers=(helper,))
+        for (i, ego), (j, helper) in product(enumerate(egos, 1), enumerate(helpers, 1))
+    }
+    cells = []
+    for (i, j), of in specs.items():
+        folder, roles = out / "cells" / f"{i}-{j}", {"ego": egos[i - 1].name, "helper": helpers[j - 1].name}
+        if (folder / "run.json").is_file() and not (folder / WORK).is_dir():
+            finished(of, folder)
+        else:
+            given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
+            evaluate(of, folder, progress, cache_file, more, opens=opens, given=given)
+            work.tidy(folder)
+        run = read(folder)
+        for answer in run.answers:
+            if answer.role in roles:
+                asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
+        cells.append(Cell(egos[i - 1], helpers[j - 1], run))
+    return Grid(tuple(cells), len(egos), len(helpers))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """All cells of a full factorial design, row by row: `rows` ego agents, `columns` helper agents."""
+
+    cells: tuple[Cell, ...]
+    rows: int
+    columns: int
+
+    def __post_init__(self) -> None:
+        if len({(cell.run.conditions, cell.run.grid) for cell in self.cells}) > 1:
+            raise UserError(f"{printable(self.cells[0].run.path.parent)}: its runs are not of the same grid")
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the operating points."""
+        return self.cells[0].run.conditions
+
+    @cached_property
+    def factors(self) -> tuple[Factor, ...]:
+        """What has more than one level."""
+        every = []
+        for half, field in product(HALVES, FIELDS):
+            levels = dict.fromkeys(c.level(Factor(half, field, ())) for c in self.cells)
+            every.append(Factor(half, field, tuple(levels)))
+        return tuple(factor for factor in every if len(factor.levels) > 1)
+
+    def name(self, agent: Agent, half: str) -> str:
+        """An agent by what is varied of its half; by its model where nothing is."""
+        varied = [factor.field for factor in self.factors if factor.half == half]
+        return " ".join(level(agent, field) for field in varied or ("model",))
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """Main effects and interactions of two factors on success, under every condition."""
+        contrasts = [
+            (condition, *contrast)
+            for condition in self.conditions
+            for contrast in (*self._main(condition), *self._interactions(condition))
+        ]
+        p_values = [p_value(SUCCESS, high, low) for _, _, low, high in contrasts]
+        corrected = iter(holm([p for p in p_values if p is not None]))
+        return tuple(
+            Effect(condition, what, difference(SUCCESS, high, low), None if p is None else next(corrected))
+            for (condition, what, low, high), p in zip(contrasts, p_values, strict=True)
+        )
+
+    def _mean(self, condition: str, **levels: str) -> Floats:
+        """Mean success of the cells with these levels, by factor's name, (E, S)."""
+        at = self.conditions.index(condition)
+        by_name = {factor.name: factor for factor in self.factors}
+        chosen = [
+            cell.values[SUCCESS][at]
+            for cell in self.cells
+            if all(cell.level(by_name[name]) == wanted for name, wanted in levels.items())
+        ]
+        return np.asarray(np.mean(chosen, axis=0).T)
+
+    def _main(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
+        for factor in self.factors:
+            base, *others = factor.levels
+            for other in others:
+                low, high = (self._mean(condition, **{factor.name: at}) for at in (base, other))
+                yield f"{factor.name}: {base} → {other}", low, high
+
+    def _interactions(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
+        for one, two in combinations(self.factors, 2):
+            for x, y in product(one.levels[1:], two.levels[1:]):
+                means = {
+                    at: self._mean(condition, **{one.name: at[0], two.name: at[1]})
+                    for at in product((one.levels[0], x), (two.levels[0], y))
+                }
+                same = (means[one.levels[0], two.levels[0]] + means[x, y]) / 2
+                crossed = (means[x, two.levels[0]] + means[one.levels[0], y]) / 2
+                yield f"{one.name} → {x} × {two.name} → {y}", crossed, same
+
+    def halves(self, condition: str) -> Halves | None:
+        """What each half explains; None without a channel, where one alone varies, or all may be alike."""
+        at = self.conditions.index(condition)
+        if 1 in (self.rows, self.columns) or not self.cells[0].run.manifest.conditions[at]["profile"]:
+            return None
+        each = np.array([np.mean(cell.values[SUCCESS][at], axis=0) for cell in self.cells])
+        n = each.shape[1]
+        draws = noise.generator("grid", "halves").multinomial(n, [1 / n] * n, size=RESAMPLES)
+        weights = np.concatenate([np.ones((1, n)), draws]) / n
+        shares = _shares((each @ weights.T).reshape(self.rows, self.columns, -1))
+        if np.isnan(shares[:, 0]).any() or np.isnan(shares[0]).mean() > LEVEL:
+            return None
+        ends = np.nanpercentile(shares[:, 1:], (2.5, 97.5), axis=1).T
+        found = [
+            Estimate(float(value), float(low), float(high), n, 0)
+            for value, (low, high) in zip(shares[:, 0], ends, strict=True)
+        ]
+        return Halves(condition, *found)
+
+
+def _shares(means: Floats) -> Floats:
+    """Of means (I, J, B): shares of rows, columns and the rest in the sum of squares, and rows - columns."""
+    grand = means.mean(axis=(0, 1))
+    rows = means.shape[1] * ((means.mean(axis=1) - grand) ** 2).sum(axis=0)
+    columns = means.shape[0] * ((means.mean(axis=0) - grand) ** 2).sum(axis=0)
+    total = ((means - grand) ** 2).sum(axis=(0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rest = np.maximum(total - rows - columns, 0.0)
+        parts = np.where(total > 1e-12, np.array([rows, columns, rest]) / total, np.nan)
+    return np.concatenate([parts, parts[:1] - parts[1:2]])
