@@ -14,7 +14,7 @@ from evaluating import run, spec_of, with_ego
 from tokenizers import Tokenizer, models
 
 from harness import __version__, cli
-from harness.cli.options import parse_seeds
+from harness.cli.options import parse_seeds, points
 from harness.cli.run import default_out
 from harness.core import work
 from harness.core.errors import UserError
@@ -327,3 +327,24 @@ def test_help_loads_no_heavy_package(args: list[str]) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.lstrip().startswith("Usage: ")
     assert done.stderr == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("conditions", "control", "names"),
+    [
+        (["single-local", "6g"], [], "single-local 6g"),
+        (["single-local", "6g"], ["shuffled-messages"], "single-local 6g 6g:messages=shuffled"),
+        (["6g", "6g:tau=0"], ["no-messages"], "6g 6g:tau=0 6g:loss=1 6g:tau=0,loss=1"),
+        (["6g", "6g:loss=1"], ["no-messages"], "6g 6g:loss=1"),
+        (["v2x", "v2x"], ["no-messages", "shuffled-messages"], "v2x v2x:loss=1 v2x:messages=shuffled"),
+    ],
+)  # fmt: skip
+def test_a_control_stands_beside_every_condition_with_a_channel(
+    conditions: list[str], control: list[str], names: str
+) -> None:
+    assert sorted(point.name for point in points(conditions, control)) == sorted(names.split())
+
+
+def test_an_unknown_control_is_refused() -> None:
+    with pytest.raises(UserError, match="unknown --control 'blind'"):
+        points(["6g"], ["blind"])

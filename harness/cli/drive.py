@@ -63,7 +63,7 @@ def command(
 ) -> None:
     """Drive closed-loop episodes in highway-env. The same command continues one that was stopped."""
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS, named_point
+    from harness.coordination.operating_point import POINTS
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.evaluate.live_world import LiveSource
     from harness.evaluate.run import evaluate
@@ -102,7 +102,7 @@ def command(
             helper_thinking,
         ).agents(source.scenario),
         source=source,
-        points=tuple(named_point(name) for name in dict.fromkeys(names)),
+        points=options.points(tuple(names)),
         seeds=options.parse_seeds(seeds),
         batch_size=batch_size,
         device=device,

@@ -38,6 +38,7 @@ def command(
         resources.DATASET, help="Shipped dataset, a dataset's folder, or suite:NAME."
     ),
     condition: options.Conditions = None,
+    control: options.Controls = None,
     seeds: options.Seeds = "0:5",
     limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
     only: str | None = typer.Option(None, help="Episodes by number: 3,10:20 is 3 and 10 to 19."),
@@ -64,7 +65,7 @@ def command(
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes. The same command continues one that was stopped."""
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS, named_point
+    from harness.coordination.operating_point import POINTS
     from harness.dataset import load, suites
     from harness.dataset.select import Selection
     from harness.evaluate.frozen_world import FrozenSource
@@ -84,7 +85,7 @@ def command(
         Spec(
             **swarm.agents(each.scenario),
             source=FrozenSource(each, selection),
-            points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+            points=options.points(condition or tuple(POINTS), control),
             seeds=channel_seeds,
             batch_size=batch_size,
             device=device,

@@ -25,6 +25,7 @@ def command(
     helper_answer: str | None = typer.Option(None, help="Answer modes of helpers. Default: the ego's."),
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
+    control: options.Controls = None,
     seeds: options.Seeds = "0:5",
     limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
     batch_size: options.BatchSize = 8,
@@ -42,7 +43,7 @@ def command(
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
-    from harness.coordination.operating_point import POINTS, named_point
+    from harness.coordination.operating_point import POINTS
     from harness.dataset import load
     from harness.dataset.select import Selection
     from harness.evaluate.agent import Agent
@@ -71,7 +72,7 @@ def command(
     spec = Spec(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
-        points=tuple(named_point(name) for name in dict.fromkeys(condition or POINTS)),
+        points=options.points(condition or tuple(POINTS), control),
         seeds=options.parse_seeds(seeds),
         batch_size=batch_size,
         device=device,

@@ -5,10 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from harness.backends.base import AnswerMode
+    from harness.coordination.operating_point import OperatingPoint
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = str
 
@@ -33,6 +36,14 @@ Dataset = Annotated[str, Option(help="Shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
     list[str] | None,
     Option(help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all."),
+]
+Controls = Annotated[
+    list[str] | None,
+    Option(
+        "--control",
+        help="shuffled-messages: beside each condition with a channel, one whose ego hears the helpers of "
+        "another layout; no-messages: one that loses all. Repeatable.",
+    ),
 ]
 Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
 FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
@@ -64,6 +75,27 @@ NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that 
 Tags = Annotated[list[str] | None, Option(help="Word to find the run by. Repeatable.")]
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, Option("--quiet", help="Print nothing but errors, and what --json asks for.")]
+
+
+CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1"}
+
+
+def points(
+    conditions: "Sequence[str]", controls: "Sequence[str] | None" = None
+) -> "tuple[OperatingPoint, ...]":
+    """Operating points by name, each once, followed by their controls where they have a channel."""
+    from harness.coordination.operating_point import named_point
+
+    given = [named_point(name) for name in dict.fromkeys(conditions)]
+    found = list(given)
+    for control in dict.fromkeys(controls or ()):
+        if control not in CONTROLS:
+            raise unknown("--control", control, CONTROLS)
+        setting = CONTROLS[control]
+        for point in given:
+            if point.profile and setting.partition("=")[0] not in point.name:
+                found.append(named_point(point.name + ("," if ":" in point.name else ":") + setting))
+    return tuple(dict.fromkeys(found))
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
