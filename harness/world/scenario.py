@@ -181,6 +181,7 @@ class Scenario:
             hidden by". Templates read `words.<name>`.
         brake_lamps: whether vehicles show that they brake.
         prompt: version that is taken where none is named.
+        one_sided: why its scenes with left and right swapped are no scenes of it; None if they are.
         start: starts an episode that is not simulated by the harness, `(scenario, seed)`: a `World`.
     """
 
@@ -194,6 +195,7 @@ class Scenario:
     words: Mapping[str, str]
     brake_lamps: bool = False
     prompt: str = "v4"
+    one_sided: str | None = "nothing says that a mirrored scene is one of it"
     start: Callable[["Scenario", int], Any] | None = None
 
     @property

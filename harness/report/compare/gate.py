@@ -3,7 +3,7 @@
 import math
 import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import UserError, printable, unknown
@@ -50,11 +50,16 @@ class Verdict:
     failed: tuple[tuple[str, float], ...]
 
 
-def gate(text: str) -> Gate:
+def gate(text: str, names: Sequence[str] = NAMES, example: str = "6g:success_rate < -0.01") -> Gate:
     """A gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
+    Args:
+        text: as it was typed.
+        names: the metrics there are.
+        example: of a gate, for the error.
+
     Raises:
-        UserError: it cannot be read, or names no metric that is compared.
+        UserError: it cannot be read, or names no metric that there is.
     """
     match = _GATE.fullmatch(text)
     try:
@@ -63,11 +68,11 @@ def gate(text: str) -> Gate:
         number = math.nan
     if not match or not math.isfinite(number):
         raise UserError(
-            f"--fail-if {printable(text)!r} cannot be read; give [CONDITION:]METRIC[.low|.high] OP NUMBER "
-            f"with OP one of {' '.join(OPERATORS)}, such as '6g:success_rate < -0.01'"
+            f"--fail-if {printable(text)!r} cannot be read; give [NAME:]METRIC[.low|.high] OP NUMBER "
+            f"with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
-    if match["metric"] not in NAMES:
-        raise unknown("metric of --fail-if", match["metric"], NAMES)
+    if match["metric"] not in names:
+        raise unknown("metric of --fail-if", match["metric"], names)
     if match["end"] not in (None, *ENDS):
         raise unknown(f"end of {match['metric']}'s interval in --fail-if", match["end"], ENDS)
     condition = match["condition"]

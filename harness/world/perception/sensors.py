@@ -20,6 +20,8 @@ from harness.world.state import VehicleState, WorldState
 LIDAR_RANGE_M, RADAR_RANGE_M, CAMERA_RANGE_M = 80.0, 150.0, 60.0
 HALF_FIELD_RAD = np.radians(60.0)
 LEAST_RAYS = 3  # rays on an object below which no sensor reports it
+# Standard deviations: the LiDAR's position on each axis, the radar's range.
+LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,9 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
 
     # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
     if seen["lidar"]:
-        x, y = v.x_m + 0.1 * z[0], v.y_m + 0.1 * z[1]
+        x, y = v.x_m + LIDAR_NOISE_M * z[0], v.y_m + LIDAR_NOISE_M * z[1]
     else:
-        r, b = distance + 0.4 * z[0], bearing + np.radians(1.0) * z[1]
+        r, b = distance + RADAR_NOISE_M * z[0], bearing + np.radians(1.0) * z[1]
         x, y = viewer.x_m + r * np.cos(b), viewer.y_m + r * np.sin(b)
     rate = None
     if seen["radar"]:

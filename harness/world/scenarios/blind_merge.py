@@ -181,4 +181,5 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
+    one_sided="the ramp comes from the right",
 )

@@ -164,4 +164,5 @@ SCENARIO = Scenario(
     cleared=cleared,
     words={"task": "pass a slow truck, or stay behind it", "hiding": "the truck"},
     brake_lamps=True,
+    one_sided="traffic keeps to the right, and what comes towards it is on the left",
 )

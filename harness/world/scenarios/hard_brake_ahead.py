@@ -153,4 +153,5 @@ SCENARIO = Scenario(
     cleared=cleared,
     words={"task": "drive on along a motorway", "hiding": "the van ahead"},
     brake_lamps=True,
+    one_sided="traffic keeps to the right lane and passes on the left",
 )

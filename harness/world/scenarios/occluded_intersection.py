@@ -168,4 +168,5 @@ SCENARIO = Scenario(
     cleared=cleared,
     words={"task": "go straight over an intersection", "hiding": "buildings and trucks"},
     prompt="v2",
+    one_sided=None,  # nobody has right of way, so that times decide and sides do not
 )

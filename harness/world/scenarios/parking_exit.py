@@ -197,4 +197,5 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     words={"task": "pull out of a kerbside space into the lane beside it", "hiding": "parked vans"},
+    one_sided="the kerb is on the right",
 )

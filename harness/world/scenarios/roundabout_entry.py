@@ -251,4 +251,5 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     words={"task": "enter a roundabout and go straight on", "hiding": "a hedge and a planted island"},
+    one_sided="traffic goes round one way and comes from the left",
 )

@@ -1,0 +1,129 @@
+"""`harness twins`: metamorphic tests of a prompt."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import echo_json, table
+from harness.cli.progress import bar
+from harness.cli.run import free_folder
+from harness.core import resources, work
+from harness.core.errors import printable, unknown
+
+if TYPE_CHECKING:
+    from harness.studies.twins.scoring import Row
+
+EPISODES = 12  # that are drawn where nothing is said
+HEADS = ("twin", "role", "holds", "invariant % [95 %]", "TV distance", "fail%", "n")
+
+
+def command(
+    model: options.Model = "proxy",
+    engine: options.Engine = None,
+    prompt: options.ScenarioPrompt = None,
+    dataset: options.Dataset = resources.DATASET,
+    twin: list[str] | None = typer.Option(None, help="Twin to ask about. Repeatable. Default: all."),
+    limit: int | None = typer.Option(None, help="The first so many episodes."),
+    sample: int | None = typer.Option(
+        None, help=f"How many episodes to draw. Default: {EPISODES}, or all there are."
+    ),
+    sample_seed: int = typer.Option(0, help="Seed of the draw of episodes and decision points."),
+    thinking: options.Thinking = False,
+    answer: options.Answer = "json",
+    batch_size: options.BatchSize = 8,
+    workers: options.ModelWorkers = 2,
+    device: options.Device = None,
+    dtype: options.Dtype = None,
+    fail_if: list[str] | None = typer.Option(
+        None,
+        help="Gate: '[TWIN:]METRIC[.low|.high] OP NUMBER' with invariance_rate, tv_distance or failed_rate, "
+        "in every role; shares from 0 to 1. Repeatable. Exit code 1 if one fails.",
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: reports/<model>-<prompt>-twins-<dataset>."
+    ),
+    no_cache: options.NoCache = False,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Ask about decision points and about their twins, and test what must hold of both answers.
+
+    The same command continues one that was stopped.
+    """
+    from harness.backends import cards
+    from harness.backends.cache import default_file
+    from harness.dataset import load
+    from harness.dataset.select import Selection
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+    from harness.report.compare.gate import gate
+    from harness.studies.twins import asking, page, scoring
+    from harness.studies.twins.declared import TWINS
+
+    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    for name in twin or ():
+        if name not in TWINS:
+            raise unknown("--twin", name, TWINS)
+    gates = [gate(typed, scoring.METRICS, "mirrored:invariance_rate < 0.9") for typed in fail_if or ()]
+    for each in gates:
+        if each.condition not in (None, *(twin or TWINS)):
+            raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), twin or TWINS)
+    whole = load.load(load.find(dataset), None if sample else limit)
+    if limit is None and sample is None:
+        sample = min(EPISODES, len(whole.episodes))
+    selection = Selection(limit, sample=sample, sample_seed=sample_seed)
+    source = FrozenSource(selection.of(whole), selection)
+    spec = Spec(
+        card=cards.resolve(model, engine),
+        prompt=versions.load(prompt or source.scenario.prompt),
+        source=source,
+        points=(),
+        seeds=(0,),
+        thinking=thinking,
+        answer=answer,
+        batch_size=batch_size,
+        device=device,
+        dtype=dtype,
+    )
+    study = asking.Study(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
+    where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
+    cache, label = None if no_cache else default_file(), f"asking {printable(spec.card.name, 30)}, episodes"
+    with bar(label, len(study.points()), as_json or quiet) as progress:
+        pairs = asking.ask(study, where, progress, cache, workers)
+    with work.going_on(where):
+        rows = scoring.rows(pairs, [TWINS[name] for name in study.twins])
+        verdicts = [scoring.judge(each, rows) for each in gates]
+        written = page.write(study, pairs, rows, verdicts, where)
+    work.tidy(where)
+    if as_json:
+        echo_json(page.mapping(study, rows, verdicts))
+    elif not quiet:
+        typer.echo(
+            f"{printable(spec.card.name)} · prompt {spec.prompt.version} · {spec.answer} · {source.name}"
+        )
+        table(HEADS, map(_cells, rows), tight=True)
+        typer.echo(
+            f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
+            "intervals over episodes\n"
+            "n: questions that the twin changes; fail%: an answer failed, so that nothing holds"
+        )
+        typer.echo(scoring.headline(rows))
+        for name, needs in page.missing(study, rows).items():
+            typer.echo(f"left out: {name} needs {needs}")
+        for verdict in verdicts:
+            failed = "; ".join(f"{at}: {value:.3f}" for at, value in verdict.failed)
+            typer.echo(f"gate {printable(verdict.gate)}: {f'fails, {failed}' if failed else 'passes'}")
+        typer.echo(f"wrote {printable(written)}")
+    raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
+
+
+def _cells(row: "Row") -> tuple[str, ...]:
+    from harness.studies.twins.page import cell
+
+    return (
+        row.twin.name, row.role, row.twin.holds, cell(row.invariance_rate, 100, 1),
+        cell(row.tv_distance, 1, 2), f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
+    )  # fmt: skip

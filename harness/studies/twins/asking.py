@@ -1,0 +1,236 @@
+"""Asks a model about decision points and about their twins."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from harness.backends.base import Backend, Request
+from harness.backends.cache import cached
+from harness.backends.cards import Card
+from harness.backends.registry import capabilities, open_backend
+from harness.core import noise, work
+from harness.core.errors import UserError, printable
+from harness.core.files import digest
+from harness.core.parallel import spread
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.asking import Asker, fusion_request, requests
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.fusion import messages_of
+from harness.evaluate.latency import PAPER
+from harness.evaluate.spec import Spec
+from harness.runs.records import Answer
+from harness.studies.twins.declared import TWINS, Twin
+from harness.studies.twins.scoring import Pair, distance, held
+
+RESULT = "twins.json"
+Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twin
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is asked.
+
+    Attributes:
+        spec: who is asked, and how; its source has the drawn episodes.
+        twins: their names.
+        seed: of the draw of decision points.
+    """
+
+    spec: Spec
+    twins: tuple[str, ...]
+    seed: int
+
+    def __post_init__(self) -> None:
+        card = self.spec.card
+        shown = f"--model {printable(card.name)}"
+        if not capabilities(card.engine).closed_loop:
+            raise UserError(f"{shown}: a replay has no answers to twins; give the model that it replays")
+        if card.privileged:
+            raise UserError(f"{shown} reads the truth, which no twin changes; give local-view or a model")
+        if not any(lack(self.spec, TWINS[name]) is None for name in self.twins):
+            raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
+
+    def lacks(self, names: Sequence[str]) -> str:
+        """What these twins need and nothing here has."""
+        needs = ((name, lack(self.spec, TWINS[name]) or TWINS[name].needs) for name in names)
+        return "; ".join(f"{name} needs {what}" for name, what in needs)
+
+    @property
+    def dataset(self) -> Dataset:
+        """The drawn episodes."""
+        assert isinstance(self.spec.source, FrozenSource)
+        return self.spec.source.dataset
+
+    def points(self) -> dict[int, list[str]]:
+        """Decision points by episode: of each step one of those on the drivers' courses."""
+        forest, drawn = self.dataset.forest, dict[int, dict[int, str]]()
+
+        def draw(scene: str) -> float:
+            return float(noise.uniforms((1,), "twins", self.seed, scene)[0])
+
+        for scene in sorted(self.dataset.courses(), key=draw):
+            at = forest.place[scene]
+            drawn.setdefault(int(forest.episodes[forest.tree[at]]), {}).setdefault(
+                int(forest.step[at]), scene
+            )
+        return {episode: [of[step] for step in sorted(of)] for episode, of in sorted(drawn.items())}
+
+    def begin(self, identity: str) -> work.Begun:
+        """What the work begins with; `identity` is the digest of the model's."""
+        settings = {**self.spec.settings(), "twins": self.twins, "seed": self.seed, "identity": identity}
+        return work.Begun(settings=msgspec.json.decode(msgspec.json.encode(settings)))
+
+    def goes_on(self, out: Path) -> bool:
+        """Whether this was begun in a folder, stopped there, and nobody is at it."""
+        try:
+            left = work.begun(out, work.Begun)
+            if left is None or (out / RESULT).exists() or work.held(out):
+                return False
+            work.same(out, self.begin(str(left.settings.get("identity"))).settings, left.settings)
+            return True
+        except UserError:
+            return False
+
+
+def lack(spec: Spec, twin: Twin) -> str | None:
+    """What a twin needs that this evaluation never has; None where some question may have it."""
+    language_model = capabilities(spec.card.engine).language_model
+    if twin.actions and spec.scenario.one_sided is not None:
+        return f"{twin.needs}: {spec.scenario.one_sided}"
+    if not language_model and twin.of_text:
+        return "a language model"
+    if twin.senders and spec.answer == "readout":
+        return "messages, which no readout gives"
+    return None
+
+
+def ask(
+    study: Study, out: Path, progress: Callable[[int], None], cache: Path | None, workers: int
+) -> list[Pair]:
+    """Ask about decision points and their twins; the same for any number of workers.
+
+    What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever writes
+    the result calls.
+
+    Args:
+        study: what is asked.
+        out: folder of the result.
+        progress: called with the number of decision points just done.
+        cache: file of completions kept between runs; None for no cache.
+        workers: processes, each with a backend of its own.
+
+    Raises:
+        UserError: the folder holds something else, the model is not available, or no question has a twin.
+    """
+    if (out / RESULT).exists():
+        raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
+    # Compiled templates do not travel between processes.
+    study = replace(study, spec=replace(study.spec, prompt=replace(study.spec.prompt)))
+    [identity] = spread(_identity, [study.spec], workers, lambda done: None)
+    begun = study.begin(identity)
+    if left := work.begun(out, work.Begun):
+        work.same(out, begun.settings, left.settings)
+    with work.working(out, begun, RESULT) as place:
+        done = spread(partial(_asked, study, cache, place), study.points().items(), workers, progress)
+        pairs = [pair for of in done for pair in of]
+        if not pairs:
+            raise UserError(f"--twin: none applies to what was drawn: {study.lacks(study.twins)}")
+        return pairs
+
+
+def _identity(spec: Spec) -> str:
+    return digest(_opened(spec.card, spec.device, spec.dtype, spec.batch_size).identity())
+
+
+@lru_cache(maxsize=1)
+def _opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
+    """This process's backend."""
+    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
+
+
+def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Sequence[str]]) -> list[Pair]:
+    """Ask about the decision points of an episode, then about their twins."""
+    (number, ids), spec = episode, study.spec
+    scenes = study.dataset.scenes(ids)
+
+    def backend() -> Backend:
+        return cached(_opened(spec.card, spec.device, spec.dtype, spec.batch_size), spec.card, cache)
+
+    asker = Asker(spec, backend, PAPER, place / f"answers-{number:06d}.jsonl")
+    questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
+    first = {request.id: request for of in questions.values() for request in of}
+    asker.ask(list(first.values()))
+    asked = [
+        each
+        for scene in scenes
+        for twin in map(TWINS.__getitem__, study.twins)
+        if lack(spec, twin) is None
+        for each in (
+            _fusion(spec, twin, scene, asker.answers)
+            if twin.senders
+            else _twins(spec, twin, scene, questions[scene.id])
+        )
+    ]
+    then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in first}
+    asker.ask(list(then.values()))
+    return [_pair(spec, each, number, asker.answers) for each in asked]
+
+
+def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:
+    """The questions about a scene that the twin changes for who reads them, each with its twin."""
+    graphs = scene.record["graphs"]
+    if twin.graph:
+        graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
+    others = requests(spec, [_named(scene, twin, graphs=graphs)])
+    for question, other in zip(questions, others, strict=True):
+        if capabilities(spec.card.engine).language_model:
+            other = twin.text(spec, other) if twin.text else other
+            differ = _differ(question, other)
+        else:
+            other = replace(other, view=twin.view(other.view or {})) if twin.view else other
+            differ = question.view != other.view
+        if differ:
+            yield twin, question.role, question, other
+
+
+def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer]) -> Iterator[Asked]:
+    """The ego's fusion call with the messages of all helpers, and its twin."""
+    by_viewer = {v: answers[f"{scene.id}/{v}"] for v in spec.viewers(scene)}
+    senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:])]
+    if senders and twin.senders:
+        question = fusion_request(spec, scene, by_viewer, senders)
+        other = fusion_request(spec, _named(scene, twin), by_viewer, twin.senders(senders))
+        if _differ(question, other):
+            yield twin, "fusion", question, other
+
+
+def _named(scene: Scene, twin: Twin, **others: Any) -> Scene:
+    """A scene of another name, so that its answers have names of their own."""
+    return Scene({**scene.record, **others, "scene": f"{scene.id}~{twin.name}"})
+
+
+def _differ(a: Request, b: Request) -> bool:
+    """Whether a language model is asked otherwise."""
+    return (a.messages, a.actions) != (b.messages, b.actions)
+
+
+def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
+    twin, role, *both = asked
+    a, b = (answers[request.id] for request in both)
+    p, q = a.intent, None
+    if b.intent:
+        names = ((twin.actions or {}).get(action, action) for action in both[1].actions)
+        read = dict(zip(names, b.intent, strict=True))
+        q = tuple(read[action] for action in spec.actions)
+    return Pair(
+        twin.name, role, episode, a.scene, a.viewer, p, q, distance(p, q), held(twin, p, q), (a.raw, b.raw),
+        (a.status, b.status), (_text(both[0]), _text(both[1])),
+    )  # fmt: skip
+
+
+def _text(request: Request) -> str:
+    return "\n".join(f"--- {message['role']}\n{message['content']}" for message in request.messages)

@@ -1,0 +1,321 @@
+"""Twins of decision points: the same question put another way, and what must hold of the answers to both.
+
+These are metamorphic relations (Chen et al. 2018): nobody needs to know the right answer to tell that two
+answers do not go together. A twin that does not apply to a question leaves it as it is.
+"""
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from harness.backends.base import Request
+from harness.core import noise
+from harness.dataset.load import Scene
+from harness.evaluate.spec import Spec
+from harness.prompts import readout
+from harness.world.perception.sensors import LIDAR_NOISE_M, RADAR_NOISE_M
+
+Graph = Mapping[str, Any]
+Leaf = Callable[[str, Any], Any]
+FAR_M = 100.0  # from the viewer to the vehicle that is added, at least
+CLEAR_M = 65.0  # from there to the conflict zone, at least
+FEET, KMH = 1 / 0.3048, 3.6
+# Words of units, and those that take their place.
+UNITS = {r"\bm/s\b": "km/h", r"\bm\b": "ft", r"\bmet(?:er|re)s\b": "feet"}
+PLACEHOLDER = re.compile(r"{{.*?}}|{%.*?%}", re.DOTALL)
+MEMBER = re.compile(r'\s*,\s*(?="\w+"\s*:)')
+SIDES = {"left": "right", "right": "left"}
+LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
+
+
+@dataclass(frozen=True)
+class Twin:
+    """One way to put a question otherwise.
+
+    Attributes:
+        name: how commands call it.
+        says: what is other.
+        needs: what a question must have for it to apply.
+        within: greatest total-variation distance that it allows; None where the action must be the same.
+        graph: the twin's scene graph, `(spec, scene, graph)`.
+        text: the twin's request, `(spec, request)`, of a language model.
+        view: the same for who reads the graph and no text.
+        senders: whose messages a fusion call has, `(senders)`, in the place of these.
+        actions: the question's name for an action of the twin, where it is another.
+    """
+
+    name: str
+    says: str
+    needs: str = "a graph or a text that it changes"
+    within: float | None = None
+    graph: Callable[[Spec, Scene, Graph], Graph] | None = None
+    text: Callable[[Spec, Request], Request] | None = None
+    view: Callable[[Graph], Graph] | None = None
+    senders: Callable[[Sequence[str]], Sequence[str]] | None = None
+    actions: Mapping[str, str] | None = None
+
+    @property
+    def of_text(self) -> bool:
+        """Whether it says nothing to who reads the graph and no text."""
+        return bool(self.text or self.senders) and not self.view
+
+    @property
+    def holds(self) -> str:
+        """What must hold, in a word or two."""
+        if self.within is not None:
+            return f"TV <= {self.within:g}"
+        return "mirrored" if self.actions else "same"
+
+
+def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
+    """A copy of plain data whose leaves are `leaf(key, value)`; those of a list have the list's key."""
+    if isinstance(value, Mapping):
+        return {name: changed(of, leaf, name) for name, of in value.items()}
+    if isinstance(value, list):
+        return [changed(of, leaf, key) for of in value]
+    return leaf(key, value)
+
+
+def mirrored(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """Left and right swapped; the same graph if the scenario is one-sided, or has no such path."""
+    if spec.scenario.one_sided is not None:
+        return graph
+    twin = swapped(graph)
+    paths = spec.scenario.road().paths
+    legal = all((c["sector"], c["route"]) in paths for c in twin["conflicts"])
+    return twin if legal else graph
+
+
+def swapped(graph: Graph) -> Graph:
+    """Left and right swapped in positions, headings and words; sectors in the order that they had."""
+
+    def leaf(key: str, value: Any) -> Any:
+        if key in ("left_m", "heading_deg") and value is not None:
+            return 0 - value
+        if key in ("sector", "lane", "route", "indicator") and value is not None:
+            return re.sub(r"\b(left|right)\b", lambda side: SIDES[side[0]], value)
+        return value
+
+    twin = changed(graph, leaf)
+    order = [sector["sector"] for sector in graph["sectors"]]
+    if {sector["sector"] for sector in twin["sectors"]} == set(order):
+        twin["sectors"].sort(key=lambda sector: order.index(sector["sector"]))
+    return dict(twin)
+
+
+def permuted_ids(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """Every vehicle has the name of another, in all graphs of the scene alike."""
+    ids = [v["id"] for v in scene.record["state"]["vehicles"]]
+    order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
+    named = {ids[n]: ids[m] for n, m in zip(order, [*order[1:], *order[:1]], strict=True)}  # one cycle
+    return dict(changed(graph, lambda key, value: named.get(value, value) if key in NAMES else value))
+
+
+NAMES = ("id", "with", "viewer", "by")
+
+
+def rounded(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """Metres and m/s without decimals, shares with one. Times stay: half a second decides conflicts."""
+
+    def leaf(key: str, value: Any) -> Any:
+        if isinstance(value, float) and key.endswith(("_m", "_mps")):
+            return round(value) + 0.0
+        return round(value, 1) if key == "seen_share" else value
+
+    return dict(changed(graph, leaf))
+
+
+def far_vehicle(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """One more vehicle: it stands beside the road, away from viewer, ego and conflict zone."""
+    away = max(FAR_M, CLEAR_M + graph["self"]["zone_m"])
+    ahead = graph["ego"]["forward_m"] < 0  # the other way than the ego; behind the ego itself
+    used = {int(v["id"][1:]) for v in scene.record["state"]["vehicles"]}
+    own_mps = graph["self"]["speed_mps"]
+    node = {
+        "id": f"v{max(used) + 1}", "type": "vehicle", "forward_m": away if ahead else -away, "left_m": 0.0,
+        "heading_deg": None, "speed_mps": 0.0, "range_rate_mps": -own_mps if ahead else own_mps,
+        "lane": "off-lane", "indicator": None, "sensors": ["radar"],
+        **({"braking": None} if spec.scenario.brake_lamps else {}),
+    }  # fmt: skip
+    return {**graph, "nodes": [*graph["nodes"], node]}
+
+
+def jittered(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """Distances of what sensors report as another look would have them, with the same noise once more."""
+    draws = noise.generator("twins", "jitter", scene.id, graph["viewer"])
+    twin = changed(graph, lambda key, value: value)
+    by_id = {}
+    for node in twin["nodes"]:
+        scale = LIDAR_NOISE_M if "lidar" in node["sensors"] else RADAR_NOISE_M
+        by_id[node["id"]] = forward, left = (scale * draws.standard_normal(2)).tolist()
+        node |= {
+            "forward_m": round(node["forward_m"] + forward, 1),
+            "left_m": round(node["left_m"] + left, 1),
+        }
+    for conflict in twin["conflicts"]:
+        if conflict["with"] in by_id:  # who is not is the viewer itself, which knows where it is
+            to_go = conflict["other"] if conflict["other"]["arc_m"] else conflict["ego"]
+            to_go["arc_m"] = round(to_go["arc_m"] + by_id[conflict["with"]][0], 1)
+    return dict(twin)
+
+
+def reversed_lines(spec: Spec, request: Request) -> Request:
+    """Neighbouring lines that begin with a vehicle's name, the last first."""
+
+    def turned(run: re.Match[str]) -> str:
+        return "".join(reversed(run[0].splitlines(keepends=True)))
+
+    return _reworded(request, lambda text: re.sub(r"(?m)(?:^v\d+\b.*\n){2,}", turned, text))
+
+
+def reversed_lists(graph: Graph) -> Graph:
+    """Objects and conflicts, the last first."""
+    return {**graph, "nodes": graph["nodes"][::-1], "conflicts": graph["conflicts"][::-1]}
+
+
+def in_feet(spec: Spec, scene: Scene, graph: Graph) -> Graph:
+    """Feet and km/h where a template has metres and m/s as words that can be replaced."""
+    return dict(changed(graph, _in_feet)) if _says_units(spec, graph["role"]) else graph
+
+
+def _in_feet(key: str, value: Any) -> Any:
+    if value is None or not key.endswith(("_m", "_mps")):
+        return value
+    return round(value * (KMH if key.endswith("_mps") else FEET), 1)
+
+
+def _says_units(spec: Spec, role: str) -> bool:
+    """Whether a template has both units, and no number of its own with one, but for the target speeds."""
+    fixed = PLACEHOLDER.sub("", spec.prompt.texts[role]).replace(f"{_speeds(spec, 1.0)} m/s", "m/s")
+    return all(re.search(unit, fixed) for unit in ("m/s", r"\bm\b(?!/)")) and not re.search(
+        r"\d\s*m\b", fixed
+    )
+
+
+def _speeds(spec: Spec, factor: float) -> str:
+    """The target speeds as prompts have them, `14, 7, 0`."""
+    speeds = spec.scenario.prompt_words["speeds"].split(", ")
+    return ", ".join(f"{round(float(speed) * factor, 1):g}" for speed in speeds)
+
+
+def other_units(spec: Spec, request: Request) -> Request:
+    """The words of units, and the target speeds."""
+    if not _says_units(spec, request.role):
+        return request
+
+    def reworded(text: str) -> str:
+        text = text.replace(f"{_speeds(spec, 1.0)} m/s", f"{_speeds(spec, KMH)} m/s")
+        for unit, other in UNITS.items():
+            text = re.sub(unit, other, text)
+        return text
+
+    return _reworded(request, reworded)
+
+
+def paraphrased(spec: Spec, request: Request) -> Request:
+    """Every sentence of `paraphrases.toml` in other words."""
+
+    def reworded(text: str) -> str:
+        for sentence, other in paraphrases().items():
+            text = text.replace(sentence, other)
+        return text
+
+    return _reworded(request, reworded)
+
+
+@cache
+def paraphrases() -> dict[str, str]:
+    """Other words for sentences."""
+    text = (Path(__file__).parent / "paraphrases.toml").read_text(encoding="utf-8")
+    return {str(sentence): str(other) for sentence, other in tomllib.loads(text).items()}
+
+
+def reordered_keys(spec: Spec, request: Request) -> Request:
+    """The members of the JSON objects that a prompt shows, the last first."""
+    return _reworded(request, _reversed_members)
+
+
+def _reversed_members(text: str) -> str:
+    """The same text with the members of its outermost objects, and of those in them, the last first."""
+    done, at = "", 0
+    while (start := text.find('{"', at)) >= 0 and (end := _closing(text, start)):
+        inner, members, comma, depth, last = text[start + 1 : end], [""], "", 0, 0
+        for mark in re.finditer(r"[{}]|" + MEMBER.pattern, inner):
+            depth += {"{": 1, "}": -1}.get(mark[0], 0)
+            if depth == 0 and mark[0] not in "{}":
+                members[-1] += inner[last : mark.start()]
+                members.append("")
+                comma, last = mark[0], mark.end()
+        members[-1] += inner[last:]
+        body = comma.join(map(_reversed_members, reversed(members)))
+        done, at = f"{done}{text[at : start + 1]}{body}}}", end + 1
+    return done + text[at:]
+
+
+def _closing(text: str, start: int) -> int:
+    """Where the brace that opens at `start` is closed; 0 if it is not."""
+    depth = 0
+    for n, character in enumerate(text[start:], start):
+        depth += {"{": 1, "}": -1}.get(character, 0)
+        if depth == 0:
+            return n
+    return 0
+
+
+def permuted_letters(spec: Spec, request: Request) -> Request:
+    """Each letter of a read-out stands for the next action, the first for the last."""
+    if request.answer != "readout":
+        return request
+    moved = (*request.actions[-1:], *request.actions[:-1])
+    old, new = (readout.asked([{"content": ""}], of)[0]["content"] for of in (request.actions, moved))
+    return replace(_reworded(request, lambda text: text.replace(old, new)), actions=moved)
+
+
+def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
+    messages = tuple({**message, "content": reworded(message["content"])} for message in request.messages)
+    return replace(request, messages=messages)
+
+
+_DECLARED = (
+    Twin(
+        "mirrored", "left and right swapped", "a scenario whose scenes may be mirrored",
+        graph=mirrored, actions=LANES,
+    ),
+    Twin("ids", "vehicles have each other's names", graph=permuted_ids),
+    Twin(
+        "order", "objects and conflicts in another order", "two objects or conflicts",
+        text=reversed_lines, view=reversed_lists,
+    ),
+    Twin("far-vehicle", "one more vehicle, far from every conflict", graph=far_vehicle),
+    Twin(
+        "units", "feet and km/h for metres and m/s", "a prompt that says m and m/s", within=0.1,
+        graph=in_feet, text=other_units,
+    ),
+    Twin("rounding", "one decimal fewer in distances, speeds and shares", within=0.1, graph=rounded),
+    Twin("jitter", "distances with the sensors' noise once more", within=0.1, graph=jittered),
+    Twin(
+        "paraphrase", "some sentences in other words", "sentences of the prompts that ship", within=0.1,
+        text=paraphrased,
+    ),
+    Twin(
+        "key-order", "keys of the JSON that the prompt shows in another order", "a prompt that shows JSON",
+        text=reordered_keys,
+    ),
+    Twin(
+        "letters", "letters of the read-out stand for other actions", "--answer readout",
+        text=permuted_letters,
+    ),
+    Twin(
+        "message-order", "the helpers' messages in another order", "fusion calls with two messages",
+        senders=lambda senders: senders[::-1],
+    ),
+    Twin(
+        "message-twice", "one helper's message twice", "fusion calls with a message",
+        senders=lambda senders: [*senders, *senders[:1]],
+    ),
+)  # fmt: skip
+TWINS = {twin.name: twin for twin in _DECLARED}

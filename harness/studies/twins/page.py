@@ -1,0 +1,101 @@
+"""The folder and the page of a study of twins."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from markupsafe import Markup, escape
+
+from harness.core.files import write_whole
+from harness.core.statistics import Estimate
+from harness.evaluate.spec import versions
+from harness.report.compare.gate import Verdict
+from harness.report.page import environment, visible
+from harness.studies.twins.asking import RESULT, Study, lack
+from harness.studies.twins.declared import TWINS
+from harness.studies.twins.scoring import METRICS, Pair, Row, headline
+
+FORMAT = "swarmdrive-twins/1"
+TEMPLATES = Path(__file__).parent.parent / "templates"
+EXAMPLES = 3  # of each row
+
+
+def write(
+    study: Study, pairs: Sequence[Pair], rows: Sequence[Row], verdicts: Sequence[Verdict], out: Path
+) -> Path:
+    """Write `pairs.jsonl`, the page, which is returned, and last `twins.json`."""
+    lines = [{k: v for k, v in asdict(pair).items() if k != "messages"} for pair in pairs]
+    write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+    page = environment(TEMPLATES).get_template("twins.html.j2").render(
+        study=study, spec=study.spec, rows=rows, headline=headline(rows), missing=missing(study, rows),
+        points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, cell=cell, difference=difference,
+    )  # fmt: skip
+    write_whole(out / "index.html", page)
+    content = {"format": FORMAT, **mapping(study, rows, verdicts), "versions": versions()}
+    write_whole(out / RESULT, msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n")
+    return out / "index.html"
+
+
+def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """The result as plain values; null where there is no number."""
+    table = [
+        {
+            "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
+            **{metric: _plain(getattr(row, metric)) for metric in METRICS},
+        }
+        for row in rows
+    ]  # fmt: skip
+    gates = [{"gate": verdict.gate, "failed": dict(verdict.failed)} for verdict in verdicts]
+    return {
+        "model": study.spec.card.name, "prompt": study.spec.prompt.version, "answer": study.spec.answer,
+        "world": msgspec.to_builtins(study.spec.source.record()), "seed": study.seed,
+        "decision_points": decision_points(study), "rows": table, "left_out": missing(study, rows),
+        "gates": gates,
+    }  # fmt: skip
+
+
+def _plain(estimate: Estimate) -> dict[str, float | None]:
+    return {k: None if np.isnan(v) else v for k, v in asdict(estimate).items() if k != "n_excluded"}
+
+
+def decision_points(study: Study) -> int:
+    """How many were drawn."""
+    return sum(map(len, study.points().values()))
+
+
+def missing(study: Study, rows: Sequence[Row]) -> dict[str, str]:
+    """The twins that no question has, and what they need."""
+    had = {row.twin.name for row in rows}
+    return {n: lack(study.spec, TWINS[n]) or TWINS[n].needs for n in study.twins if n not in had}
+
+
+def cell(estimate: Estimate, scale: float, decimals: int) -> str:
+    """`value [low, high]`; a dash for what is not known."""
+    ends = (estimate.value, estimate.low, estimate.high)
+    return "{} [{}, {}]".format(*("–" if np.isnan(end) else f"{scale * end:.{decimals}f}" for end in ends))
+
+
+def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
+    """The lines that two texts do not share, `-` of the first and `+` of the other, with words marked."""
+    old, new = a.splitlines(), b.splitlines()
+    for kind, i, j, k, n in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        if kind != "equal":
+            before, after = "\n".join(old[i:j]).split(" "), "\n".join(new[k:n]).split(" ")
+            changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
+            sides = (
+                ("-", before, [(kind, start, end) for kind, start, end, *_ in changes]),
+                ("+", after, [(kind, start, end) for kind, *_, start, end in changes]),
+            )
+            for sign, words, parts in sides:
+                if any(words):
+                    shown = (_word(words[start:end], kind) for kind, start, end in parts if start < end)
+                    yield sign, Markup(" ").join(shown)
+
+
+def _word(words: Sequence[str], kind: str) -> Markup:
+    shown = escape(visible(" ".join(words)))
+    return shown if kind == "equal" else Markup("<mark>{}</mark>").format(shown)

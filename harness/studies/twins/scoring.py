@@ -1,0 +1,142 @@
+"""Whether what twins declare holds of a model's answers, with intervals, and gates on it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core.errors import UserError, printable, unknown
+from harness.core.statistics import Estimate, rate_interval
+from harness.report.compare.gate import OPERATORS, Gate, Verdict
+from harness.studies.twins.declared import Twin
+
+ROLES = ("ego", "helper", "fusion")
+METRICS = ("invariance_rate", "tv_distance", "failed_rate")
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The answers to a question and to its twin.
+
+    Attributes:
+        twin: name of the twin.
+        role: `ego`, `helper`, or `fusion` for the ego's fusion call.
+        episode: number of the episode.
+        scene: id of the decision point.
+        viewer: who was asked.
+        p: distribution of the question's answer over the actions; None where it failed.
+        q: the twin's, read back.
+        distance: total variation between both; None where one failed.
+        holds: whether what the twin declares holds; false where an answer failed.
+        said: both answers as they came.
+        status: of both answers, of the parser.
+        messages: the text of both questions.
+    """
+
+    twin: str
+    role: str
+    episode: int
+    scene: str
+    viewer: str
+    p: tuple[float, ...] | None
+    q: tuple[float, ...] | None
+    distance: float | None
+    holds: bool
+    said: tuple[str, str]
+    status: tuple[str, str]
+    messages: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Row:
+    """The result of one twin in one role.
+
+    Attributes:
+        twin: the twin.
+        role: who was asked.
+        episodes: how many episodes the pairs are of.
+        invariance_rate: share of pairs that hold; n is the pairs.
+        tv_distance: mean total variation; n is the pairs whose two answers were parsed.
+        failed_rate: share of pairs in which an answer failed.
+        broken: pairs that do not hold, the farthest apart first, those that failed last.
+    """
+
+    twin: Twin
+    role: str
+    episodes: int
+    invariance_rate: Estimate
+    tv_distance: Estimate
+    failed_rate: Estimate
+    broken: tuple[Pair, ...]
+
+
+def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
+    """Total variation between two distributions, 0 to 1; None where one is missing."""
+    return float(np.abs(np.subtract(p, q)).sum() / 2) if p and q else None
+
+
+def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
+    """Whether what a twin declares holds of two distributions; not where one is missing."""
+    if not p or not q:
+        return False
+    if twin.within is not None:
+        return (distance(p, q) or 0.0) <= twin.within + ROUNDING
+    return int(np.argmax(p)) == int(np.argmax(q))
+
+
+def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
+    """A row a twin and role that was asked."""
+    return [
+        _row(twin, role, of)
+        for twin in twins
+        for role in ROLES
+        if (of := [pair for pair in pairs if (pair.twin, pair.role) == (twin.name, role)])
+    ]
+
+
+def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
+    episodes = np.array([pair.episode for pair in pairs])
+    apart = np.array([np.nan if pair.distance is None else pair.distance for pair in pairs])
+    broken = sorted((pair for pair in pairs if not pair.holds), key=lambda pair: -(pair.distance or 0.0))
+    return Row(
+        twin, role, len(np.unique(episodes)),
+        rate_interval(np.array([float(pair.holds) for pair in pairs]), episodes),
+        rate_interval(apart, episodes),  # a distance is from 0 to 1, too
+        rate_interval(np.isnan(apart).astype(float), episodes),
+        tuple(broken),
+    )  # fmt: skip
+
+
+def headline(table: Sequence[Row]) -> str:
+    """The result in a sentence."""
+    whole = sum(not row.broken for row in table)
+    least = min(table, key=lambda row: row.invariance_rate.value)
+    if not least.broken:
+        return f"All {len(table)} twins and roles hold in every question."
+    rate = least.invariance_rate
+    return (
+        f"{whole} of {len(table)} twins and roles hold in every question. Least often {least.twin.name}, "
+        f"{least.role}: {100 * rate.value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}."
+    )
+
+
+def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
+    """Hold a gate against the rows of its twin, in every role; of all twins if it names none.
+
+    Raises:
+        UserError: its twin has no row, or its number is not known.
+    """
+    shown = f"--fail-if {printable(gate.text)!r}"
+    of = [row for row in table if gate.condition in (None, row.twin.name)]
+    if not of:
+        raise unknown(f"twin of {shown}", gate.condition or "", {row.twin.name for row in table})
+    failed = []
+    for row in of:
+        value, where = float(getattr(getattr(row, gate.metric), gate.end)), f"{row.twin.name}, {row.role}"
+        if np.isnan(value):
+            # A gate that passes because nothing is known would guard nothing.
+            raise UserError(f"{shown}: {where} has no such number; ask about more episodes")
+        if OPERATORS[gate.op](round(value, 9), gate.number):
+            failed.append((where, value))
+    return Verdict(gate.text, tuple(failed))
