@@ -1,18 +1,20 @@
 """`harness twins`: metamorphic tests of a prompt."""
 
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json, table
+from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.run import free_folder
 from harness.core import resources, work
 from harness.core.errors import printable, unknown
 
 if TYPE_CHECKING:
+    from harness.report.compare.gate import Verdict
     from harness.studies.twins.scoring import Row
 
 EPISODES = 12  # that are drawn where nothing is said
@@ -68,9 +70,6 @@ def command(
         if name not in TWINS:
             raise unknown("--twin", name, TWINS)
     gates = [gate(typed, scoring.METRICS, "mirrored:invariance_rate < 0.9") for typed in fail_if or ()]
-    for each in gates:
-        if each.condition not in (None, *(twin or TWINS)):
-            raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), twin or TWINS)
     whole = load.load(load.find(dataset), None if sample else limit)
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
@@ -89,6 +88,10 @@ def command(
         dtype=dtype,
     )
     study = asking.Study(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
+    able = [name for name in study.twins if asking.lack(spec, TWINS[name]) is None]
+    for each in gates:
+        if each.condition not in (None, *able):
+            raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), able)
     where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
     cache, label = None if no_cache else default_file(), f"asking {printable(spec.card.name, 30)}, episodes"
     with bar(label, len(study.points()), as_json or quiet) as progress:
@@ -108,16 +111,17 @@ def command(
         typer.echo(
             f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
             "intervals over episodes\n"
-            "n: questions that the twin changes; fail%: an answer failed, so that nothing holds"
+            "n: questions that the twin changes; fail%: an answer failed, so nothing holds"
         )
-        typer.echo(scoring.headline(rows))
-        for name, needs in page.missing(study, rows).items():
-            typer.echo(f"left out: {name} needs {needs}")
-        for verdict in verdicts:
-            failed = "; ".join(f"{at}: {value:.3f}" for at, value in verdict.failed)
-            typer.echo(f"gate {printable(verdict.gate)}: {f'fails, {failed}' if failed else 'passes'}")
+        for said in (scoring.headline(rows), *page.notes(study, rows), *map(_judged, verdicts)):
+            typer.echo(fill(said, WIDTH))
         typer.echo(f"wrote {printable(written)}")
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
+
+
+def _judged(verdict: "Verdict") -> str:
+    failed = "; ".join(f"{where} ({value:.3f})" for where, value in verdict.failed)
+    return f"FAILED: {verdict.gate} in {failed}" if failed else f"passed: {verdict.gate}"
 
 
 def _cells(row: "Row") -> tuple[str, ...]:

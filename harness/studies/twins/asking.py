@@ -103,9 +103,7 @@ def lack(spec: Spec, twin: Twin) -> str | None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
     if not language_model and twin.of_text:
         return "a language model"
-    if twin.senders and spec.answer == "readout":
-        return "messages, which no readout gives"
-    return None
+    return twin.needs if spec.answer not in twin.modes else None
 
 
 def ask(
@@ -161,21 +159,23 @@ def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Se
         return cached(_opened(spec.card, spec.device, spec.dtype, spec.batch_size), spec.card, cache)
 
     asker = Asker(spec, backend, PAPER, place / f"answers-{number:06d}.jsonl")
+    twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
     questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
-    first = {request.id: request for of in questions.values() for request in of}
-    asker.ask(list(first.values()))
+    # Fusion calls have the helpers' messages, which are there first.
+    first = [each for of in questions.values() for each in of if any(twin.senders for twin in twins)]
+    asker.ask(first)
     asked = [
         each
         for scene in scenes
-        for twin in map(TWINS.__getitem__, study.twins)
-        if lack(spec, twin) is None
+        for twin in twins
         for each in (
             _fusion(spec, twin, scene, asker.answers)
             if twin.senders
             else _twins(spec, twin, scene, questions[scene.id])
         )
     ]
-    then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in first}
+    known = {request.id for request in first}
+    then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known}
     asker.ask(list(then.values()))
     return [_pair(spec, each, number, asker.answers) for each in asked]
 

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from harness.backends.base import Request
+from harness.backends.base import AnswerMode, Request
 from harness.core import noise
 from harness.dataset.load import Scene
 from harness.evaluate.spec import Spec
@@ -46,6 +46,7 @@ class Twin:
         view: the same for who reads the graph and no text.
         senders: whose messages a fusion call has, `(senders)`, in the place of these.
         actions: the question's name for an action of the twin, where it is another.
+        modes: answer modes in which it applies.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Twin:
     view: Callable[[Graph], Graph] | None = None
     senders: Callable[[Sequence[str]], Sequence[str]] | None = None
     actions: Mapping[str, str] | None = None
+    modes: tuple[str, ...] = get_args(AnswerMode)
 
     @property
     def of_text(self) -> bool:
@@ -268,8 +270,6 @@ def _closing(text: str, start: int) -> int:
 
 def permuted_letters(spec: Spec, request: Request) -> Request:
     """Each letter of a read-out stands for the next action, the first for the last."""
-    if request.answer != "readout":
-        return request
     moved = (*request.actions[-1:], *request.actions[:-1])
     old, new = (readout.asked([{"content": ""}], of)[0]["content"] for of in (request.actions, moved))
     return replace(_reworded(request, lambda text: text.replace(old, new)), actions=moved)
@@ -307,15 +307,15 @@ _DECLARED = (
     ),
     Twin(
         "letters", "letters of the read-out stand for other actions", "--answer readout",
-        text=permuted_letters,
+        text=permuted_letters, modes=("readout",),
     ),
     Twin(
-        "message-order", "the helpers' messages in another order", "fusion calls with two messages",
-        senders=lambda senders: senders[::-1],
+        "message-order", "the helpers' messages in another order", "fusion calls, not of a readout",
+        senders=lambda senders: senders[::-1], modes=("json", "constrained"),
     ),
     Twin(
-        "message-twice", "one helper's message twice", "fusion calls with a message",
-        senders=lambda senders: [*senders, *senders[:1]],
+        "message-twice", "one helper's message twice", "fusion calls, not of a readout",
+        senders=lambda senders: [*senders, *senders[:1]], modes=("json", "constrained"),
     ),
 )  # fmt: skip
 TWINS = {twin.name: twin for twin in _DECLARED}

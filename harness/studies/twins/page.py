@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 from markupsafe import Markup, escape
 
+from harness.backends.registry import capabilities
+from harness.core.errors import printable
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import versions
@@ -31,7 +33,7 @@ def write(
     lines = [{k: v for k, v in asdict(pair).items() if k != "messages"} for pair in pairs]
     write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     page = environment(TEMPLATES).get_template("twins.html.j2").render(
-        study=study, spec=study.spec, rows=rows, headline=headline(rows), missing=missing(study, rows),
+        study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows),
         points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, cell=cell, difference=difference,
     )  # fmt: skip
     write_whole(out / "index.html", page)
@@ -71,6 +73,17 @@ def missing(study: Study, rows: Sequence[Row]) -> dict[str, str]:
     """The twins that no question has, and what they need."""
     had = {row.twin.name for row in rows}
     return {n: lack(study.spec, TWINS[n]) or TWINS[n].needs for n in study.twins if n not in had}
+
+
+def notes(study: Study, rows: Sequence[Row]) -> list[str]:
+    """What a reader must know besides the rows."""
+    who, by_need = printable(study.spec.card.name), dict[str, list[str]]()
+    for name, need in missing(study, rows).items():
+        by_need.setdefault(need, []).append(name)
+    said = [f"left out, since there is none here: {', '.join(of)} ({need})" for need, of in by_need.items()]
+    if not capabilities(study.spec.card.engine).language_model:
+        said.insert(0, f"{who} reads the scene and not the text, so this says nothing about the prompt")
+    return said
 
 
 def cell(estimate: Estimate, scale: float, decimals: int) -> str:
