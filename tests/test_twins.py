@@ -28,6 +28,7 @@ from harness.studies.twins.asking import Study
 from harness.studies.twins.declared import TWINS, changed
 from harness.studies.twins.scoring import METRICS, Pair
 from harness.world import scenarios
+from harness.world.planner import plan
 
 SHIPPED = sorted(path.parent.name for path in folder("datasets").glob("*/manifest.json"))
 GRAPHS = [name for name, twin in TWINS.items() if twin.graph and not twin.text]
@@ -83,14 +84,22 @@ def asked(spec: Spec, out: Path, *names: str) -> list[scoring.Row]:
 
 
 def leaves(value: Any, *keys: str) -> list[Any]:
-    """The values of these keys, in order; of all others if none is named."""
+    """The values of these keys, in order."""
     found: list[Any] = []
-    changed(value, lambda key, leaf: found.append(leaf) if (key in keys) else None)
+
+    def leaf(key: str, value: Any) -> None:
+        if key in keys:
+            found.append(value)
+
+    changed(value, leaf)
     return found
 
 
 def renamed(graph: Mapping[str, Any], to: Mapping[str, str]) -> Any:
-    return changed(graph, lambda key, value: to.get(value, value) if key in declared.NAMES else value)
+    def leaf(key: str, value: Any) -> Any:
+        return to.get(value, value) if key in declared.NAMES else value
+
+    return changed(graph, leaf)
 
 
 # What a twin changes, and what it leaves
@@ -127,6 +136,22 @@ def test_an_oncoming_left_turn_has_no_mirrored_twin(crossing: Dataset) -> None:
     assert all(graph == twin for graph, twin in turns)
 
 
+def test_the_planner_mirrors_at_the_intersection_and_keeps_right_on_the_motorway() -> None:
+    """The counts of docs/decisions/0038."""
+    held = {}
+    for name in ("occluded-intersection-v2", "hard-brake-ahead-v1"):
+        dataset = load(folder("datasets") / name, 8)
+        scenario, paths, said = dataset.scenario, dataset.scenario.road().paths, list[bool]()
+        for scene in dataset.scenes(dataset.courses()[::2]):
+            for graph in scene.record["graphs"].values():
+                twin = declared.swapped(graph)
+                if all((c["sector"], c["route"]) in paths for c in twin["conflicts"]):
+                    action = plan(scenario, twin)
+                    said.append(declared.LANES.get(action, action) == plan(scenario, graph))
+        held[name] = sum(said), len(said)
+    assert held == {"occluded-intersection-v2": (162, 162), "hard-brake-ahead-v1": (181, 200)}
+
+
 @pytest.mark.parametrize("scenario", scenarios.names())
 def test_every_scenario_that_ships_says_whether_it_may_be_mirrored(scenario: str) -> None:
     found = scenarios.get(scenario)
@@ -147,10 +172,7 @@ def test_permuted_names_are_the_same_vehicles(family: Dataset) -> None:
             for old, new in zip(leaves(graph, *keys), leaves(twin, *keys), strict=True):
                 assert named.setdefault(old, new) == new  # alike in all graphs of a scene
                 assert old != new
-            back = {new: old for old, new in named.items()}
-            assert (
-                changed(twin, lambda key, v, to=back: to.get(v, v) if key in declared.NAMES else v) == graph
-            )
+            assert renamed(twin, {new: old for old, new in named.items()}) == graph
         assert set(named) <= set(own)
         assert set(named.values()) <= set(own)
 

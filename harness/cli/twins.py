@@ -69,7 +69,9 @@ def command(
     for name in twin or ():
         if name not in TWINS:
             raise unknown("--twin", name, TWINS)
-    gates = [gate(typed, scoring.METRICS, "mirrored:invariance_rate < 0.9") for typed in fail_if or ()]
+    gates = [
+        gate(typed, scoring.METRICS, "TWIN", "mirrored:invariance_rate < 0.9") for typed in fail_if or ()
+    ]
     whole = load.load(load.find(dataset), None if sample else limit)
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))

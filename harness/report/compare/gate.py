@@ -50,13 +50,17 @@ class Verdict:
     failed: tuple[tuple[str, float], ...]
 
 
-def gate(text: str, names: Sequence[str] = NAMES, example: str = "6g:success_rate < -0.01") -> Gate:
+def gate(
+    text: str, names: Sequence[str] = NAMES, place: str = "CONDITION",
+    example: str = "6g:success_rate < -0.01",
+) -> Gate:  # fmt: skip
     """A gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
     Args:
         text: as it was typed.
         names: the metrics there are.
-        example: of a gate, for the error.
+        place: what stands before the colon, and
+        example: of a gate, both for the error.
 
     Raises:
         UserError: it cannot be read, or names no metric that there is.
@@ -68,7 +72,7 @@ def gate(text: str, names: Sequence[str] = NAMES, example: str = "6g:success_rat
         number = math.nan
     if not match or not math.isfinite(number):
         raise UserError(
-            f"--fail-if {printable(text)!r} cannot be read; give [NAME:]METRIC[.low|.high] OP NUMBER "
+            f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
     if match["metric"] not in names:
