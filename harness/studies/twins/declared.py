@@ -139,7 +139,7 @@ def far_vehicle(spec: Spec, scene: Scene, graph: Graph) -> Graph:
     own_mps = graph["self"]["speed_mps"]
     node = {
         "id": f"v{max(used) + 1}", "type": "vehicle", "forward_m": away if ahead else -away, "left_m": 0.0,
-        "heading_deg": None, "speed_mps": 0.0, "range_rate_mps": -own_mps if ahead else own_mps,
+        "heading_deg": None, "speed_mps": 0.0, "range_rate_mps": 0 - own_mps if ahead else own_mps,
         "lane": "off-lane", "indicator": None, "sensors": ["radar"],
         **({"braking": None} if spec.scenario.brake_lamps else {}),
     }  # fmt: skip
