@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import Scripted, failed, says, spec_of
+from evaluating import Scripted, failed, says, spec_of, with_ego
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -240,8 +240,9 @@ def test_units_change_in_values_and_in_words(crossing: Dataset) -> None:
 
 def test_units_leave_a_prompt_alone_whose_own_numbers_have_some(crossing: Dataset) -> None:
     spec = spec_for(crossing, "swarm-tiny")
-    text = spec.prompt.texts["ego"].replace("Collisions are worst", "Within 12 m brake. Collisions are worst")
-    spec = replace(spec, prompt=replace(spec.prompt, texts={**spec.prompt.texts, "ego": text}))
+    texts_of = spec.ego.prompt.texts
+    text = texts_of["ego"].replace("Collisions are worst", "Within 12 m brake. Collisions are worst")
+    spec = with_ego(spec, prompt=replace(spec.ego.prompt, texts={**texts_of, "ego": text}))
     old, new = texts(spec, "units", scenes_in(crossing)[0], "v1")
     assert old == new
 

@@ -58,6 +58,7 @@ def command(
     from harness.backends.cache import default_file
     from harness.dataset import load
     from harness.dataset.select import Selection
+    from harness.evaluate.agent import Agent
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
@@ -78,13 +79,12 @@ def command(
     selection = Selection(limit, sample=sample, sample_seed=sample_seed)
     source = FrozenSource(selection.of(whole), selection)
     spec = Spec(
-        card=cards.resolve(model, engine),
-        prompt=versions.load(prompt or source.scenario.prompt),
-        source=source,
+        Agent(
+            cards.resolve(model, engine), versions.load(prompt or source.scenario.prompt), answer, thinking
+        ),
+        source,
         points=(),
         seeds=(0,),
-        thinking=thinking,
-        answer=answer,
         batch_size=batch_size,
         device=device,
         dtype=dtype,
@@ -95,7 +95,10 @@ def command(
         if each.condition not in (None, *able):
             raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), able)
     where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
-    cache, label = None if no_cache else default_file(), f"asking {printable(spec.card.name, 30)}, episodes"
+    cache, label = (
+        None if no_cache else default_file(),
+        f"asking {printable(spec.ego.card.name, 30)}, episodes",
+    )
     with bar(label, len(study.points()), as_json or quiet) as progress:
         pairs = asking.ask(study, where, progress, cache, workers)
     with work.going_on(where):
@@ -106,9 +109,7 @@ def command(
     if as_json:
         echo_json(page.mapping(study, rows, verdicts))
     elif not quiet:
-        typer.echo(
-            f"{printable(spec.card.name)} · prompt {spec.prompt.version} · {spec.answer} · {source.name}"
-        )
+        typer.echo(f"{printable(spec.ego.name)} · {source.name}")
         table(HEADS, map(_cells, rows), tight=True)
         typer.echo(
             f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "

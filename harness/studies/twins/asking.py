@@ -11,7 +11,7 @@ import msgspec
 from harness.backends.base import Backend, Request
 from harness.backends.cache import cached
 from harness.backends.cards import Card
-from harness.backends.registry import capabilities, open_backend
+from harness.backends.registry import open_backend
 from harness.core import noise, work
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
@@ -45,11 +45,11 @@ class Study:
     seed: int
 
     def __post_init__(self) -> None:
-        card = self.spec.card
-        shown = f"--model {printable(card.name)}"
-        if not capabilities(card.engine).closed_loop:
+        ego = self.spec.ego
+        shown = f"--model {printable(ego.card.name)}"
+        if not ego.can.closed_loop:
             raise UserError(f"{shown}: a replay has no answers to twins; give the model that it replays")
-        if card.privileged:
+        if ego.card.privileged:
             raise UserError(f"{shown} reads the truth, which no twin changes; give local-view or a model")
         if not any(lack(self.spec, TWINS[name]) is None for name in self.twins):
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
@@ -98,12 +98,12 @@ class Study:
 
 def lack(spec: Spec, twin: Twin) -> str | None:
     """What a twin needs that this evaluation never has; None where some question may have it."""
-    language_model = capabilities(spec.card.engine).language_model
+    language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
     if not language_model and twin.of_text:
         return "a language model"
-    return twin.needs if spec.answer not in twin.modes else None
+    return twin.needs if spec.ego.answer not in twin.modes else None
 
 
 def ask(
@@ -117,7 +117,7 @@ def ask(
     Args:
         study: what is asked.
         out: folder of the result.
-        progress: called with the number of decision points just done.
+        progress: called with 1 for each episode that is done.
         cache: file of completions kept between runs; None for no cache.
         workers: processes, each with a backend of its own.
 
@@ -127,7 +127,8 @@ def ask(
     if (out / RESULT).exists():
         raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
     # Compiled templates do not travel between processes.
-    study = replace(study, spec=replace(study.spec, prompt=replace(study.spec.prompt)))
+    ego = replace(study.spec.ego, prompt=replace(study.spec.ego.prompt))
+    study = replace(study, spec=replace(study.spec, ego=ego))
     [identity] = spread(_identity, [study.spec], workers, lambda done: None)
     begun = study.begin(identity)
     if left := work.begun(out, work.Begun):
@@ -141,7 +142,7 @@ def ask(
 
 
 def _identity(spec: Spec) -> str:
-    return digest(_opened(spec.card, spec.device, spec.dtype, spec.batch_size).identity())
+    return digest(_opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size).identity())
 
 
 @lru_cache(maxsize=1)
@@ -156,7 +157,7 @@ def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Se
     scenes = study.dataset.scenes(ids)
 
     def backend() -> Backend:
-        return cached(_opened(spec.card, spec.device, spec.dtype, spec.batch_size), spec.card, cache)
+        return cached(_opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
 
     asker = Asker(spec, backend, PAPER, place / f"answers-{number:06d}.jsonl")
     twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
@@ -187,7 +188,7 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
         graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
     others = requests(spec, [_named(scene, twin, graphs=graphs)])
     for question, other in zip(questions, others, strict=True):
-        if capabilities(spec.card.engine).language_model:
+        if spec.ego.can.language_model:
             other = twin.text(spec, other) if twin.text else other
             differ = _differ(question, other)
         else:

@@ -192,7 +192,7 @@ def _in_feet(key: str, value: Any) -> Any:
 
 def _says_units(spec: Spec, role: str) -> bool:
     """Whether a template has both units, and no number of its own with one, but for the target speeds."""
-    fixed = PLACEHOLDER.sub("", spec.prompt.texts[role]).replace(f"{_speeds(spec, 1.0)} m/s", "m/s")
+    fixed = PLACEHOLDER.sub("", spec.ego.prompt.texts[role]).replace(f"{_speeds(spec, 1.0)} m/s", "m/s")
     return all(re.search(unit, fixed) for unit in ("m/s", r"\bm\b(?!/)")) and not re.search(
         r"\d\s*m\b", fixed
     )

@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 from markupsafe import Markup, escape
 
-from harness.backends.registry import capabilities
 from harness.core.errors import printable
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
@@ -53,8 +52,7 @@ def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> d
     ]  # fmt: skip
     gates = [{"gate": verdict.gate, "failed": dict(verdict.failed)} for verdict in verdicts]
     return {
-        "model": study.spec.card.name, "prompt": study.spec.prompt.version, "answer": study.spec.answer,
-        "world": msgspec.to_builtins(study.spec.source.record()), "seed": study.seed,
+        **study.spec.ego.settings(), "world": msgspec.to_builtins(study.spec.source.record()), "seed": study.seed,
         "decision_points": decision_points(study), "rows": table, "left_out": missing(study, rows),
         "gates": gates,
     }  # fmt: skip
@@ -77,11 +75,11 @@ def missing(study: Study, rows: Sequence[Row]) -> dict[str, str]:
 
 def notes(study: Study, rows: Sequence[Row]) -> list[str]:
     """What a reader must know besides the rows."""
-    who, by_need = printable(study.spec.card.name), dict[str, list[str]]()
+    who, by_need = printable(study.spec.ego.card.name), dict[str, list[str]]()
     for name, need in missing(study, rows).items():
         by_need.setdefault(need, []).append(name)
     said = [f"left out, since there is none here: {', '.join(of)} ({need})" for need, of in by_need.items()]
-    if not capabilities(study.spec.card.engine).language_model:
+    if not study.spec.ego.can.language_model:
         said.insert(0, f"{who} reads the scene and not the text, so this says nothing about the prompt")
     return said
 
