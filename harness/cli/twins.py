@@ -14,7 +14,6 @@ from harness.core import resources, work
 from harness.core.errors import printable, unknown
 
 if TYPE_CHECKING:
-    from harness.report.compare.gate import Verdict
     from harness.studies.twins.scoring import Row
 
 EPISODES = 12  # that are drawn where nothing is said
@@ -63,6 +62,7 @@ def command(
     from harness.evaluate.spec import Spec
     from harness.prompts import versions
     from harness.report.compare.gate import gate
+    from harness.report.compare.words import judged
     from harness.studies.twins import asking, page, scoring
     from harness.studies.twins.declared import TWINS
 
@@ -70,18 +70,16 @@ def command(
     for name in twin or ():
         if name not in TWINS:
             raise unknown("--twin", name, TWINS)
-    gates = [
-        gate(typed, scoring.METRICS, "TWIN", "mirrored:invariance_rate < 0.9") for typed in fail_if or ()
-    ]
+    example = "mirrored:invariance_rate < 0.9"
+    gates = [gate(typed, scoring.METRICS, "TWIN", example) for typed in fail_if or ()]
     whole = load.load(load.find(dataset), None if sample else limit)
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
     selection = Selection(limit, sample=sample, sample_seed=sample_seed)
     source = FrozenSource(selection.of(whole), selection)
+    version = versions.load(prompt or source.scenario.prompt)
     spec = Spec(
-        Agent(
-            cards.resolve(model, engine), versions.load(prompt or source.scenario.prompt), answer, thinking
-        ),
+        Agent(cards.resolve(model, engine), version, answer, thinking),
         source,
         points=(),
         seeds=(0,),
@@ -95,12 +93,9 @@ def command(
         if each.condition not in (None, *able):
             raise unknown(f"twin of --fail-if {printable(each.text)!r}", str(each.condition), able)
     where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
-    cache, label = (
-        None if no_cache else default_file(),
-        f"asking {printable(spec.ego.card.name, 30)}, episodes",
-    )
+    label = f"asking {printable(spec.ego.card.name, 30)}, episodes"
     with bar(label, len(study.points()), as_json or quiet) as progress:
-        pairs = asking.ask(study, where, progress, cache, workers)
+        pairs = asking.ask(study, where, progress, None if no_cache else default_file(), workers)
     with work.going_on(where):
         rows = scoring.rows(pairs, [TWINS[name] for name in study.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]
@@ -116,15 +111,11 @@ def command(
             "intervals over episodes\n"
             "n: questions that the twin changes; fail%: an answer failed, so nothing holds"
         )
-        for said in (scoring.headline(rows), *page.notes(study, rows), *map(_judged, verdicts)):
+        gated = (judged(verdict, "-") for verdict in verdicts)
+        for said in (scoring.headline(rows), *page.notes(study, rows), *gated):
             typer.echo(fill(said, WIDTH))
         typer.echo(f"wrote {printable(written)}")
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
-
-
-def _judged(verdict: "Verdict") -> str:
-    failed = "; ".join(f"{where} ({value:.3f})" for where, value in verdict.failed)
-    return f"FAILED: {verdict.gate} in {failed}" if failed else f"passed: {verdict.gate}"
 
 
 def _cells(row: "Row") -> tuple[str, ...]:

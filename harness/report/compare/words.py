@@ -203,9 +203,9 @@ def settings(comparison: Comparison) -> list[str]:
     return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in comparison.settings]
 
 
-def judged(verdict: Verdict) -> str:
-    """What became of a gate."""
+def judged(verdict: Verdict, sign: str = "+") -> str:
+    """What became of a gate; `sign` is the format's, of values that are no differences `-`."""
     gate = printable(verdict.gate)
     if not verdict.failed:
         return f"passed: {gate}"
-    return f"FAILED: {gate} in " + ", ".join(f"{name} ({value:+.4g})" for name, value in verdict.failed)
+    return f"FAILED: {gate} in " + ", ".join(f"{name} ({value:{sign}.4g})" for name, value in verdict.failed)

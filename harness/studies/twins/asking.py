@@ -163,7 +163,8 @@ def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Se
     twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
     questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
     # Fusion calls have the helpers' messages, which are there first.
-    first = [each for of in questions.values() for each in of if any(twin.senders for twin in twins)]
+    fused = any(twin.senders for twin in twins)
+    first = [request for of in questions.values() for request in of] if fused else []
     asker.ask(first)
     asked = [
         each

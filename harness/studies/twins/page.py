@@ -15,6 +15,7 @@ from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import versions
 from harness.report.compare.gate import Verdict
+from harness.report.compare.words import judged
 from harness.report.page import environment, visible
 from harness.studies.twins.asking import RESULT, Study, lack
 from harness.studies.twins.declared import TWINS
@@ -33,7 +34,8 @@ def write(
     write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     page = environment(TEMPLATES).get_template("twins.html.j2").render(
         study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows),
-        points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, cell=cell, difference=difference,
+        points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, judged=judged, cell=cell,
+        difference=difference,
     )  # fmt: skip
     write_whole(out / "index.html", page)
     content = {"format": FORMAT, **mapping(study, rows, verdicts), "versions": versions()}
@@ -50,11 +52,11 @@ def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> d
         }
         for row in rows
     ]  # fmt: skip
-    gates = [{"gate": verdict.gate, "failed": dict(verdict.failed)} for verdict in verdicts]
+    gates = [{"gate": v.gate, "passed": not v.failed, "failed": dict(v.failed)} for v in verdicts]
     return {
-        **study.spec.ego.settings(), "world": msgspec.to_builtins(study.spec.source.record()), "seed": study.seed,
-        "decision_points": decision_points(study), "rows": table, "left_out": missing(study, rows),
-        "gates": gates,
+        **study.spec.ego.settings(), "world": msgspec.to_builtins(study.spec.source.record()),
+        "seed": study.seed, "decision_points": decision_points(study), "rows": table,
+        "left_out": missing(study, rows), "gates": gates,
     }  # fmt: skip
 
 

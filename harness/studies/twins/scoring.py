@@ -133,7 +133,7 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
         raise unknown(f"twin of {shown}", gate.condition or "", {row.twin.name for row in table})
     failed = []
     for row in of:
-        value, where = float(getattr(getattr(row, gate.metric), gate.end)), f"{row.twin.name}, {row.role}"
+        value, where = float(getattr(getattr(row, gate.metric), gate.end)), f"{row.twin.name} {row.role}"
         if np.isnan(value):
             # A gate that passes because nothing is known would guard nothing.
             raise UserError(f"{shown}: {where} has no such number; ask about more episodes")
