@@ -1,25 +1,33 @@
 """`harness prompt`: the versions, the text a model is sent, and its token budget."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import echo_json
+from harness.cli.estimates import console, echo_json
 from harness.cli.progress import bar
 from harness.core import resources
 from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
     from harness.dataset.load import Scene
+    from harness.prompts.difference import TextChange
 
 FUSION = "fusion"  # the ego's call with messages
+NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
+COLOURS = {"same": "", "removed": "red", "added": "green"}
 
-app = typer.Typer(help="List prompt versions; show, check or release one.", no_args_is_help=True)
+app = typer.Typer(
+    help="List prompt versions; show, check or release one, or show what differs between two.",
+    no_args_is_help=True,
+)
 
 Version = Annotated[str, typer.Argument(help="Prompt version.")]
+Tokenizer = Annotated[Path | None, typer.Option(help="tokenizer.json, its folder, or a Qwen2 GGUF.")]
 
 
 @app.command("list")
@@ -80,7 +88,7 @@ def show(
 def check(
     version: Version,
     dataset: options.Dataset = resources.DATASET,
-    tokenizer: Path | None = typer.Option(None, help="tokenizer.json, its folder, or a Qwen2 GGUF."),
+    tokenizer: Tokenizer = None,
     as_json: options.Json = False,
 ) -> None:
     """Render every prompt of every scene and count tokens. Exit code 1 if one is outside the budget.
@@ -129,9 +137,7 @@ def check(
         for role, s in stats.items():
             typer.echo(f"{role:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
         if not count:
-            typer.echo(
-                "tokens not counted: give --tokenizer (the model's tokenizer.json, its folder, or a GGUF)"
-            )
+            typer.echo(NOT_COUNTED)
         if outside:
             total = sum(map(len, sizes.values()))
             typer.echo(f"outside the budget: {len(outside)} of {total} prompts; the first are")
@@ -140,6 +146,66 @@ def check(
             typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}: {o['tokens']} tokens")
     if outside:
         raise typer.Exit(1)
+
+
+@app.command()
+def diff(
+    a: Annotated[str, typer.Argument(help="Prompt version.", metavar="A")],
+    b: Annotated[str, typer.Argument(help="The version that is compared with it.", metavar="B")],
+    scene: str | None = typer.Option(None, help="Scene id, such as 00003-0. Default: the dataset's first."),
+    dataset: options.Dataset = resources.DATASET,
+    tokenizer: Tokenizer = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show what differs between two versions, word by word: settings, templates, and what a model is sent.
+
+    A scene is rendered for the ego, for its first helper, and for the ego with the messages of all.
+    """
+    from harness.backends.tokens import counter
+    from harness.dataset import load
+    from harness.prompts import difference
+    from harness.prompts import versions as prompts
+
+    before, after, data = prompts.load(a), prompts.load(b), load.load(load.find(dataset))
+    at = data.scene(scene or next(iter(data.forest.place)))
+    change = difference.change(before, after)
+    sent = difference.sent(before, after, at, data.scenario, counter(tokenizer))
+    if as_json:
+        about = ("version", "sha256", "released")
+        sides = {key: {name: getattr(p, name) for name in about} for key, p in (("a", before), ("b", after))}
+        echo_json({**sides, **asdict(change), "scene": at.id, "sent": [asdict(one) for one in sent]})
+        return
+    typer.echo(f"{a} → {b}: {'differ' if change else 'the same settings and texts'}")
+    for name, *values in change.settings:
+        typer.echo(f"  {name:<26}{' → '.join('none' if v is None else str(v) for v in values)}")
+    for file, text in change.texts.items():
+        _changed(file, text)
+    typer.echo(f"\nsent in scene {at.id}")
+    if sent[0].tokens is None:
+        typer.echo(NOT_COUNTED)
+    for one in sent:
+        counts = {"words": one.words, "tokens": one.tokens}
+        sizes = ", ".join(
+            f"{n[0]} → {n[1]} {unit} ({n[1] - n[0]:+d})" for unit, n in counts.items() if n is not None
+        )
+        typer.echo(f"\n{one.viewer} {one.role}: {sizes}")
+        for part, text in one.parts.items():
+            _changed(part, text)
+
+
+def _changed(what: str, text: "TextChange") -> None:
+    """Print what differs between two texts, coloured in a terminal."""
+    from rich.text import Text
+
+    from harness.prompts.difference import marked
+
+    if not text.hunks:
+        typer.echo(f"{what}: the same")
+        return
+    typer.echo(f"{what}: {text.removed} words removed, {text.added} added")
+    for hunk in text.hunks:
+        typer.echo(f"@@ line {hunk.line_a} → {hunk.line_b}")
+        console().print(Text.assemble(*((piece, COLOURS[kind]) for kind, piece in marked(hunk))))
 
 
 @app.command()
