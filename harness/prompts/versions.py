@@ -250,6 +250,15 @@ def load(version: str, where: Path | None = None) -> Prompt:
     )
 
 
+def as_it_was(version: str, sha256: str) -> Prompt | None:
+    """A version if its files here have this digest; None if they have not, or it is not here."""
+    try:
+        prompt = load(version)
+    except UserError:
+        return None
+    return prompt if prompt.sha256 == sha256 else None
+
+
 def lock(version: str, where: Path | None = None) -> str:
     """Release a version: pin its digest. Returns the digest."""
     prompt = load(version, where)

@@ -39,12 +39,10 @@ def prompts_of(run: Run) -> Sent | None:
     """Gives the chat messages that a viewer was sent; None if a prompt of the run is not here as it was."""
     manifest, prompts = run.manifest, dict[str, versions.Prompt]()
     for agent in (manifest.agent(0), *manifest.helpers):
-        version = agent["prompt"]["version"]
-        if version not in versions.names():
+        prompt = versions.as_it_was(agent["prompt"]["version"], agent["prompt"]["sha256"])
+        if prompt is None:
             return None
-        prompts[version] = versions.load(version)
-        if prompts[version].sha256 != agent["prompt"]["sha256"]:
-            return None
+        prompts[prompt.version] = prompt
 
     def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
         words = scenarios.get(scene.state.scenario).prompt_words

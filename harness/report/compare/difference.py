@@ -7,10 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
+from harness.core.errors import printable
 from harness.core.multiplicity import holm, p_of_bootstrap
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
+from harness.prompts.difference import PromptChange, change
+from harness.prompts.versions import as_it_was
 from harness.report.compare import percentiles
+from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
 from harness.report.compare.pair import Pair
 from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
 
@@ -64,6 +68,8 @@ class InCondition:
         test: of the difference in success; None for a single episode whose success depends on the seed.
         gained: episodes from failure to success.
         lost: episodes from success to failure.
+        decisions: how many both runs have.
+        flips: those whose action is another; what B's gave away first.
     """
 
     condition: str
@@ -71,6 +77,8 @@ class InCondition:
     test: SuccessTest | None
     gained: tuple[Flip, ...]
     lost: tuple[Flip, ...]
+    decisions: int
+    flips: tuple[DecisionFlip, ...]
 
 
 @dataclass(frozen=True)
@@ -81,7 +89,7 @@ class AnswersFlipped:
         role: of who answered: `ego`, `helper` or `merge`.
         a: verdict in A: `strict`, `recovered` or `failed`.
         b: verdict in B.
-        requests: their ids.
+        requests: their ids; first of decisions by which B gave success away, then of those by which A did.
     """
 
     role: str
@@ -100,6 +108,8 @@ class Comparison:
         conditions: what changed in each.
         answers: which answers changed their verdict.
         answers_in_both: answers by role that both runs have.
+        prompts: what differs between the texts; None where they are the same; a sentence that says why it is
+            not known.
     """
 
     pair: Pair
@@ -107,6 +117,7 @@ class Comparison:
     conditions: tuple[InCondition, ...]
     answers: tuple[AnswersFlipped, ...]
     answers_in_both: dict[str, int]
+    prompts: PromptChange | str | None
 
 
 def compare(pair: Pair) -> Comparison:
@@ -118,12 +129,31 @@ def compare(pair: Pair) -> Comparison:
         before, after = a[request].verdict, b[request].verdict
         if before != after:
             flipped.setdefault((a[request].role, before, after), []).append(request)
+    conditions = [_in_condition(pair, name) for name in pair.conditions]
+    lost = {f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)}
+    for requests in flipped.values():
+        requests.sort(key=lambda request: lost.get(a[request].scene, len(LOST_BY)))
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
-        conditions=_corrected([_in_condition(pair, name) for name in pair.conditions]),
+        conditions=_corrected(conditions),
         answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
         answers_in_both=dict(Counter(a[request].role for request in both)),
+        prompts=_prompts(pair),
+    )
+
+
+def _prompts(pair: Pair) -> PromptChange | str | None:
+    a, b = (side.run.manifest.prompt for side in (pair.a, pair.b))
+    if a["sha256"] == b["sha256"]:
+        return None
+    before, after = (as_it_was(prompt["version"], prompt["sha256"]) for prompt in (a, b))
+    if before and after:
+        return change(before, after)
+    name, lacks = ("B", b) if before else ("A", a)
+    return (
+        f"what differs between the prompts is not known: {name}'s {printable(lacks['version'], 40)} "
+        f"with sha256 {printable(lacks['sha256'], 13)} is not here"
     )
 
 
@@ -168,12 +198,15 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
         )
     ]  # fmt: skip
     a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
+    decisions, flipped = flips(pair, condition)
     return InCondition(
         condition=condition,
         differences=tuple(d for d in differences if d.change.n),
         test=success_test(a, b),
         gained=tuple(_flips(pair, condition, (a == 0) & (b == 1))),
         lost=tuple(_flips(pair, condition, (a == 1) & (b == 0))),
+        decisions=decisions,
+        flips=flipped,
     )
 
 

@@ -8,8 +8,11 @@ from urllib.parse import quote, urlencode
 import numpy as np
 from markupsafe import Markup
 
+from harness.core.errors import printable
+from harness.prompts.difference import marked
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip
+from harness.report.compare.flips import DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
 from harness.report.drawing import colours
@@ -19,6 +22,7 @@ from harness.runs.metrics import is_rate
 
 TEMPLATES = Path(__file__).parent / "templates"
 WIDTH, HEIGHT = 240, 22  # of one line of the forest plot
+RAW = 300  # characters of an answer
 Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
@@ -34,9 +38,17 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
                 asked = {"scene": scene, "condition": condition, "seed": flip.seeds[0]}
                 yield name, f"{where}#{urlencode(asked)}"
 
+    def decided(condition: str, flip: DecisionFlip) -> Iterator[tuple[str, str, str | None]]:
+        """Of each run: what its ego answered there alone, and where its page shows it."""
+        for name, side in (("A", pair.a), ("B", pair.b)):
+            asked = {"scene": flip.scene, "condition": condition, "seed": flip.seeds[0]}
+            where, answers = place(side.run), side.run.answers_by_scene.get(flip.scene, ())
+            raw = next((answer.raw for answer in answers if answer.role == "ego"), "nothing")
+            yield name, printable(raw, RAW), where and f"{where}#{urlencode(asked)}"
+
     return environment(TEMPLATES).get_template("compare.html.j2").render(
-        found=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links,
-        forest=_forest(comparison), palette=Markup(colours.variables()),
+        found=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links, decided=decided,
+        marked=marked, forest=_forest(comparison), palette=Markup(colours.variables()),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 from harness.core.errors import printable
+from harness.prompts.difference import PromptChange
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, InCondition
 from harness.report.compare.gate import Verdict
@@ -33,6 +34,7 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
     yield f"paired: {words.paired(pair)}"
     yield words.differing(comparison)
     yield from (f"  {setting}" for setting in words.settings(comparison))
+    yield from words.prompts(comparison)
     for c in comparison.conditions:
         label = printable(c.condition)
         if len(label) > 25:
@@ -44,6 +46,8 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
             yield f"{named:<27}{one.a:>7}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>9}"
         yield words.success(c, pair)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
+        yield words.decisions(c)
+        yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
     yield words.many(comparison)
     if not comparison.answers:
         yield "answers: none changed its verdict"
@@ -65,12 +69,15 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     for c in comparison.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
         said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
+        said += ["", words.decisions(c), ""]
+        said += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
         said += [""]
     said += [f"{words.many(comparison)}.", ""]
     said += ["<details><summary>Answers and settings</summary>", ""]
     said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
     said += [] if comparison.answers else ["- no answer changed its verdict"]
     said += [f"- {code(setting)}" for setting in words.settings(comparison)]
+    said += [f"- {code(line.strip())}" for line in words.prompts(comparison)]
     return "\n".join([*said, "", "</details>"])
 
 
@@ -115,6 +122,7 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
         "settings": [{"name": name, "a": a, "b": b} for name, a, b in comparison.settings],
+        "prompts": asdict(change) if isinstance(change := comparison.prompts, PromptChange) else change,
         "conditions": [_in_condition(c, most) for c in comparison.conditions],
         "answers_in_both": comparison.answers_in_both,
         "answers": [
@@ -143,7 +151,9 @@ def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
     for name, some in (("gained", c.gained), ("lost", c.lost)):
         listed = [asdict(t) for t in some[:most]]
         entry[name] = {"count": sum(len(t.seeds) for t in some), "episodes": len(some), "listed": listed}
-    return entry
+    flips = [asdict(flip) for flip in c.flips[:most]]
+    count = sum(len(flip.seeds) for flip in c.flips)
+    return {**entry, "flips": {"count": count, "of": c.decisions, "listed": flips}}
 
 
 def _number(value: float) -> float | None:

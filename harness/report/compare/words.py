@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 from harness.core.errors import printable
 from harness.core.multiplicity import LEVEL
+from harness.prompts.difference import marked
 from harness.report.caveats import no_prompt, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
+from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side
 from harness.report.words import p_value
@@ -21,6 +23,7 @@ NEITHER = {
 }  # fmt: skip
 BETTER, WORSE = "better", "worse"
 SIGNS = {BETTER: "✓", WORSE: "✗", "": ""}
+HUNKS = 3  # changes of a prompt's text that are shown beside the numbers
 # What a page shows first; the others are behind a fold.
 LEADING = (
     "success_rate",
@@ -163,8 +166,8 @@ def many(comparison: Comparison) -> str:
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """What a condition gained and what it lost, where it did: up to so many episodes of each."""
-    ways = (("gained", c.gained), ("lost", c.lost))
+    """What a condition lost and what it gained, where it did: up to so many episodes of each."""
+    ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
 
@@ -173,9 +176,56 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     said = []
     for t in some[:most]:
         how = t.a if t.b == "success" else t.b
-        seeds = "" if len(t.seeds) == len(pair.seeds) else f" (seeds {', '.join(map(str, t.seeds))})"
-        said.append(f"{t.episode} {how}{seeds}")
+        said.append(f"{t.episode} {how}{_seeds(t.seeds, pair)}")
     return _listed(said, len(some), most)
+
+
+def decisions(c: InCondition) -> str:
+    """How many decisions flipped, and in how many one run alone gave success away."""
+    n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
+    said = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both had"
+    return f"{said}; success given away by B alone in {n['B']}, by A alone in {n['A']}" if c.flips else said
+
+
+def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
+    """Decisions that flipped and gave success away in one run alone: up to so many of each run."""
+    kinds = {by: [flip for flip in c.flips if flip.lost_by == by] for by in ("B", "A")}
+    return [
+        (
+            f"given away by {by} alone",
+            _listed([decision_flip(flip, pair) for flip in some[:most]], len(some), most),
+        )
+        for by, some in kinds.items() if some
+    ]  # fmt: skip
+
+
+def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
+    """A decision point and what both did there; seeds where it is not all of them."""
+    return f"{flip.scene} {flip.a} → {flip.b}{_seeds(flip.seeds, pair)}"
+
+
+def _seeds(seeds: Sequence[int], pair: Pair) -> str:
+    return "" if len(seeds) == len(pair.seeds) else f" (seeds {', '.join(map(str, seeds))})"
+
+
+def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
+    """What differs between the texts, up to so many changes; none where the prompts are the same."""
+    change = comparison.prompts
+    if change is None or isinstance(change, str):
+        return [change] if change else []
+    sides = (comparison.pair.a, comparison.pair.b)
+    a, b = (printable(side.run.manifest.variant.prompt, 40) for side in sides)
+    counts = [f"{file} {t.removed} words removed, {t.added} added" for file, t in change.texts.items()]
+    said = [f"prompt {a} → {b}: {', '.join(counts)}"]
+    said += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
+    hunks = [(file, hunk) for file, text in change.texts.items() for hunk in text.hunks]
+    for file, hunk in hunks[:most]:
+        said.append(f"  {file} line {hunk.line_a} → {hunk.line_b}")
+        text = "".join(piece for _, piece in marked(hunk))
+        said += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
+    if len(hunks) > most:
+        said.append(f"  {len(hunks) - most} more changes: `harness prompt diff {a} {b}`")
+    return said
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
