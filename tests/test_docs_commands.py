@@ -59,9 +59,11 @@ NOT_RUN = {
     "harness eval --model qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
+    "harness export reports/proxy-v2-occluded-intersection-v2 --inspect logs/run.eval": "needs inspect-ai",
     "harness dataset rank occluded-intersection-v2 --json": "long; docs/datasets.md ranks a small one",
 }
 OTHER_PROGRAMS = {
+    "inspect": "serves until it is interrupted",
     "make": "CI runs it",
     "source": "the tests are in an environment already",
     "pip": "as above",

@@ -1,11 +1,14 @@
-"""`harness export`: a run's decisions and answers as text."""
+"""`harness export`: a run for other programs."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from harness.core import extras
 from harness.core.errors import UserError, printable
+
+File = Path | None
 
 
 def command(
@@ -14,29 +17,60 @@ def command(
     as_jsonl: Annotated[
         bool, typer.Option("--jsonl", help="Write decisions.jsonl, an object a decision.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder to write to. Default: the run's.")] = None,
+    out: Annotated[File, typer.Option(help="Folder for --csv and --jsonl. Default: the run's.")] = None,
+    junit: Annotated[
+        File, typer.Option(help="JUnit's XML to write: a test case an episode and condition.")
+    ] = None,
+    inspect: Annotated[
+        File, typer.Option(help="Log of Inspect AI to write, NAME.eval: a sample an answer.")
+    ] = None,
+    sft: Annotated[
+        File,
+        typer.Option(help="JSON lines to write: chats to fine-tune on, with what the trees say is right."),
+    ] = None,
+    report_seeds_too: Annotated[
+        bool,
+        typer.Option("--report-seeds-too", help="With --sft: also of layouts that numbers are reported of."),
+    ] = False,
 ) -> None:
-    """Write a run's decisions and answers as text. Spreadsheets and other programs read it."""
-    from harness.runs.export import answers_csv, decisions_csv, decisions_jsonl
+    """Write a run for spreadsheets and other programs."""
+    from harness.runs import export
     from harness.runs.folder import read
 
-    if as_csv == as_jsonl:
-        raise UserError("--csv or --jsonl: give one of them")
-    source = read(run)
-    folder = out or run
+    files = {"--junit": junit, "--inspect": inspect, "--sft": sft}
+    asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
+    [option, *others] = [name for name, given in asked.items() if given] or [""]
+    if others or not option:
+        raise UserError(f"{', '.join(asked)}: give one of them")
+    if report_seeds_too and not sft:
+        raise UserError("--report-seeds-too is of --sft; give that, or leave it out")
+    if out and option in files:
+        raise UserError(f"--out is of --csv and --jsonl; {option} names its file")
+    source, folder = read(run), out or run
+    target = files.get(option)
     try:
         if as_csv:
             decisions, answers = source.decisions, source.answers  # both are read before anything is written
             written = [
-                decisions_csv(decisions, folder / "decisions.csv"),
-                answers_csv(answers, source.actions, folder / "answers.csv"),
+                export.decisions_csv(decisions, folder / "decisions.csv"),
+                export.answers_csv(answers, source.actions, folder / "answers.csv"),
             ]
-        else:
-            written = [decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
+        elif as_jsonl:
+            written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
+        elif junit:
+            written = [export.junit(source, junit)]
+        elif sft:
+            from harness.training import pairs
+
+            written = [pairs.write(source, sft, report_seeds_too)]
+        elif inspect:
+            extras.need("--inspect", "inspect_ai")
+            from harness.report import inspect_log
+
+            written = [inspect_log.write(source, inspect)]
     except OSError as error:
-        raise UserError(
-            f"{'--out ' if out else ''}{printable(folder)} cannot be written ({error.strerror}); "
-            "choose another folder with --out"
-        ) from None
+        where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
+        other = "name another file" if target else "choose another folder with --out"
+        raise UserError(f"{where} cannot be written ({error.strerror}); {other}") from None
     for file in written:
         typer.echo(printable(file, 1000))

@@ -14,6 +14,7 @@ OPTIONAL = {
     "matplotlib": ("matplotlib", "report"),
     "PIL": ("pillow", "report"),
     "sklearn": ("scikit-learn", "audit"),
+    "inspect_ai": ("inspect-ai", "inspect"),
     "imageio_ffmpeg": ("imageio-ffmpeg", "video"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "torch": ("torch", "transformers"),

@@ -8,9 +8,12 @@ import msgspec
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from harness.core.files import replacing
+from harness.core.files import replacing, write_whole
+from harness.core.junit import Case
+from harness.core.junit import junit as test_suite
 from harness.runs.decisions import Decisions
-from harness.runs.records import Answer
+from harness.runs.folder import Run
+from harness.runs.records import Answer, Episode
 
 AT_ONCE = 10_000  # decisions that are written together
 
@@ -33,6 +36,21 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
     with replacing(path) as part, part.open("wb") as file:
         for piece in decisions.table.to_batches(AT_ONCE):
             file.write(encoder.encode_lines(piece.to_pylist()))
+    return path
+
+
+def junit(run: Run, path: Path) -> Path:
+    """A test case an episode and condition in JUnit's XML; it fails where a seed has no success."""
+    ends: dict[tuple[str, int], list[Episode]] = {}
+    for end in run.episodes:
+        ends.setdefault((end.condition, end.episode), []).append(end)
+    cases = []
+    for (condition, episode), by_seed in ends.items():
+        failed = [f"{end.failure} with seed {end.seed}" for end in by_seed if not end.success]
+        of = f"{run.source} · {run.manifest.variant} · {condition}"
+        said = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
+        cases.append(Case(of, f"episode {episode}", said if failed else None))
+    write_whole(path, test_suite(f"harness {run.manifest.name}", cases))
     return path
 
 

@@ -48,7 +48,7 @@ def alone(lessons: Lessons) -> Iterator[Question]:
     for scene in lessons.scenes:
         for viewer in scene.viewers:
             for prompt in lessons.prompts:
-                yield _question(lessons, scene, viewer, prompt)
+                yield question(lessons, scene, viewer, prompt)
 
 
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
@@ -79,12 +79,13 @@ def with_messages(
                 if u < ARRIVES
             ]
             if heard:
-                yield _question(lessons, scene, ego, prompt, heard)
+                yield question(lessons, scene, ego, prompt, heard)
 
 
-def _question(
+def question(
     lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt, heard: Sequence[Mapping[str, Any]] = ()
 ) -> Question:
+    """What a viewer is asked in a scene, with the messages that it heard."""
     graph, scenario = scene.record["graphs"][viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")

@@ -1,9 +1,10 @@
-"""`harness export`: decisions and answers as text."""
+"""`harness export`: decisions and answers as text, and episodes as test cases."""
 
 import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from run_on_disk import Row, answers_of, made_up, rows_of
@@ -71,6 +72,27 @@ def test_jsonl_has_an_object_a_decision(
     assert [path.name for path in Path("text").iterdir()] == ["decisions.jsonl"]
 
 
+def test_junit_has_a_case_an_episode_and_condition(tmp_path: Path, harness: Callable[..., Said]) -> None:
+    def end(row: Row) -> None:
+        if row["condition"] == "6g" and row["episode"] in (1, 2):
+            failed = row["episode"] == 1 or row["seed"] == 1
+            row |= {"success": False, "failure": "col\x1blision"} if failed else {}
+
+    run = made_up(tmp_path / "run", episode=end)
+    code, out, err = harness("export", run, "--junit", "run.xml")
+    assert (code, out, err) == (0, "run.xml\n", "")
+    suite = ElementTree.parse("run.xml").getroot()
+    assert (suite.tag, suite.get("tests"), suite.get("failures")) == ("testsuite", "8", "2")
+    cases = {(case.get("classname"), case.get("name")): case.find("failure") for case in suite}
+    of = {name: f"made-up · made-up · v2 · json · {name}" for name in ("single-local", "6g")}
+    assert list(cases) == [(of[name], f"episode {n}") for name in of for n in range(4)]
+    failed = {where: case.get("message") for where, case in cases.items() if case is not None}
+    assert failed == {
+        (of["6g"], "episode 1"): r"2 of 2 seeds: col\x1blision with seed 0, col\x1blision with seed 1",
+        (of["6g"], "episode 2"): r"1 of 2 seeds: col\x1blision with seed 1",
+    }
+
+
 def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decisions = read(run).decisions
     whole = export.decisions_csv(decisions, tmp_path / "whole.csv").read_bytes()
@@ -81,8 +103,16 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--csv or --jsonl: give one of them"),
-        (("--csv", "--jsonl"), "--csv or --jsonl: give one of them"),
+        ((), "--csv, --jsonl, --junit, --inspect, --sft: give one of them"),
+        (("--csv", "--jsonl"), "--csv, --jsonl, --junit, --inspect, --sft: give one of them"),
+        (("--csv", "--junit", "a.xml"), "give one of them"),
+        (("--junit", "a.xml", "--out", "there"), "--out is of --csv and --jsonl; --junit names its file"),
+        (
+            ("--junit", "a.xml", "--report-seeds-too"),
+            "--report-seeds-too is of --sft; give that, or leave it",
+        ),
+        (("--junit", "run/run.json/a.xml"), "--junit run/run.json/a.xml cannot be written ("),
+        (("--junit", "run"), "--junit run cannot be written (Is a directory); name another file"),
         (("--csv", "--out", "run/run.json"), "--out run/run.json cannot be written ("),
         (("--jsonl", "--out", "run/run.json/in"), "; choose another folder with --out"),
     ],

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from textwrap import wrap
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, tostring
 
 from harness.core.errors import printable
+from harness.core.junit import Case
+from harness.core.junit import junit as test_suite
 from harness.prompts.difference import PromptChange
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, InCondition
@@ -92,15 +93,9 @@ def _table(c: InCondition) -> list[str]:
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     """The gates as test cases, for what shows JUnit's XML."""
-    failed = sum(bool(verdict.failed) for verdict in verdicts)
-    counts = {"name": "harness compare", "tests": str(len(verdicts)), "failures": str(failed)}
-    suite = Element("testsuite", counts)
     runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
-    for each in verdicts:
-        case = SubElement(suite, "testcase", classname=runs, name=printable(each.gate))
-        if each.failed:
-            SubElement(case, "failure", message=printable(words.judged(each), WHOLE))
-    return tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+    cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
+    return test_suite("harness compare", cases)
 
 
 def code(text: str) -> str:

@@ -1,0 +1,146 @@
+"""A run as a log of Inspect AI, for its viewer and its data frames: a sample an answer.
+
+The package writes the file; nothing here knows the format. https://inspect.aisi.org.uk/eval-logs.html
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from inspect_ai import log, model
+from inspect_ai.scorer import Score
+from inspect_ai.viewer import ViewerConfig
+
+from harness.core.errors import UserError
+from harness.core.files import digest, replacing
+from harness.dataset.load import Scene
+from harness.evaluate.fusion import messages_of
+from harness.report.decisions import prompts_of
+from harness.runs.folder import Run, dataset_of
+from harness.runs.records import Answer, FrozenScenes
+
+VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
+STOPS = {"stop": "stop", "length": "max_tokens"}
+SPOKEN = {"system": model.ChatMessageSystem, "user": model.ChatMessageUser}
+
+
+def write(run: Run, path: Path) -> Path:
+    """Write a run to an `.eval` file, or to JSON if its name ends so."""
+    with replacing(path) as part:
+        log.write_eval_log(log_of(run), str(part), format="json" if path.suffix == ".json" else "eval")
+    return path
+
+
+def log_of(run: Run) -> log.EvalLog:
+    """The log: its task is dataset and prompt version, its results the run's summary over episodes."""
+    manifest, variant = run.manifest, run.manifest.variant
+    stated = msgspec.to_builtins(manifest)
+    samples = list(_samples(run))
+    name = digest(stated)[:22]
+    return log.EvalLog(
+        status="success",
+        eval=log.EvalSpec(
+            eval_id=name, run_id=name, task_id=name, created=manifest.created,
+            task=f"{run.source} {variant.prompt}", task_version=variant.prompt, tags=list(manifest.tags),
+            dataset=log.EvalDataset(name=run.source, samples=len(samples)),
+            model=f"{manifest.model['engine']}/{variant.model}", config=log.EvalConfig(),
+            task_args={key: stated[key] for key in ("prompt", "answer", "thinking", "seeds", "conditions")},
+            packages={"swarmdrive-harness": manifest.versions.get("harness", "unknown")},
+            metadata={key: stated[key] for key in ("command", "world", "latency", "identity")},
+            viewer=ViewerConfig(trust_content=False),  # what a model writes may be anything
+        ),
+        results=log.EvalResults(
+            total_samples=len(samples), completed_samples=len(samples), scores=list(_results(run))
+        ),
+        samples=samples,
+    )  # fmt: skip
+
+
+def _results(run: Run) -> Iterator[log.EvalScore]:
+    """The summary over episodes or answers, a score a condition."""
+    for condition in dict.fromkeys(score.condition for score in run.scores):
+        metrics = {
+            s.metric: log.EvalMetric(
+                name=s.metric, value=s.value, metadata={"low": s.low, "high": s.high, "n": s.n}
+            )
+            for s in run.scores
+            if s.condition == condition and s.interval != "seed means" and s.value is not None
+        }
+        yield log.EvalScore(name=condition, scorer="swarmdrive-harness", metrics=metrics)
+
+
+def _samples(run: Run) -> Iterator[log.EvalSample]:
+    sent, scenes = prompts_of(run), _scenes(run)
+    d = run.decisions
+    regret, safe = d["regret"], d.of_actions("safe")
+    condition = d.codes("condition", run.conditions)
+    for name, rows in d.scenes.items():
+        answers = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
+        kept = _kept(run, condition[rows.start : rows.stop], regret[rows.start : rows.stop])
+        target = [a for a, is_safe in zip(run.actions, safe[rows.start] == 1.0, strict=True) if is_safe]
+        facts = {
+            "scene": name,
+            "episode": int(d.whole("episode")[rows.start]),
+            "step": int(d.whole("step")[rows.start]),
+        }
+        for answer in answers.values():
+            asked: Sequence[Mapping[str, str]] = ()
+            if sent and name in scenes:
+                asked = sent(scenes[name], answer.viewer, messages_of(answers, answer.heard))
+            yield _sample(run, answer, asked, target, {} if answer.role == "helper" else kept, facts)
+
+
+def _sample(
+    run: Run, answer: Answer, asked: Sequence[Mapping[str, str]], target: list[str],
+    kept: Mapping[str, Score], facts: Mapping[str, Any],
+) -> log.EvalSample:  # fmt: skip
+    here = bool(asked) and digest(asked) == answer.prompt_sha256
+    chat = [SPOKEN[message["role"]](content=message["content"]) for message in asked] if here else []
+    reply = model.ChatMessageAssistant(content=answer.raw, source="generate")
+    usage = None
+    if answer.prompt_tokens is not None and answer.completion_tokens is not None:
+        n = answer.prompt_tokens, answer.completion_tokens
+        usage = model.ModelUsage(input_tokens=n[0], output_tokens=n[1], total_tokens=sum(n))
+    stop = STOPS.get(answer.finish_reason, "unknown")
+    plain = msgspec.to_builtins(answer)
+    left_out = ("raw", "prompt_tokens", "completion_tokens", "finish_reason", "error", "seconds")
+    intent = "failed" if answer.intent is None else " ".join(
+        f"{action} {p:.2f}" for action, p in zip(run.actions, answer.intent, strict=True)
+    )  # fmt: skip
+    verdict = Score(
+        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {answer.detail}"
+    )
+    return log.EvalSample(
+        id=answer.id, epoch=1, input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",
+        target=target, messages=[*chat, reply],
+        output=model.ModelOutput(
+            model=run.manifest.variant.model, usage=usage, time=answer.seconds, error=answer.error,
+            choices=[model.ChatCompletionChoice(message=reply, stop_reason=stop)],
+        ),
+        scores={"parsed": verdict, **kept},
+        metadata={**facts, **{key: value for key, value in plain.items() if key not in left_out}},
+    )  # fmt: skip
+
+
+def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
+    """Of each condition in which it is known, the share of seeds whose decision gave success away."""
+    scores = {}
+    for n, name in enumerate(run.conditions):
+        known = regret[(condition == n) & ~np.isnan(regret)]
+        if len(known):
+            said = f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
+            scores[f"regret {name}"] = Score(value=float(known.mean()), explanation=said)
+    return scores
+
+
+def _scenes(run: Run) -> dict[str, Scene]:
+    """The run's decision points; none where its dataset is not here as it was, or it was driven."""
+    if not isinstance(run.manifest.world, FrozenScenes):
+        return {}
+    try:
+        names = list(run.decisions.scenes)
+        return dict(zip(names, dataset_of(run).scenes(names), strict=True))
+    except UserError:
+        return {}

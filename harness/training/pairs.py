@@ -1,0 +1,87 @@
+"""A run's questions with the answers that they should have had, as chats for fine-tuning.
+
+A line a question, in TRL's conversational form of prompt and completion. The answer states the soft label of
+`harness.training.lessons`, with the outcomes of the dataset's decision trees: the best action has most of it.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.core.seeds import FIRST, purpose, stated
+from harness.evaluate.fusion import messages_of
+from harness.prompts import readout
+from harness.prompts.versions import as_it_was
+from harness.runs.folder import Run, dataset_of
+from harness.runs.records import FrozenScenes
+from harness.training.answers import answer
+from harness.training.examples import question
+from harness.training.lessons import Lessons, label
+
+
+def write(run: Run, path: Path, report_seeds_too: bool) -> Path:
+    """Write a run's pairs to a file.
+
+    Raises:
+        UserError: the run was driven, its dataset or prompt is not here as it was, or its layouts are those
+            that numbers are reported of and `report_seeds_too` is false.
+    """
+    seeds = sorted({episode.layout_seed for episode in run.episodes})
+    first, count = seeds[0], seeds[-1] - seeds[0] + 1
+    if seeds[-1] >= FIRST["report"] and not report_seeds_too:
+        raise UserError(
+            f"--sft {printable(path)}: {printable(run.path)} has {stated(first, count)}, and a model that "
+            "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
+            f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
+        )
+    write_whole(path, msgspec.json.Encoder().encode_lines(pairs(run)))
+    return path
+
+
+def pairs(run: Run) -> Iterator[dict[str, Any]]:
+    """What each viewer was asked, fusion calls included, and the answer that the tree asks for.
+
+    A decision point after which no action succeeds teaches nothing and is left out.
+
+    Raises:
+        UserError: as `write` says.
+    """
+    if not isinstance(run.manifest.world, FrozenScenes):
+        raise UserError(
+            f"--sft: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
+            "to; give a run of `harness eval`"
+        )
+    version, sha256 = (run.manifest.prompt[key] for key in ("version", "sha256"))
+    prompt = as_it_was(version, sha256)
+    if prompt is None:
+        raise UserError(
+            f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
+            f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
+        )
+    dataset = dataset_of(run)
+    forest, names = dataset.forest, list(run.decisions.scenes)
+    ends_s = np.where(forest.safe, forest.delay_s, np.inf)
+    labels = {
+        name: label(dict(zip(dataset.actions, ends_s[n].tolist(), strict=True)))
+        for name in names if forest.value[n := forest.place[name]]
+    }  # fmt: skip
+    scenes = tuple(dataset.scenes(list(labels)))
+    lessons = Lessons(dataset.scenario, (prompt,), scenes, labels)
+    for scene in scenes:
+        answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
+        for one in answers.values():
+            q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
+            messages, said = q.messages, answer(prompt, q.graph, q.label, q.actions)
+            if run.manifest.answer == "readout":
+                said = readout.letters(q.actions)[int(q.label.argmax())]
+                messages = readout.asked(messages, q.actions)
+            seed = int(scene.record["episode_seed"])
+            yield {
+                "prompt": messages, "completion": [{"role": "assistant", "content": said}],
+                "scene": scene.id, "viewer": one.key, "layout_seed": seed, "purpose": purpose(seed, 1),
+            }  # fmt: skip

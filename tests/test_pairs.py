@@ -1,0 +1,167 @@
+"""`harness export --sft`: a run's questions, the answers that its trees ask for, and training on them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
+
+from harness.coordination.operating_point import POINTS
+from harness.core.files import digest
+from harness.dataset.load import Dataset
+from harness.parsing.parse import parse
+from harness.parsing.status import Status
+from harness.runs.folder import read
+from harness.training.lessons import label
+from harness.training.pairs import pairs
+
+Said = tuple[int, str, str]
+Harness = Callable[..., Said]
+
+
+@pytest.fixture(scope="module")
+def evaluated(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    spec = spec_of(small, prompt="v3", points=(POINTS["single-local"], POINTS["6g"]), seeds=(0,))
+    done = evaluate(spec, tmp_path_factory.mktemp("pairs") / "run").out
+
+    def merge(row: Row) -> None:
+        """Where the last helper answered stands a fusion call with the others' messages."""
+        if row["viewer"] == "v4":
+            row |= {"viewer": "v1", "heard": ("v2", "v3"), "role": "merge", "message": None}
+
+    change(done, answer=merge)
+    return done
+
+
+@pytest.fixture
+def run(evaluated: Path, tmp_path: Path) -> Path:
+    import shutil
+
+    return shutil.copytree(evaluated, tmp_path / "run")
+
+
+def lines_of(run: Path, harness: Harness, *options: str) -> list[dict[str, Any]]:
+    code, out, err = harness("export", run, "--sft", "pairs.jsonl", *options)
+    assert (code, out, err) == (0, "pairs.jsonl\n", "")
+    return [json.loads(line) for line in Path("pairs.jsonl").read_text().splitlines()]
+
+
+def test_every_question_of_a_point_that_can_be_won_has_the_answer_of_its_tree(
+    run: Path, harness: Harness
+) -> None:
+    lines = lines_of(run, harness)
+    rows = {row["scene"]: row for row in rows_of(run)}
+    answers = {(a.scene, a.key): a for a in answers_of(run)}
+    actions = read(run).actions
+    assert [(at["scene"], at["viewer"]) for at in lines] == [at for at in answers if rows[at[0]]["value"]]
+    assert {answers[at["scene"], at["viewer"]].role for at in lines} == {"ego", "helper", "merge"}
+    for line in lines:
+        row, asked = rows[line["scene"]], answers[line["scene"], line["viewer"]]
+        if asked.role == "merge":
+            assert "\nv2 " in line["prompt"][1]["content"].partition("\nMESSAGES ")[2]
+        else:
+            assert digest(line["prompt"]) == asked.prompt_sha256, "what the run asked, word by word"
+        [said] = line["completion"]
+        parsed = parse(said["content"], role="helper" if asked.role == "helper" else "ego", actions=actions)
+        assert (said["role"], parsed.status) == ("assistant", Status.STRICT)
+        ends_s = {a: row[f"delay_s_{a}"] if row[f"safe_{a}"] else float("inf") for a in actions}
+        assert max(abs(parsed.intent - label(ends_s))) <= 0.05
+        assert all(p == 0 for a, p in zip(actions, parsed.intent, strict=True) if not row[f"safe_{a}"])
+    assert {(line["layout_seed"], line["purpose"]) for line in lines} <= {(100 + n, "tune") for n in range(4)}
+
+
+def test_a_read_out_is_answered_by_the_letter_of_the_best_action(run: Path) -> None:
+    configure(run, answer="readout")
+    rows = {row["scene"]: row for row in rows_of(run)}
+    for pair in pairs(read(run)):
+        assert pair["prompt"][-1]["content"].endswith("\nAnswer with one letter: A SLOWER, B IDLE, C FASTER.")
+        action = {"A": "SLOWER", "B": "IDLE", "C": "FASTER"}[pair["completion"][0]["content"]]
+        assert rows[pair["scene"]][f"safe_{action}"]
+
+
+def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path, harness: Harness) -> None:
+    change(run, episode=lambda row: row.update(layout_seed=row["layout_seed"] + 199_897))
+    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "has layout seeds 199997 to 200000 (train and report), and a model that learns from them" in err
+    assert err.endswith("or give --report-seeds-too\n")
+    assert not Path("pairs.jsonl").exists()
+    assert lines_of(run, harness, "--report-seeds-too")
+
+
+@pytest.mark.parametrize(
+    ("key", "said"), [("prompt", "prompt v3 with sha256 1111"), ("world", "is not the one that")]
+)
+def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())[key]
+    configure(run, **{key: {**stated, "sha256": "1" * 64}})
+    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+    assert not Path("pairs.jsonl").exists()
+
+
+def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> None:
+    made_up(tmp_path / "driven", closed_loop=True)
+    code, _, err = harness("export", "driven", "--sft", "pairs.jsonl")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "driven was driven, and only frozen scenes know what each action leads to" in err
+
+
+@pytest.mark.slow
+def test_a_model_learns_from_the_pairs(run: Path, harness: Harness, tmp_path: Path) -> None:
+    """Steps as TRL takes them: the chat template over both, the loss of the completion alone."""
+    torch = pytest.importorskip("torch", reason="needs the transformers extra")
+    transformers = pytest.importorskip("transformers", reason="needs the transformers extra")
+    from tiny_qwen3 import build
+
+    lines = lines_of(run, harness)[:4]
+    folder = build(tmp_path / "tiny", context_tokens=4096)
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
+    model = transformers.AutoModelForCausalLM.from_pretrained(folder)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-3)
+
+    def loss_of(line: dict[str, Any]) -> Any:
+        asked = tokenizer.apply_chat_template(line["prompt"], tokenize=False, add_generation_prompt=True)
+        whole = tokenizer.apply_chat_template(line["prompt"] + line["completion"], tokenize=False)
+        assert whole.startswith(asked)
+        ids, start = (tokenizer(text, return_tensors="pt").input_ids for text in (whole, asked))
+        labels = ids.clone()
+        labels[:, : start.shape[1]] = -100
+        assert tokenizer.decode(ids[0, start.shape[1] :]).startswith(line["completion"][0]["content"])
+        return model(input_ids=ids, labels=labels).loss
+
+    before = [loss_of(line).item() for line in lines]
+    for line in lines:
+        optimiser.zero_grad()
+        loss_of(line).backward()
+        optimiser.step()
+    assert sum(loss_of(line).item() for line in lines) < sum(before)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_trl_trains_on_the_file_as_it_is(run: Path, harness: Harness, tmp_path: Path) -> None:
+    trl = pytest.importorskip("trl", reason="needs trl, which no extra has")
+    datasets = pytest.importorskip("datasets", reason="needs trl, which no extra has")
+    from tiny_qwen3 import build
+    from transformers import AutoTokenizer
+
+    lines = lines_of(run, harness)
+    read_by = {"data_files": "pairs.jsonl", "split": "train", "cache_dir": tmp_path / "hf"}
+    folder = build(tmp_path / "tiny", context_tokens=4096)
+    trainer = trl.SFTTrainer(
+        model=str(folder),
+        processing_class=AutoTokenizer.from_pretrained(folder),
+        train_dataset=datasets.load_dataset("json", **read_by),
+        args=trl.SFTConfig(
+            output_dir=str(tmp_path / "out"), max_steps=2, per_device_train_batch_size=2, use_cpu=True,
+            bf16=False, max_length=4096, report_to="none",
+        ),
+    )  # fmt: skip
+    assert len(trainer.train_dataset) == len(lines)
+    assert trainer.train().global_step == 2
