@@ -21,7 +21,7 @@ from harness.core.errors import UserError, printable
 
 PANELS = {
     "Evaluate": ("eval", "drive", "grid", "sweep", "compare", "twins", "fidelity", "campaign"),
-    "Look": ("ls", "view", "report", "export", "video", "parse"),
+    "Look": ("ls", "history", "view", "report", "export", "video", "parse"),
     "Data": ("init", "prompt", "dataset", "scenario"),
     "Models": ("model", "distill", "parity", "doctor"),
 }

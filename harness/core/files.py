@@ -84,6 +84,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     What killed processes left of such files goes as well.
     """
+    if path.is_dir():  # and not only after all is written
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     forget_halves(path.parent, escape(path.name))
     part = path.with_name(f".{path.name}.{os.getpid()}.part")

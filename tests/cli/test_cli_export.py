@@ -112,6 +112,7 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
             "--report-seeds-too is of --sft; give that, or leave it",
         ),
         (("--junit", "run/run.json/a.xml"), "--junit run/run.json/a.xml cannot be written ("),
+        (("--junit", "."), "--junit . cannot be written (Is a directory); name another file"),
         (("--junit", "run"), "--junit run cannot be written (Is a directory); name another file"),
         (("--csv", "--out", "run/run.json"), "--out run/run.json cannot be written ("),
         (("--jsonl", "--out", "run/run.json/in"), "; choose another folder with --out"),

@@ -25,6 +25,24 @@ SETTINGS = (
 )  # fmt: skip
 
 
+def scenes_of(run: Run) -> Any:
+    """What pins a run's scenes: the dataset's digest, or the scenario's layouts, of whatever beacons."""
+    world = run.manifest.world
+    if isinstance(world, FrozenScenes):
+        return world.sha256
+    name, parameters = world.scenario["name"].partition(":")[0], world.scenario["parameters"]
+    dials = {key: value for key, value in parameters.items() if key not in BEACON_DIALS}
+    return name, dials, world.first_seed
+
+
+def where(run: Run) -> str:
+    """A run's scenes, for people."""
+    world = run.manifest.world
+    if isinstance(world, FrozenScenes):
+        return f"{world.name} {world.sha256[:12]}"
+    return f"{world.scenario['name']} from layout seed {world.first_seed}"
+
+
 @dataclass(frozen=True)
 class Side:
     """One of the two runs.
@@ -38,24 +56,6 @@ class Side:
     run: Run
     settings: Mapping[str, str]
     values: Mapping[str, Floats]
-
-    @property
-    def scenes(self) -> Any:
-        """What pins its scenes: the dataset's digest, or the scenario's layouts, of whatever beacons."""
-        world = self.run.manifest.world
-        if isinstance(world, FrozenScenes):
-            return world.sha256
-        name, parameters = world.scenario["name"].partition(":")[0], world.scenario["parameters"]
-        dials = {key: value for key, value in parameters.items() if key not in BEACON_DIALS}
-        return name, dials, world.first_seed
-
-    @property
-    def on(self) -> str:
-        """Its scenes, for people."""
-        world = self.run.manifest.world
-        if isinstance(world, FrozenScenes):
-            return f"{world.name} {world.sha256[:12]}"
-        return f"{world.scenario['name']} from layout seed {world.first_seed}"
 
     @cached_property
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
@@ -116,8 +116,8 @@ def pair(a: Path, b: Path) -> Pair:
             "see `harness fidelity`"
         )
     side_a, side_b = _side(one), _side(other)
-    if side_a.scenes != side_b.scenes:
-        scenes = " and ".join(printable(side.on, 60) for side in (side_a, side_b))
+    if scenes_of(one) != scenes_of(other):
+        scenes = " and ".join(printable(where(run), 60) for run in (one, other))
         raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
     seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (one, other))
     if seeds_a != seeds_b:

@@ -14,6 +14,7 @@ from harness.prompts.difference import PromptChange
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, InCondition
 from harness.report.compare.gate import Verdict
+from harness.report.compare.pair import where
 
 WIDTH = 80
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
@@ -113,7 +114,7 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
         "a": {"run": str(pair.a.run.path), "settings": dict(pair.a.settings)},
         "b": {"run": str(pair.b.run.path), "settings": dict(pair.b.settings)},
         "caveats": words.caveats(pair),
-        "scenes": pair.a.on,
+        "scenes": where(pair.a.run),
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
         "settings": [{"name": name, "a": a, "b": b} for name, a, b in comparison.settings],

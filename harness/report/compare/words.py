@@ -11,7 +11,7 @@ from harness.report.caveats import no_prompt, unread
 from harness.report.compare.difference import Comparison, Difference, Flip, InCondition
 from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
-from harness.report.compare.pair import Pair, Side
+from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import p_value
 from harness.runs.metrics import SUCCESS, unit
 
@@ -122,7 +122,7 @@ def caveats(pair: Pair) -> list[str]:
 
 def paired(pair: Pair) -> str:
     """What is paired, and what only one of the runs has."""
-    said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {pair.a.on}"
+    said = f"{len(pair.episodes)} episodes × {len(pair.seeds)} seeds of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
         episodes = len(side.run.grid.episodes) - len(pair.episodes)

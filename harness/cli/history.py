@@ -1,0 +1,61 @@
+"""`harness history`: a metric over the runs in a folder."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import WIDTH, echo_json, interval
+from harness.core.errors import printable
+from harness.runs.listing import SUCCESS
+
+if TYPE_CHECKING:
+    from harness.report.history import Line
+
+VARIANT = 32  # columns of model, prompt and answer mode
+
+
+def command(
+    folder: options.Reports = Path("reports"),
+    metric: str = typer.Option(SUCCESS, help="A metric of summary.csv."),
+    condition: str | None = typer.Option(None, help="Default: the last that most of the runs have."),
+    dataset: str | None = typer.Option(None, help="Only runs on this dataset, or driven in this scenario."),
+    html: Path | None = typer.Option(None, help="File to write a page to as well."),
+    as_json: options.Json = False,
+) -> None:
+    """Show a metric over runs, by date, prompt version and model. Runs of the same scenes stand together."""
+    from harness.report import history
+    from harness.runs.metrics import unit
+
+    groups = history.history(folder, metric, condition, dataset)
+    if html:
+        history.write(groups, metric, html)
+    if as_json:
+        echo_json([
+            {"scenes": group.of, "condition": group.condition, "metric": metric,
+             "runs": [_mapping(line) for line in group.lines]}
+            for group in groups
+        ])  # fmt: skip
+        return
+    factor, suffix, decimals = unit(metric)
+    typer.echo(f"{metric}{suffix if suffix.strip() == '%' else ''} with its 95 % interval")
+    for group in groups:
+        typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH)}")
+        for line in group.lines:
+            value = n = "–"
+            if score := line.score:
+                value, n = interval(score.value, score.low, score.high, factor, decimals), str(score.n)
+            who = printable(line.run.manifest.variant, VARIANT)
+            typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
+    if len(groups) > 1:
+        typer.echo("\nruns of different scenes do not compare: they stand apart")
+
+
+def _mapping(line: "Line") -> dict[str, object]:
+    variant, score = line.run.manifest.variant, line.score
+    numbers = {key: getattr(score, key, None) for key in ("value", "low", "high", "n", "n_excluded")}
+    return {
+        "run": line.name, "date": line.date.isoformat(), "model": variant.model, "prompt": variant.prompt,
+        "answer": variant.answer, "tags": line.run.manifest.tags, **numbers,
+    }  # fmt: skip

@@ -1,0 +1,141 @@
+"""A metric over the runs of a folder, by date. Runs of the same scenes make a group; no others compare."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.core.errors import UserError, printable, unknown
+from harness.report.compare.page import Place, beside
+from harness.report.compare.pair import scenes_of, where
+from harness.report.drawing import colours
+from harness.report.page import environment, save
+from harness.runs.folder import Run, read
+from harness.runs.listing import runs as listed
+from harness.runs.metrics import ALL, label
+from harness.runs.records import Score
+
+WIDTH, HEIGHT = 240, 22  # of the picture of a line
+
+
+@dataclass(frozen=True)
+class Line:
+    """One run.
+
+    Attributes:
+        name: its folder, from the folder that is looked through.
+        date: when it began.
+        run: as it was read.
+        score: its value in the group's condition; None where it has none.
+    """
+
+    name: str
+    date: datetime
+    run: Run
+    score: Score | None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of the same scenes.
+
+    Attributes:
+        of: the scenes, for people: a dataset with its digest, or a scenario with its layouts.
+        condition: of the values: the one that was asked for, or the last of those that most of the runs have;
+            `all` of a metric that depends on none.
+        lines: by date, the oldest first.
+    """
+
+    of: str
+    condition: str
+    lines: tuple[Line, ...]
+
+
+def history(
+    folder: Path, metric: str, condition: str | None = None, dataset: str | None = None
+) -> list[Group]:
+    """The finished runs in a folder, the group whose last run is the newest first.
+
+    Args:
+        folder: is looked through as `harness ls` does.
+        metric: a metric of `summary.csv`.
+        condition: of the values; None for the last of those that most of a group's runs have.
+        dataset: name of the dataset, or of the scenario of driven runs; None for all.
+
+    Raises:
+        UserError: there is no such folder, metric, condition or dataset, or a run's file is broken.
+    """
+    lines: dict[object, list[Line]] = {}
+    for one in reversed(listed(folder)):
+        if one.state == "finished" and one.kind in ("eval", "drive"):
+            run = read(folder / one.name)
+            lines.setdefault(repr(scenes_of(run)), []).append(Line(one.name, one.date, run, None))
+    if not lines:
+        raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")
+    runs = [line.run for of in lines.values() for line in of]
+    for what, name, known in (
+        ("metric", metric, {score.metric for run in runs for score in run.scores}),
+        ("condition", condition, {name for run in runs for name in run.conditions}),
+        ("dataset", dataset, {_scenes(run) for run in runs}),
+    ):
+        if name is not None and name not in known:
+            raise unknown(f"{what} of these runs", name, known)
+    groups = [_group(of, metric, condition) for of in lines.values() if dataset in (None, _scenes(of[0].run))]
+    return sorted(groups, key=lambda group: group.lines[-1].date, reverse=True)
+
+
+def _scenes(run: Run) -> str:
+    return run.source.partition(" (")[0]
+
+
+def _group(lines: Sequence[Line], metric: str, condition: str | None) -> Group:
+    if condition is None:
+        had = Counter(name for line in lines for name in line.run.conditions)
+        most = max(had.values())
+        condition = next(name for name in reversed(list(had)) if had[name] == most)
+
+    scored = tuple(
+        replace(line, score=line.run.score(condition, metric) or line.run.score(ALL, metric))
+        for line in lines
+    )
+    if {line.score.condition for line in scored if line.score} == {ALL}:
+        condition = ALL
+    return Group(where(lines[-1].run), condition, scored)
+
+
+def write(groups: Sequence[Group], metric: str, out: Path) -> None:
+    """Write the page. Raises UserError if `out` cannot be written."""
+    save(render(groups, metric, beside(out)), out, "--html")
+
+
+def render(groups: Sequence[Group], metric: str, place: Place) -> str:
+    """The page; `place` gives the link to a run's own."""
+    return environment().get_template("history.html.j2").render(
+        groups=[(group, _picture(group)) for group in groups], metric=label(metric), place=place,
+        palette=Markup(colours.variables()),
+    )  # fmt: skip
+
+
+def _picture(group: Group) -> Callable[[Score], Markup]:
+    """Draws a value and its interval, on one scale for the whole group."""
+    scores = [line.score for line in group.lines if line.score]
+    ends = [x for s in scores for x in (s.value, s.low, s.high) if x is not None]
+    least, most = min(ends, default=0.0), max(ends, default=1.0)
+
+    def x(value: float) -> float:
+        return round(8 + (value - least) / ((most - least) or 1.0) * (WIDTH - 16), 1)
+
+    def draw(score: Score) -> Markup:
+        y, value = HEIGHT / 2, score.value or 0.0
+        spread = ""
+        if score.low is not None and score.high is not None:
+            spread = f'<path d="M{x(score.low)} {y}H{x(score.high)}"/>'
+        return Markup(
+            f'<svg class="forest" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
+            f'aria-hidden="true">{spread}<circle cx="{x(value)}" cy="{y}" r="4"/></svg>'
+        )
+
+    return draw
