@@ -15,6 +15,7 @@ from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
 from harness.parsing.status import Status
+from harness.prompts import versions as prompts
 from harness.runs.folder import read
 from harness.training.lessons import label
 from harness.training.pairs import pairs
@@ -81,6 +82,18 @@ def test_a_read_out_is_answered_by_the_letter_of_the_best_action(run: Path) -> N
         assert pair["prompt"][-1]["content"].endswith("\nAnswer with one letter: A SLOWER, B IDLE, C FASTER.")
         action = {"A": "SLOWER", "B": "IDLE", "C": "FASTER"}[pair["completion"][0]["content"]]
         assert rows[pair["scene"]][f"safe_{action}"]
+
+
+def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs(run: Path) -> None:
+    model = json.loads((run / "run.json").read_text())["model"]
+    prompt = {"version": "v1", "sha256": prompts.load("v1").sha256}
+    configure(run, helpers=[{"model": model, "prompt": prompt, "answer": "readout", "thinking": False}])
+    for pair in pairs(read(run)):
+        system, user = (message["content"] for message in pair["prompt"])
+        helps = pair["viewer"] in ("v2", "v3")
+        assert user.endswith("Answer with one letter: A SLOWER, B IDLE, C FASTER.") == helps
+        assert ("recommended_maneuver" in system) == helps, "what v1 asks a helper for"
+        assert (len(pair["completion"][0]["content"]) == 1) == helps
 
 
 def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path, harness: Harness) -> None:

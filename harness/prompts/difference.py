@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from typing import Any, Literal
 
@@ -93,6 +93,16 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
     return PromptChange(
         tuple((name, value, after[name]) for name, value in before.items() if value != after[name]),
         {f"{role}.j2": words(text, b.texts[role]) for role, text in a.texts.items()},
+    )
+
+
+def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
+    """The ego's version with the helper's part of another."""
+    return replace(
+        ego,
+        texts={**ego.texts, "helper": helper.texts["helper"]},
+        max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
+        helper_answer=helper.helper_answer,
     )
 
 

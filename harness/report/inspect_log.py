@@ -37,6 +37,7 @@ def log_of(run: Run) -> log.EvalLog:
     """The log: its task is dataset and prompt version, its results the run's summary over episodes."""
     manifest, variant = run.manifest, run.manifest.variant
     stated = msgspec.to_builtins(manifest)
+    asked = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
     samples = list(_samples(run))
     name = digest(stated)[:22]
     return log.EvalLog(
@@ -46,7 +47,7 @@ def log_of(run: Run) -> log.EvalLog:
             task=f"{run.source} {variant.prompt}", task_version=variant.prompt, tags=list(manifest.tags),
             dataset=log.EvalDataset(name=run.source, samples=len(samples)),
             model=f"{manifest.model['engine']}/{variant.model}", config=log.EvalConfig(),
-            task_args={key: stated[key] for key in ("prompt", "answer", "thinking", "seeds", "conditions")},
+            task_args={key: stated[key] for key in asked},
             packages={"swarmdrive-harness": manifest.versions.get("harness", "unknown")},
             metadata={key: stated[key] for key in ("command", "world", "latency", "identity")},
             viewer=ViewerConfig(trust_content=False),  # what a model writes may be anything
@@ -116,7 +117,7 @@ def _sample(
         id=answer.id, epoch=1, input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",
         target=target, messages=[*chat, reply],
         output=model.ModelOutput(
-            model=run.manifest.variant.model, usage=usage, time=answer.seconds, error=answer.error,
+            model=run.agent(answer)["model"]["name"], usage=usage, time=answer.seconds, error=answer.error,
             choices=[model.ChatCompletionChoice(message=reply, stop_reason=stop)],
         ),
         scores={"parsed": verdict, **kept},

@@ -56,13 +56,15 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
             f"--sft: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
             "to; give a run of `harness eval`"
         )
-    version, sha256 = (run.manifest.prompt[key] for key in ("version", "sha256"))
-    prompt = as_it_was(version, sha256)
-    if prompt is None:
-        raise UserError(
-            f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
-            f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
-        )
+    prompts = {}
+    for agent in (run.manifest.agent(0), *run.manifest.helpers):
+        version, sha256 = (agent["prompt"][key] for key in ("version", "sha256"))
+        if (prompt := as_it_was(version, sha256)) is None:
+            raise UserError(
+                f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
+                f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
+            )
+        prompts[version] = prompt
     dataset = dataset_of(run)
     forest, names = dataset.forest, list(run.decisions.scenes)
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)
@@ -71,13 +73,15 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
         for name in names if forest.value[n := forest.place[name]]
     }  # fmt: skip
     scenes = tuple(dataset.scenes(list(labels)))
-    lessons = Lessons(dataset.scenario, (prompt,), scenes, labels)
+    lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
         answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
         for one in answers.values():
+            agent = run.agent(one)
+            prompt = prompts[agent["prompt"]["version"]]
             q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
             messages, said = q.messages, answer(prompt, q.graph, q.label, q.actions)
-            if run.manifest.answer == "readout":
+            if agent["answer"] == "readout":
                 said = readout.letters(q.actions)[int(q.label.argmax())]
                 messages = readout.asked(messages, q.actions)
             seed = int(scene.record["episode_seed"])

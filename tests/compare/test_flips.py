@@ -154,6 +154,22 @@ def test_a_prompt_that_is_not_here_as_it_was_is_one_line(
     assert json.loads(harness("compare", *runs, "--json")[1])["prompts"].endswith(" is not here")
 
 
+def test_helpers_with_a_prompt_of_their_own_have_their_own_difference(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
+    prompt = {"version": "v4", "sha256": prompts.load("v4").sha256}
+    model = json.loads((runs[1] / "run.json").read_text())["model"]
+    configure(runs[1], helpers=[{"model": model, "prompt": prompt, "answer": "json", "thinking": False}])
+    texts = json.loads(harness("compare", *runs, "--json")[1])["prompts"]["texts"]
+    assert not texts["ego.j2"]["hunks"]
+    assert texts["helper.j2"]["added"] > 50
+    said = " ".join(harness("compare", *runs)[1].split())
+    assert "ego's prompt v2 → v2, helper's v2 → v4: ego.j2 0 words removed, 0 added, helper.j2 " in said
+    assert "more changes: `harness prompt diff v2 v4`" in said
+    assert "max_answer_tokens.helper: 128 → 160" in said
+    assert "max_answer_tokens.ego" not in said
+
+
 def test_the_same_prompt_has_no_difference(runs: tuple[Path, Path], harness: Harness) -> None:
     assert json.loads(harness("compare", *runs, "--json")[1])["prompts"] is None
     out = harness("compare", *runs, "--html", "page.html")[1]

@@ -11,7 +11,7 @@ from harness.core.errors import printable
 from harness.core.multiplicity import holm, p_of_bootstrap
 from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
-from harness.prompts.difference import PromptChange, change
+from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.prompts.versions import as_it_was
 from harness.report.compare import percentiles
 from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
@@ -144,17 +144,20 @@ def compare(pair: Pair) -> Comparison:
 
 
 def _prompts(pair: Pair) -> PromptChange | str | None:
-    a, b = (side.run.manifest.prompt for side in (pair.a, pair.b))
-    if a["sha256"] == b["sha256"]:
+    """What differs between the egos' prompts, and between the first helpers'."""
+    a, b = ([side.run.manifest.agent(place)["prompt"] for place in (0, 1)] for side in (pair.a, pair.b))
+    if [prompt["sha256"] for prompt in a] == [prompt["sha256"] for prompt in b]:
         return None
-    before, after = (as_it_was(prompt["version"], prompt["sha256"]) for prompt in (a, b))
-    if before and after:
-        return change(before, after)
-    name, lacks = ("B", b) if before else ("A", a)
-    return (
-        f"what differs between the prompts is not known: {name}'s {printable(lacks['version'], 40)} "
-        f"with sha256 {printable(lacks['sha256'], 13)} is not here"
-    )
+    here = []
+    for name, prompt in zip("AABB", (*a, *b), strict=True):
+        found = as_it_was(prompt["version"], prompt["sha256"])
+        if found is None:
+            return (
+                f"what differs between the prompts is not known: {name}'s {printable(prompt['version'], 40)} "
+                f"with sha256 {printable(prompt['sha256'], 13)} is not here"
+            )
+        here.append(found)
+    return change(of_swarm(*here[:2]), of_swarm(*here[2:]))
 
 
 def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:

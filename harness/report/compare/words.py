@@ -213,10 +213,16 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
     change = comparison.prompts
     if change is None or isinstance(change, str):
         return [change] if change else []
-    sides = (comparison.pair.a, comparison.pair.b)
-    a, b = (printable(side.run.manifest.variant.prompt, 40) for side in sides)
+    pair = comparison.pair
+    ego, helper = (
+        [printable(side.run.manifest.agent(place)["prompt"]["version"], 40) for side in (pair.a, pair.b)]
+        for place in (0, 1)
+    )
+    who = f"prompt {' → '.join(ego)}"
+    if ego != helper:
+        who = f"ego's {who}, helper's {' → '.join(helper)}"
     counts = [f"{file} {t.removed} words removed, {t.added} added" for file, t in change.texts.items()]
-    said = [f"prompt {a} → {b}: {', '.join(counts)}"]
+    said = [f"{who}: {', '.join(counts)}"]
     said += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
     hunks = [(file, hunk) for file, text in change.texts.items() for hunk in text.hunks]
     for file, hunk in hunks[:most]:
@@ -224,7 +230,8 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
         text = "".join(piece for _, piece in marked(hunk))
         said += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
     if len(hunks) > most:
-        said.append(f"  {len(hunks) - most} more changes: `harness prompt diff {a} {b}`")
+        seen = dict.fromkeys(f"`harness prompt diff {a} {b}`" for a, b in (ego, helper) if a != b)
+        said.append(f"  {len(hunks) - most} more changes: {' and '.join(seen)}")
     return said
 
 
