@@ -21,10 +21,7 @@ FUSION = "fusion"  # the ego's call with messages
 NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
 COLOURS = {"same": "", "removed": "red", "added": "green"}
 
-app = typer.Typer(
-    help="List prompt versions; show, check or release one, or show what differs between two.",
-    no_args_is_help=True,
-)
+app = typer.Typer(help="List prompt versions; show, check, compare or release them.", no_args_is_help=True)
 
 Version = Annotated[str, typer.Argument(help="Prompt version.")]
 Tokenizer = Annotated[Path | None, typer.Option(help="tokenizer.json, its folder, or a Qwen2 GGUF.")]
@@ -157,9 +154,10 @@ def diff(
     tokenizer: Tokenizer = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show what differs between two versions, word by word: settings, templates, and what a model is sent.
+    """Show what differs between two versions, word by word.
 
-    A scene is rendered for the ego, for its first helper, and for the ego with the messages of all.
+    Their settings, their templates, and what a model is sent of a scene: the ego, its first helper, and the
+    ego with a message of every helper.
     """
     from harness.backends.tokens import counter
     from harness.dataset import load
