@@ -103,6 +103,7 @@ def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
         texts={**ego.texts, "helper": helper.texts["helper"]},
         max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
         helper_answer=helper.helper_answer,
+        reasons_first=tuple(r for r, p in (("ego", ego), ("helper", helper)) if r in p.reasons_first),
     )
 
 

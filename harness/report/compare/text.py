@@ -48,7 +48,7 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
             yield f"{named:<27}{one.a:>7}{one.b:>9}{one.change:>9} {one.interval:>18}{one.p:>9}"
         yield words.success(c, pair)
         yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
-        yield words.decisions(c)
+        yield words.decisions(c, pair)
         yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
     yield words.many(comparison)
     if not comparison.answers:
@@ -71,7 +71,7 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     for c in comparison.conditions:
         said += [f"#### {code(c.condition)}", "", *_table(c), "", words.success(c, pair), ""]
         said += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
-        said += ["", words.decisions(c), ""]
+        said += ["", words.decisions(c, pair), ""]
         said += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
         said += [""]
     said += [f"{words.many(comparison)}.", ""]

@@ -180,11 +180,13 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     return _listed(said, len(some), most)
 
 
-def decisions(c: InCondition) -> str:
+def decisions(c: InCondition, pair: Pair) -> str:
     """How many decisions flipped, and in how many one run alone gave success away."""
     n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
     said = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both had"
-    return f"{said}; success given away by B alone in {n['B']}, by A alone in {n['A']}" if c.flips else said
+    if not c.flips or pair.a.run.world == "closed-loop":  # which knows no regret
+        return said
+    return f"{said}; success given away by B alone in {n['B']}, by A alone in {n['A']}"
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
