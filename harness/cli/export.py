@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from harness.cli.progress import bar
 from harness.core import extras
 from harness.core.errors import UserError, printable
 
@@ -62,12 +63,14 @@ def command(
         elif sft:
             from harness.training import pairs
 
-            written = [pairs.write(source, sft, report_seeds_too)]
+            with bar("writing chats"):
+                written = [pairs.write(source, sft, report_seeds_too)]
         elif inspect:
             extras.need("--inspect", "inspect_ai")
             from harness.report import inspect_log
 
-            written = [inspect_log.write(source, inspect)]
+            with bar("writing a log"):
+                written = [inspect_log.write(source, inspect)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
         other = "name another file" if target else "choose another folder with --out"

@@ -77,15 +77,12 @@ def _samples(run: Run) -> Iterator[log.EvalSample]:
     d = run.decisions
     regret, safe = d["regret"], d.of_actions("safe")
     condition = d.codes("condition", run.conditions)
+    episode, step = d.whole("episode"), d.whole("step")
     for name, rows in d.scenes.items():
         answers = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
         kept = _kept(run, condition[rows.start : rows.stop], regret[rows.start : rows.stop])
         target = [a for a, is_safe in zip(run.actions, safe[rows.start] == 1.0, strict=True) if is_safe]
-        facts = {
-            "scene": name,
-            "episode": int(d.whole("episode")[rows.start]),
-            "step": int(d.whole("step")[rows.start]),
-        }
+        facts = {"scene": name, "episode": int(episode[rows.start]), "step": int(step[rows.start])}
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
             if sent and name in scenes:

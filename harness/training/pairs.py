@@ -31,6 +31,11 @@ def write(run: Run, path: Path, report_seeds_too: bool) -> Path:
         UserError: the run was driven, its dataset or prompt is not here as it was, or its layouts are those
             that numbers are reported of and `report_seeds_too` is false.
     """
+    if not isinstance(run.manifest.world, FrozenScenes):
+        raise UserError(
+            f"--sft: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
+            "to; give a run of `harness eval`"
+        )
     seeds = sorted({episode.layout_seed for episode in run.episodes})
     first, count = seeds[0], seeds[-1] - seeds[0] + 1
     if seeds[-1] >= FIRST["report"] and not report_seeds_too:
@@ -48,14 +53,12 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
 
     A decision point after which no action succeeds teaches nothing and is left out.
 
+    Args:
+        run: on frozen scenes.
+
     Raises:
-        UserError: as `write` says.
+        UserError: its dataset or prompt is not here as it was.
     """
-    if not isinstance(run.manifest.world, FrozenScenes):
-        raise UserError(
-            f"--sft: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
-            "to; give a run of `harness eval`"
-        )
     prompts = {}
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         version, sha256 = (agent["prompt"][key] for key in ("version", "sha256"))
