@@ -223,7 +223,10 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
     who = f"prompt {' → '.join(ego)}"
     if ego != helper:
         who = f"ego's {who}, helper's {' → '.join(helper)}"
-    counts = [f"{file} {t.removed} words removed, {t.added} added" for file, t in change.texts.items()]
+    counts = [
+        f"{file} {t.removed} words removed, {t.added} added" if t.hunks else f"{file} the same"
+        for file, t in change.texts.items()
+    ]
     said = [f"{who}: {', '.join(counts)}"]
     said += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
     hunks = [(file, hunk) for file, text in change.texts.items() for hunk in text.hunks]
