@@ -37,9 +37,10 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Evaluate all combinations of models, prompts and answer modes of ego and helpers.
+    """Evaluate every combination of ego and helper agents.
 
-    Each is asked once in each role. The same command continues one that was stopped.
+    An agent is a model with a prompt and an answer mode; each is asked once in each role. The same command
+    continues one that was stopped.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file

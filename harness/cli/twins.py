@@ -49,7 +49,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Ask about decision points and about their twins, and test what must hold of both answers.
+    """Test what must hold of the answers to a question and its twin.
 
     The same command continues one that was stopped.
     """
