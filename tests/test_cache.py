@@ -44,6 +44,7 @@ CHANGED: dict[str, Any] = {
     "answer": "constrained",
     "thinking": True,
     "reasons_first": True,
+    "temperature": 0.7,
     "sample": 1,
     "agent": 1,
     "view": {"nodes": []},

@@ -32,7 +32,10 @@ class Request:
             `harness.prompts.readout`), whose probabilities are the answer.
         thinking: whether the model was asked to think first (where its template can).
         reasons_first: whether the prompt asks for reasons before the answer.
-        sample: which of several answers to one question; 0 where one is asked for.
+        temperature: 0 takes the likeliest token each time; above, tokens are drawn from softmax(logits /
+            temperature).
+        sample: which of several answers to one question, and so the seed of its draws; 0 where one is asked
+            for.
         agent: which of the run's agents is asked: 0 is the ego's.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
@@ -49,6 +52,7 @@ class Request:
     answer: AnswerMode = "json"
     thinking: bool = False
     reasons_first: bool = False
+    temperature: float = 0.0
     sample: int = 0
     agent: int = 0
     view: Mapping[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""The three answer modes, each written once, over any engine. All of them greedy.
+"""The three answer modes, each written once, over any engine.
 
 `json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout`: it is asked
 for one letter, and the letters' probabilities are the answer.
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from harness.backends.base import FinishReason, Request
 from harness.backends.engine import Engine, Session
+from harness.backends.sampling import Choice
 from harness.backends.skeleton import Skeleton, finished, tokens_after
 from harness.core.errors import UserError, printable
 from harness.prompts.readout import letters, stated
@@ -62,15 +63,17 @@ class Decoding:
             requests: all to be answered the same way, and `room` was there for each.
             prompts: their rendered messages, in tokens.
         """
-        ways = {"json": self._free, "constrained": self._constrained, "readout": self._read_out}
         with closing(self._engine.begin(prompts)) as session:
-            return ways[requests[0].answer](session, requests)
+            if requests[0].answer == "readout":
+                return self._read_out(session, requests)
+            way = self._free if requests[0].answer == "json" else self._constrained
+            return way(session, requests, Choice(requests, prompts))
 
-    def _free(self, session: Session, requests: Sequence[Request]) -> list[Answer]:
+    def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         said: list[list[int]] = [[] for _ in requests]
         live = list(range(len(requests)))
         while live:
-            for i, token in zip(live, session.argmax([None] * len(live)), strict=True):
+            for i, token in zip(live, choice.next(session, live, [None] * len(live)), strict=True):
                 said[i].append(token)
             live = _narrow(session, live, [not self._over(said[i], requests[i]) for i in live])
             if live:
@@ -85,14 +88,15 @@ class Decoding:
             return Answer(self._chat.decode(said[:-1]), len(said), "stop")
         return Answer(self._chat.decode(said), len(said), "length")
 
-    def _constrained(self, session: Session, requests: Sequence[Request]) -> list[Answer]:
+    def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
         chosen: dict[int, list[int]] = {}
         live = list(range(len(requests)))
         while live:
             session.advance([asks[i].forced for i in live])
-            for i, token in zip(live, session.argmax([asks[i].among for i in live]), strict=True):
+            among = [asks[i].among for i in live]
+            for i, token in zip(live, choice.next(session, live, among), strict=True):
                 try:
                     asks[i] = walks[i].send(token)
                 except StopIteration as end:

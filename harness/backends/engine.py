@@ -21,8 +21,11 @@ class Session(Protocol):
         """
         ...
 
-    def log_probs(self, tokens: Sequence[int]) -> Floats:
-        """Natural log-probabilities of some tokens as the next one, of the whole vocabulary, (n, len)."""
+    def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
+        """Natural log-probabilities of some tokens, or of all, as the next one, of the whole vocabulary.
+
+        Shape (n, len(tokens)), or (n, vocabulary).
+        """
         ...
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:

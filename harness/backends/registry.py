@@ -38,6 +38,7 @@ class Capabilities:
         closed_loop: it answers for scenes that are new, not only for recorded ones.
         own_latency: it is a `harness.backends.base.Timed`: its answers were timed before.
         reference: a driver that a report holds models against.
+        samples: it heeds a request's `temperature` and `sample`, but for a `readout`.
     """
 
     language_model: bool = True
@@ -49,6 +50,7 @@ class Capabilities:
     closed_loop: bool = True
     own_latency: bool = False
     reference: bool = False
+    samples: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ BUILT_IN: Mapping[str, Registration] = {
     ),
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
-        Capabilities(has_weights=True),
+        Capabilities(has_weights=True, samples=True),
         card_keys=(*_WEIGHTS, "dtype"),
         required_keys=("weights",),
         packages={"torch": "torch", "transformers": "transformers"},
@@ -103,7 +105,7 @@ BUILT_IN: Mapping[str, Registration] = {
     ),
     "llama-cpp": Registration(
         "harness.backends.llama_cpp.backend:open",
-        Capabilities(has_weights=True),
+        Capabilities(has_weights=True, samples=True),
         card_keys=(*_WEIGHTS, "file", "quantisation"),
         required_keys=("weights",),
         packages={"llama_cpp": "llama-cpp-python"},
@@ -112,7 +114,7 @@ BUILT_IN: Mapping[str, Registration] = {
     ),
     "openai": Registration(
         "harness.backends.openai.backend:open",
-        Capabilities(thinks="card"),
+        Capabilities(thinks="card", samples=True),
         required_keys=("weights", "server"),
     ),
 }

@@ -1,6 +1,7 @@
 """Replay: the answers of an earlier run, so that a changed parser, rule or mix is scored without a model."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ class Replay:
         lacking: dict[str, list[Request]] = {}
         for request, answer in zip(requests, known, strict=True):
             if answer is None:
-                lacking.setdefault(request.role, []).append(request)
+                lacking.setdefault(request.role, []).append(self._drawn(request))
         asked = {
             c.request_id: c for role, some in lacking.items() for c in self._model(role, some).complete(some)
         }
@@ -86,6 +87,13 @@ class Replay:
                 )
             self._models[role] = cached(model, card, default_file())
         return self._models[role]
+
+    def _drawn(self, request: Request) -> Request:
+        """The request as the run would have asked it."""
+        manifest = self._run.manifest
+        if request.answer == "readout":
+            return request
+        return replace(request, temperature=manifest.temperature, sample=manifest.sampling_seed)
 
     def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
         shown = printable(self._run.path)

@@ -51,6 +51,8 @@ def command(
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
     helper_thinking: options.HelperThinking = None,
+    temperature: options.Temperature = 0.0,
+    sampling_seed: options.SamplingSeed = 0,
     batch_size: options.BatchSize = 8,
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -90,6 +92,8 @@ def command(
             batch_size=batch_size,
             device=device,
             dtype=dtype,
+            temperature=temperature,
+            sampling_seed=sampling_seed,
             latency=latency,
             tags=tuple(dict.fromkeys(tag or ())),
         )

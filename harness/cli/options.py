@@ -71,6 +71,10 @@ Latency = Annotated[
         "(batch 1, on this machine if it is idle). Default: the card's, else the paper's."
     ),
 ]
+Temperature = Annotated[
+    float, Option(help="Draw answers at this temperature, 0 to 2; 0 takes the likeliest token each time.")
+]
+SamplingSeed = Annotated[int, Option(help="Seed of those draws.")]
 NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that an earlier run has.")]
 Tags = Annotated[list[str] | None, Option(help="Word to find the run by. Repeatable.")]
 Json = Annotated[bool, Option("--json", help="Print JSON.")]

@@ -50,6 +50,11 @@ class Agent:
         return capabilities(self.card.engine)
 
     @property
+    def samples(self) -> bool:
+        """Whether a temperature draws its answers: a read-out is a distribution already."""
+        return self.can.samples and self.answer != "readout"
+
+    @property
     def name(self) -> str:
         """Model, prompt and answer mode, for people and tables."""
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"

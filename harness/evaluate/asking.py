@@ -46,6 +46,8 @@ def _request(
     spec: Spec, who: int, name: str, role: Role, messages: tuple[Mapping[str, str], ...], **more: Any
 ) -> Request:
     agent = spec.agents[who]
+    if agent.samples:
+        more |= {"temperature": spec.temperature, "sample": spec.sampling_seed}
     return Request(
         id=name, role=role, messages=messages, actions=spec.actions, max_tokens=agent.most_tokens(role),
         form=agent.prompt.helper_answer, answer=agent.answer, thinking=agent.thinking,

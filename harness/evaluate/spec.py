@@ -24,6 +24,7 @@ from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
+HOTTEST = 2.0
 
 
 class Source(Protocol):
@@ -77,6 +78,8 @@ class Spec:
         batch_size: most requests that go through an engine together.
         device: engines' device, or None for their choice.
         dtype: number format, or None for the cards'.
+        temperature: of the models' answers; 0 takes the likeliest token each time.
+        sampling_seed: of their draws, so that the same question has other answers under another one.
         latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
             reads them; None for each card's, else the paper's.
         tags: words to find the run by, which change nothing in it.
@@ -90,6 +93,8 @@ class Spec:
     batch_size: int = 8
     device: str | None = None
     dtype: str | None = None
+    temperature: float = 0.0
+    sampling_seed: int = 0
     latency: str | None = None
     tags: tuple[str, ...] = ()
 
@@ -108,6 +113,7 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
+        self._check_sampling()
         for agent in self.agents:
             self._check(agent)
         lone = [agent for agent in self.agents if not agent.can.asks_helpers]
@@ -132,6 +138,22 @@ class Spec:
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "
                     f"(engines {' and '.join(able)} have); leave it out"
                 )
+
+    def _check_sampling(self) -> None:
+        shown = f"--temperature {self.temperature:g}"
+        if not 0 <= self.temperature <= HOTTEST:
+            raise UserError(f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}")
+        if self.sampling_seed < 0 or (self.sampling_seed and not self.temperature):
+            raise UserError(
+                f"--sampling-seed {self.sampling_seed}: give 0 or more, with a --temperature above 0: "
+                "greedy answers are not drawn"
+            )
+        if self.temperature and not any(agent.samples for agent in self.agents):
+            name = printable(self.ego.card.name)
+            reason = f"{name} has nothing to sample; leave it out, or give a model that writes its answers"
+            if self.ego.answer == "readout":
+                reason = "a readout is a distribution already; use --answer json or constrained"
+            raise UserError(f"{shown}: {reason}")
 
     def _check(self, agent: Agent) -> None:
         name, version = printable(agent.card.name), agent.prompt.version
@@ -227,6 +249,8 @@ class Spec:
             "seeds": list(self.seeds),
             "batch_size": self.batch_size,
             "dtype": self.dtype,
+            "temperature": self.temperature,
+            "sampling_seed": self.sampling_seed,
             "latency_source": self.latency,
         }
 
@@ -239,6 +263,7 @@ class Spec:
             *self._helper_options(), *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
+            ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]

@@ -50,6 +50,11 @@ def of_run(run: Run) -> Iterator[str]:
     n = len(run.grid.episodes)
     if n < FEW:
         yield f"Only {n} episodes: a rate's interval may reach {98 / n**0.5:.0f} points to either side."
+    if run.manifest.temperature:
+        yield (
+            f"Answers were drawn at temperature {run.manifest.temperature:g}, with sampling seed "
+            f"{run.manifest.sampling_seed}: another seed has others."
+        )
     retries = sum(answer.retries for answer in run.answers)
     if run.manifest.engine_errors or retries:
         errors = run.manifest.engine_errors

@@ -330,6 +330,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
     answer: str
     batch_size: int
     dtype: str | None
+    temperature: float = 0.0
+    sampling_seed: int = 0
     latency_source: str | None
     latency: Latency
     answer_times: dict[str, Times] = field(default_factory=dict)

@@ -145,6 +145,7 @@ class Stored:
         return Spec(
             ego, FrozenSource(self._dataset), (), manifest.seeds, tuple(helpers),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
+            temperature=manifest.temperature, sampling_seed=manifest.sampling_seed,
         )  # fmt: skip
 
     def _agent(self, stated: Mapping[str, Any]) -> Agent:

@@ -152,12 +152,12 @@ class LlamaSession:
                 best.append(int(tokens[row[tokens].argmax()]))
         return best
 
-    def log_probs(self, tokens: Sequence[int]) -> Floats:
+    def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         largest = self._logits.max(axis=1, keepdims=True).astype(np.float64)
         check_logits(largest.ravel().tolist())
         logits = self._logits - largest
         total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
-        found: Floats = logits[:, list(tokens)] - total
+        found: Floats = (logits if tokens is None else logits[:, list(tokens)]) - total
         return found
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:

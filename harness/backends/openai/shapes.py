@@ -27,6 +27,10 @@ _PENALTY: Mapping[Kind, str] = {
     "llama-cpp-python": "repeat_penalty",
     "lm-studio": "repeat_penalty",
 }
+# Drawing is from all tokens, which some servers cut to the likeliest unless told otherwise.
+_ALL: Mapping[Kind, Mapping[str, int]] = {
+    kind: {"top_k": -1 if kind == "vllm" else 0, "min_p": 0} for kind in _PENALTY
+}
 
 
 @dataclass(frozen=True)
@@ -42,17 +46,19 @@ class Said:
 
 
 def body(card: Card, server: Server, request: Request) -> dict[str, Any]:
-    """The JSON of one chat completion: greedy, in one piece."""
+    """The JSON of one chat completion, in one piece."""
     asked: dict[str, Any] = {
         "model": card.weights,
         "messages": [dict(message) for message in request.messages],
         "max_tokens": request.max_tokens,
-        "temperature": 0,
-        "seed": 0,
+        "temperature": request.temperature or 0,
+        "seed": request.sample,
         "stream": False,
     }
     if server.kind in _PENALTY:
         asked[_PENALTY[server.kind]] = 1.0
+    if request.temperature:
+        asked |= {"top_p": 1, **_ALL.get(server.kind, {})}
     if card.thinking == "switch":
         asked["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":

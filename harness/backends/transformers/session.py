@@ -116,10 +116,11 @@ class Rows:
         chosen: list[int] = torch.stack(found).tolist()
         return chosen
 
-    def log_probs(self, tokens: Sequence[int]) -> Floats:
+    def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         logits = self._logits.float()
         check_logits(logits.amax(-1).tolist())
-        found: Floats = (logits[:, list(tokens)] - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
+        some = logits if tokens is None else logits[:, list(tokens)]
+        found: Floats = (some - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
         return found
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
@@ -156,7 +157,7 @@ class Apart:
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
         return [s.argmax([tokens])[0] for s, tokens in zip(self._sessions, among, strict=True)]
 
-    def log_probs(self, tokens: Sequence[int]) -> Floats:
+    def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         return np.concatenate([session.log_probs(tokens) for session in self._sessions])
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
