@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli import options, suite
+from harness.cli import options, repeats, suite
 from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.cli.run import Column, Swarm, as_mapping, default_out, show
 from harness.core import resources, work
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 
 if TYPE_CHECKING:
@@ -53,6 +53,9 @@ def command(
     helper_thinking: options.HelperThinking = None,
     temperature: options.Temperature = 0.0,
     sampling_seed: options.SamplingSeed = 0,
+    repeat: int | None = typer.Option(
+        None, "--repeats", help="Evaluate so many times, with sampling seeds one after the other."
+    ),
     batch_size: options.BatchSize = 8,
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -101,8 +104,14 @@ def command(
     ]
     if named:
         suite.check(named, specs)
+    if repeat is not None:
+        if named:
+            raise UserError(f"--repeats {repeat}: a suite is no one dataset; give one")
+        repeats.check(specs[0], repeat)
     if dry_run:
         counted = [_counted(*each, tokenizer) for each in zip(specs, frozen, strict=True)]
+        if repeat is not None:
+            counted[0] |= {"repeats": repeat}
         if as_json:
             echo_json(counted if named else counted[0])
         elif not quiet:
@@ -111,6 +120,9 @@ def command(
         return
     silent, cache = as_json or quiet, None if no_cache else default_file()
     evaluated = partial(_evaluated, cache=cache, silent=silent)
+    if repeat is not None:
+        repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
+        return
     if named:
         suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
         return
@@ -163,10 +175,11 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
 
 
 def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
+    repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
     typer.echo(
-        f"{spec.source.name}: {counted['requests']} requests for the {counted['scenes']} scenes on the "
-        f"reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} seeds; "
-        "no model was called"
+        f"{spec.source.name}: {counted['requests']} requests{repeated} for the {counted['scenes']} scenes "
+        f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
+        "seeds; no model was called"
     )
     for role, s in (counted["prompt_tokens"] or {}).items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from harness.cli.estimates import console, interval, table
+from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.formats import WORK
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
@@ -94,6 +96,49 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
     name += f"-{scenes}"
     folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
     return next(folder for folder in folders if not folder.exists() or goes_on(folder))
+
+
+@dataclass(frozen=True)
+class Together:
+    """Several runs in one folder.
+
+    Attributes:
+        specs: by the name of the run's own folder in it.
+        what: they are when all is done: `a finished suite`.
+        marker: the file that is written then.
+        others: files that are written before it.
+    """
+
+    specs: "Mapping[str, Spec]"
+    what: str
+    marker: str
+    others: Sequence[str]
+
+    def check(self, out: Path) -> None:
+        """Raise UserError unless a folder is new, or these runs were stopped in it."""
+        from harness.evaluate.run import finished, left
+
+        if (out / self.marker).is_file():
+            raise UserError(
+                f"--out {printable(out)} already holds {self.what}; choose another folder or delete it"
+            )
+        if out.exists() and not out.is_dir():
+            raise UserError(f"--out {printable(out)} is no folder; choose an empty or a new one")
+        ours = {*self.others, *self.specs}
+        if out.is_dir() and any(path.name not in ours and path.name[0] != "." for path in out.iterdir()):
+            raise UserError(
+                f"--out {printable(out)} is a folder with other files in it; choose an empty or a new one"
+            )
+        for name, spec in self.specs.items():
+            (finished if (out / name / "run.json").is_file() else left)(spec, out / name)
+
+    def goes_on(self, out: Path) -> bool:
+        """Whether these runs were stopped in a folder, and nobody is at them."""
+        try:
+            self.check(out)
+        except UserError:
+            return False
+        return not any(work.held(run) for run in map(out.joinpath, self.specs) if (run / WORK).is_dir())
 
 
 def _mode(agent: "Agent") -> str:

@@ -1,7 +1,7 @@
 """`harness eval --dataset suite:NAME`: a run of each dataset, and the means over families."""
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +9,7 @@ import msgspec
 import typer
 
 from harness.cli.estimates import console, echo_json, interval, table
-from harness.cli.run import as_mapping, free_folder, origins
-from harness.core import work
+from harness.cli.run import Together, as_mapping, free_folder, origins
 from harness.core.errors import UserError, printable
 from harness.core.formats import SUITE, WORK
 
@@ -47,44 +46,6 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
             raise UserError(f"--model {name}: a replay has the answers of one run; replay its dataset")
 
 
-def _left(specs: "Sequence[Spec]", out: Path) -> None:
-    """Raise UserError unless a folder is new, or these runs were stopped in it."""
-    from harness.evaluate.run import finished
-    from harness.evaluate.run import left as left_in
-    from harness.runs.suite import SUMMARY
-
-    if (out / SUITE).is_file():
-        raise UserError(
-            f"--out {printable(out)} already holds a finished suite; choose another folder or delete it"
-        )
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {printable(out)} is no folder; choose an empty or a new one")
-    ours = {SUMMARY, "report.html", *_names(specs)}
-    if out.is_dir() and any(path.name not in ours and path.name[0] != "." for path in out.iterdir()):
-        raise UserError(
-            f"--out {printable(out)} is a folder with other files in it; choose an empty or a new one"
-        )
-    for spec in specs:
-        run = out / spec.source.name
-        if (run / "run.json").is_file():
-            finished(spec, run)
-        else:
-            left_in(spec, run)
-
-
-def _names(specs: "Sequence[Spec]") -> list[str]:
-    return [spec.source.name for spec in specs]
-
-
-def _goes_on(specs: "Sequence[Spec]", out: Path) -> bool:
-    """Whether these runs were stopped in a folder, and nobody is at them."""
-    try:
-        _left(specs, out)
-    except UserError:
-        return False
-    return not any(work.held(run) for run in map(out.joinpath, _names(specs)) if (run / WORK).is_dir())
-
-
 def evaluate(
     suite: "Suite", specs: "Sequence[Spec]", datasets: "Sequence[Dataset]", out: Path | None,
     evaluated: Callable[..., Any], quiet: bool, as_json: bool,
@@ -93,10 +54,12 @@ def evaluate(
     from harness.backends.registry import open_backend
     from harness.report import suite as report
     from harness.runs.folder import read
-    from harness.runs.suite import SuiteRun, write
+    from harness.runs.suite import SUMMARY, SuiteRun, write
 
-    folder = out or free_folder(specs, suite.name, partial(_goes_on, specs))
-    _left(specs, folder)
+    by_name = {spec.source.name: spec for spec in specs}
+    together = Together(by_name, "a finished suite", SUITE, (SUMMARY, "report.html"))
+    folder = out or free_folder(specs, suite.name, together.goes_on)
+    together.check(folder)
     opens = cache(open_backend)
     for spec, dataset in zip(specs, datasets, strict=True):
         run = folder / spec.source.name

@@ -231,6 +231,19 @@ def _written(
     return Evaluated(out, manifest, summary)
 
 
+def made(
+    spec: Spec, out: Path, progress: Callable[[int], None], cache: Path | None, more: Callable[[int], None],
+    opens: Opens, given: Mapping[str, Answer] = NOTHING,
+) -> folder.Run:  # fmt: skip
+    """One of several runs in a study's folder: read where it is there, else evaluated (see `evaluate`)."""
+    if (out / "run.json").is_file() and not (out / WORK).is_dir():
+        finished(spec, out)
+    else:
+        evaluate(spec, out, progress, cache, more, opens=opens, given=given)
+        work.tidy(out)
+    return folder.read(out)
+
+
 def finished(spec: Spec, out: Path) -> Evaluated:
     """The run that is there already. Raises UserError if it is another run, or damaged."""
     run = folder.read(out)

@@ -15,16 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from harness.backends.registry import open_backend
-from harness.core import noise, work
+from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.formats import WORK
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.evaluate.agent import Agent
-from harness.evaluate.run import evaluate, finished
+from harness.evaluate.run import made
 from harness.evaluate.spec import Spec
-from harness.runs.folder import Run, read
+from harness.runs.folder import Run
 from harness.runs.metrics import (
     LATENCY,
     METRICS,
@@ -176,13 +175,8 @@ def run_cells(
     cells = []
     for (i, j), of in specs.items():
         folder, roles = out / "cells" / f"{i}-{j}", {"ego": egos[i - 1].name, "helper": helpers[j - 1].name}
-        if (folder / "run.json").is_file() and not (folder / WORK).is_dir():
-            finished(of, folder)
-        else:
-            given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
-            evaluate(of, folder, progress, cache_file, more, opens=opens, given=given)
-            work.tidy(folder)
-        run = read(folder)
+        given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
+        run = made(of, folder, progress, cache_file, more, opens, given)
         for answer in run.answers:
             if answer.role in roles:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer

@@ -1,0 +1,234 @@
+"""`harness eval --repeats`: the same evaluation several times, with other draws of its model's answers.
+
+A repeat is a whole run with a sampling seed of its own; channel and layouts are the same. What differs
+between repeats is the model's chance alone. All intervals are over episodes.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.backends.registry import open_backend
+from harness.coordination.trigger import entropy_nats
+from harness.core import noise
+from harness.core.arrays import Floats, Ints
+from harness.core.errors import UserError, printable
+from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval
+from harness.evaluate.run import made
+from harness.evaluate.spec import Spec
+from harness.runs.folder import Run
+from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
+from harness.runs.records import Score
+
+RESAMPLES = 4000
+FLIPS, STABLE, BETWEEN = "flip_rate", "stable_rate", "between_episodes_share"
+STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_minus_sampled_nats"
+
+
+def each(spec: Spec, repeats: int) -> dict[str, Spec]:
+    """The runs of several repeats, by the name of their folders."""
+    seeds = range(spec.sampling_seed, spec.sampling_seed + repeats)
+    return {f"repeat-{n}": replace(spec, sampling_seed=seed) for n, seed in enumerate(seeds, 1)}
+
+
+def run_repeats(
+    spec: Spec, repeats: int, out: Path,
+    progress: Callable[[int], None], more: Callable[[int], None], cache_file: Path | None,
+) -> "Repeats":  # fmt: skip
+    """Evaluate every repeat in a folder of its own under `out`; those that are there stay.
+
+    Args:
+        spec: the evaluation; the first repeat has its sampling seed, each other one the next.
+        repeats: how many.
+        out: the folder.
+        progress: called with the number of new answers.
+        more: called with the number of answers that are owed next.
+        cache_file: of completions kept between runs; None for no cache.
+
+    Raises:
+        UserError: the folder holds something else, or a model is not available.
+    """
+    opens = cache(open_backend)
+    runs = [
+        made(of, out / name, progress, cache_file, more, opens) for name, of in each(spec, repeats).items()
+    ]
+    return Repeats(out, tuple(runs))
+
+
+class Wavering(NamedTuple):
+    """A decision point at which repeats decided otherwise, and how often each action was decided."""
+
+    scene: str
+    condition: str
+    flips: float
+    actions: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Runs that differ in the draws of their answers alone.
+
+    Attributes:
+        path: the folder that theirs lie in.
+        runs: two or more.
+    """
+
+    path: Path
+    runs: tuple[Run, ...]
+
+    def __post_init__(self) -> None:
+        if len({(run.conditions, run.grid) for run in self.runs}) > 1:
+            raise UserError(f"{printable(self.path)}: its runs are not of the same episodes and conditions")
+
+    @property
+    def k(self) -> int:
+        """How many repeats there are."""
+        return len(self.runs)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the operating points."""
+        return self.runs[0].conditions
+
+    @cached_property
+    def scores(self) -> tuple[Score, ...]:
+        """All figures, as a run's summary has its own."""
+        found = [
+            (condition, metric, estimate)
+            for place, condition in enumerate(self.conditions)
+            for metric, estimate in self._of_condition(place)
+        ]
+        found += [(ALL, metric, estimate) for metric, estimate in self._doubts()]
+        return tuple(Score.of(*each, "episodes") for each in found)
+
+    def estimate(self, condition: str, metric: str) -> Estimate:
+        """One figure; NaN where it is not known."""
+        [found] = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
+        return found.estimate
+
+    def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
+        _, counts, episodes = self._actions
+        asked = counts[place].sum(axis=(-2, -1)) > 0
+        of = episodes[asked]
+        yield FLIPS, rate_interval(known_mean(flips(counts[place]), axis=-1)[asked], of)
+        yield STABLE, rate_interval(known_mean(stable(counts[place]), axis=-1)[asked], of)
+        success = self._success[:, place]
+        yield SUCCESS, rate_interval(success.mean(axis=(0, 1)))
+        wins = success.sum(axis=0)
+        for name, of_k in (("pass^", all_of), ("any@", any_of)):
+            for j in range(2, self.k + 1):
+                yield f"{name}{j}", rate_interval(of_k(wins, self.k, j).mean(axis=0))
+        yield BETWEEN, between_share(success.mean(axis=1).T)
+
+    @cached_property
+    def _success(self) -> Floats:
+        """Whether each episode succeeded, (k, C, S, E)."""
+        metrics = [METRICS[SUCCESS]]
+        return np.array([by_episode(metrics, r.grid, r.decisions, r.episodes)[SUCCESS] for r in self.runs])
+
+    @cached_property
+    def _actions(self) -> tuple[list[str], Ints, Ints]:
+        """Decision points (D,), how many repeats took each action there, (C, D, S, A), and their episodes."""
+        labels = {scene for run in self.runs for scene in run.decisions.labels("scene") if scene}
+        scenes, run = sorted(labels), self.runs[0]
+        conditions, seeds, _ = run.grid.shape
+        counts = np.zeros((conditions, len(scenes), seeds, len(run.actions)), dtype=np.int64)
+        episodes = np.zeros(len(scenes), dtype=np.int64)
+        for run in self.runs:
+            scene = run.decisions.codes("scene", scenes)
+            condition, seed, episode = np.unravel_index(run.grid.places(run.decisions), run.grid.shape)
+            np.add.at(counts, (condition, scene, seed, run.decisions.codes("action", run.actions)), 1)
+            episodes[scene] = episode
+        return scenes, counts, episodes
+
+    def wavering(self, most: int) -> list[Wavering]:
+        """The decision points that repeats disagree on, the most of them first."""
+        scenes, counts, _ = self._actions
+        of = np.nan_to_num(known_mean(flips(counts), axis=-1))
+        worst = np.argsort(-of, axis=None, kind="stable")[:most]
+        found = []
+        for c, d in zip(*np.unravel_index(worst, of.shape), strict=True):
+            totals = counts[c, d].sum(axis=0).tolist()
+            actions = {a: n for a, n in zip(self.runs[0].actions, totals, strict=True) if n}
+            found.append(Wavering(scenes[d], self.conditions[c], float(of[c, d]), actions))
+        return [point for point in found if point.flips > 0]
+
+    def _doubts(self) -> Iterator[tuple[str, Estimate]]:
+        """The entropy that the ego's answers state, and that of the actions which they rank first."""
+        intents: dict[str, list[tuple[float, ...]]] = {}
+        for run in self.runs:
+            for answer in run.answers:
+                if answer.role == "ego":
+                    intents.setdefault(answer.scene, []).extend([answer.intent] if answer.intent else [])
+        both = np.array([_doubt(np.array(p)) if len(p) > 1 else (math.nan,) * 2 for p in intents.values()])
+        episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
+        for name, values in ((STATED, both[:, 0]), (SAMPLED, both[:, 1])):
+            yield name, in_range(name, episode_interval(values, episodes))
+        yield DOUBT, episode_interval(both[:, 0] - both[:, 1], episodes)
+
+
+def flips(counts: Ints) -> Floats:
+    """Share of pairs of repeats that took different actions, (...), of counts (..., A); NaN for no pair."""
+    n = counts.sum(axis=-1)
+    pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
+    return np.where(pairs > 0, 1 - same / np.maximum(pairs, 1), np.nan)
+
+
+def stable(counts: Ints) -> Floats:
+    """1 where all repeats took one action, else 0, (...), of counts (..., A); NaN for fewer than two."""
+    n = counts.sum(axis=-1)
+    return np.where(n > 1, counts.max(axis=-1) == n, np.nan)
+
+
+def all_of(wins: Floats, k: int, j: int) -> Floats:
+    """Probability that j of k repeats, drawn without replacement, all succeed: pass^j without bias."""
+    return np.asarray(_choose(wins, j) / math.comb(k, j))
+
+
+def any_of(wins: Floats, k: int, j: int) -> Floats:
+    """Probability that at least one of j of k repeats succeeds: any@j without bias (Chen et al. 2021)."""
+    return 1 - all_of(k - wins, k, j)
+
+
+def _choose(n: Floats, j: int) -> Floats:
+    return np.asarray(np.vectorize(math.comb, otypes=[float])(n.astype(int), j))
+
+
+def between_share(values: Floats) -> Estimate:
+    """Share of the variance of values (E, k) that lies between episodes: ICC(1) of Shrout and Fleiss (1979).
+
+    Below 0 where repeats of one episode differ more than episodes do; NaN where nothing differs. The interval
+    resamples episodes.
+    """
+    n, k = values.shape
+    unknown = Estimate(math.nan, math.nan, math.nan, n, 0)
+    if n < 2:
+        return unknown
+    means, within = values.mean(axis=1), values.var(axis=1) * k
+    draws = noise.generator("repeats", "between").multinomial(n, [1 / n] * n, size=RESAMPLES)
+    weights = np.concatenate([np.ones((1, n)), draws])
+    between = k * np.maximum(weights @ means**2 - (weights @ means) ** 2 / n, 0) / (n - 1)
+    inside = weights @ within / (n * (k - 1))
+    total = between + (k - 1) * inside
+    share = np.where(total > 1e-12, (between - inside) / np.maximum(total, 1e-12), np.nan)
+    if np.isnan(share[0]):
+        return unknown
+    low, high = np.nanpercentile(share[1:], (2.5, 97.5))
+    return Estimate(float(share[0]), float(low), float(high), n, 0)
+
+
+def _doubt(p: Floats) -> tuple[float, float]:
+    """Mean entropy of intents (n, A), and the entropy of their likeliest actions, by Miller and Madow (1955).
+
+    The entropy of a few draws is too small on average; they add half of one less than the number of different
+    actions that were drawn, over n.
+    """
+    n = len(p)
+    shares = np.bincount(p.argmax(axis=-1), minlength=p.shape[1]) / n
+    correction = (np.count_nonzero(shares) - 1) / (2 * n)
+    return float(entropy_nats(p).mean()), float(entropy_nats(shares)) + correction
