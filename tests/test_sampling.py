@@ -16,6 +16,7 @@ from harness.backends.cards import Card, Latency, resolve
 from harness.backends.registry import open_backend
 from harness.backends.sampling import drawn
 from harness.backends.servers import Server
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse
@@ -183,6 +184,17 @@ def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_pat
     assert texts[0] == texts[1] != texts[2]
     assert (one.manifest.temperature, one.manifest.sampling_seed) == (1.0, 1)
     assert "--temperature 1.0 --sampling-seed 1" in one.manifest.command
+
+
+def test_a_replay_asks_on_as_the_run_was_asked(small: Dataset, tiny: Path, tmp_path: Path) -> None:
+    """Another condition leads to decision points that the run did not come to."""
+    alone, both = (POINTS["single-local"],), (POINTS["single-local"], POINTS["6g"])
+    spec = spec_of(small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, points=both)
+    stored = run(replace(spec, points=alone), tmp_path / "stored")
+    replayed = spec_of(small, f"replay:{stored.out}", answer="constrained", points=both)
+    again, whole = run(replayed, tmp_path / "again"), run(spec, tmp_path / "whole")
+    assert same_decisions(again.out, whole.out)
+    assert len(read(again.out).answers) > len(read(stored.out).answers)
 
 
 @pytest.mark.parametrize(

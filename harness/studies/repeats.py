@@ -147,10 +147,12 @@ class Repeats:
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """The decision points that repeats disagree on, the most of them first."""
+        """The decision points that repeats disagree on, those with most pairs that do first."""
         scenes, counts, _ = self._actions
         of = np.nan_to_num(known_mean(flips(counts), axis=-1))
-        worst = np.argsort(-of, axis=None, kind="stable")[:most]
+        n = counts.sum(axis=-1)
+        pairs = (n**2 - (counts**2).sum(axis=-1)).sum(axis=-1)
+        worst = np.argsort(-pairs, axis=None, kind="stable")[:most]
         found = []
         for c, d in zip(*np.unravel_index(worst, of.shape), strict=True):
             totals = counts[c, d].sum(axis=0).tolist()
