@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import run, same_decisions, spec_of
+from evaluating import run, same_decisions, scenes_of, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +19,10 @@ from harness.backends.servers import Server
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
+from harness.evaluate.agent import Agent
+from harness.evaluate.asking import requests
 from harness.parsing.parse import parse
+from harness.prompts import versions
 from harness.runs.folder import read
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
@@ -184,6 +187,22 @@ def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_pat
     assert texts[0] == texts[1] != texts[2]
     assert (one.manifest.temperature, one.manifest.sampling_seed) == (1.0, 1)
     assert "--temperature 1.0 --sampling-seed 1" in one.manifest.command
+
+
+def test_in_a_mix_the_half_that_writes_is_drawn(small: Dataset, tiny: Path) -> None:
+    rule, asked = spec_of(small).ego, {"temperature": 0.7, "sampling_seed": 3}
+    for spec, drawn_role in (
+        (spec_of(small, str(tiny), helpers=(rule,), **asked), "ego"),
+        (replace(spec_of(small, str(tiny), **asked), ego=rule, helpers=(agent_of(tiny),)), "helper"),
+        (replace(spec_of(small, str(tiny), **asked), helpers=(agent_of(tiny, "readout"),)), "ego"),
+    ):
+        found = {(r.role, r.temperature, r.sample) for r in requests(spec, scenes_of(small)[:1])}
+        other = "helper" if drawn_role == "ego" else "ego"
+        assert found == {(drawn_role, 0.7, 3), (other, 0.0, 0)}
+
+
+def agent_of(model: Path, answer: AnswerMode = "json") -> Agent:
+    return Agent(resolve(str(model)), versions.load("v2"), answer)
 
 
 def test_a_replay_asks_on_as_the_run_was_asked(small: Dataset, tiny: Path, tmp_path: Path) -> None:
