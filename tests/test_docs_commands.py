@@ -30,7 +30,7 @@ READER_HAS = {
 # Added to what is typed, where it would take minutes; of an option given twice the last one counts.
 CUT = {
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
-    "harness grid": "--limit 2",  # of 200 episodes
+    "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
     "harness twins": "--sample 1 --workers 1",  # of 12 episodes
     "harness campaign paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point

@@ -110,7 +110,9 @@ class Effect:
 
 @dataclass(frozen=True)
 class Halves:
-    """Shares of the variance of success between the cells that each half explains, by episode resampled.
+    """Shares of the variance of success between the cells that each half explains.
+
+    What episodes by chance add is taken off, as a bootstrap over episodes says; so are intervals made.
 
     Attributes:
         condition: the operating point.
@@ -268,7 +270,11 @@ class Grid:
         n = each.shape[1]
         draws = noise.generator("grid", "halves").multinomial(n, [1 / n] * n, size=RESAMPLES)
         weights = np.concatenate([np.ones((1, n)), draws]) / n
-        shares = _shares((each @ weights.T).reshape(self.rows, self.columns, -1))
+        squares = _squares((each @ weights.T).reshape(self.rows, self.columns, -1))
+        # Episodes by chance add as much to the squares of what was played as resampling adds to those.
+        by_chance = squares[:, 1:].mean(axis=1) - squares[:, 0]
+        times = np.where(np.arange(RESAMPLES + 1) > 0, 2, 1)
+        shares = _shares(np.maximum(squares - times * by_chance[:, None], 0.0))
         if np.isnan(shares[:, 0]).any() or np.isnan(shares[0]).mean() > LEVEL:
             return None
         ends = np.nanpercentile(shares[:, 1:], (2.5, 97.5), axis=1).T
@@ -279,13 +285,17 @@ class Grid:
         return Halves(condition, *found)
 
 
-def _shares(means: Floats) -> Floats:
-    """Of means (I, J, B): shares of rows, columns and the rest in the sum of squares, and rows - columns."""
+def _squares(means: Floats) -> Floats:
+    """Of means (I, J, B): sums of squares of rows, of columns, and of what is left, (3, B)."""
     grand = means.mean(axis=(0, 1))
     rows = means.shape[1] * ((means.mean(axis=1) - grand) ** 2).sum(axis=0)
     columns = means.shape[0] * ((means.mean(axis=0) - grand) ** 2).sum(axis=0)
-    total = ((means - grand) ** 2).sum(axis=(0, 1))
+    return np.array([rows, columns, ((means - grand) ** 2).sum(axis=(0, 1)) - rows - columns])
+
+
+def _shares(squares: Floats) -> Floats:
+    """The share of each of the three, and the first less the second, (4, B); NaN where there is nothing."""
+    total = squares.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rest = np.maximum(total - rows - columns, 0.0)
-        parts = np.where(total > 1e-12, np.array([rows, columns, rest]) / total, np.nan)
+        parts = np.where(total > 1e-12, squares / total, np.nan)
     return np.concatenate([parts, parts[:1] - parts[1:2]])

@@ -28,8 +28,18 @@ COSTS = {LATENCY: 1.0, "tokens": 1.0}
 
 
 def in_a_sentence(grid: Grid) -> list[str]:
-    """Which half matters, of each condition in which both were varied and cells differ."""
-    return [_said(grid, found) for c in grid.conditions if (found := grid.halves(c))]
+    """The result under each condition: which half matters, or that none can be told to."""
+    return [_said(grid, h) if (h := grid.halves(c)) else _range(grid, c) for c in grid.conditions]
+
+
+def _range(grid: Grid, condition: str) -> str:
+    rates = [100 * cell.estimate(SUCCESS, condition).value for cell in grid.cells]
+    effects = [effect for effect in grid.effects if effect.condition == condition]
+    return (
+        f"With {condition} the {len(rates)} combinations succeed in {min(rates):.1f} to {max(rates):.1f} % "
+        f"of the episodes; {sum(e.clear for e in effects) or 'none'} of {len(effects)} effects is more than "
+        f"chance explains (n = {grid.cells[0].estimate(SUCCESS, condition).n})."
+    )
 
 
 def _said(grid: Grid, h: Halves) -> str:
