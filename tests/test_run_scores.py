@@ -80,8 +80,8 @@ def value(told: Walked, condition: str, metric: str, interval: str = "episodes")
 
 def test_a_summarys_columns(told: Walked) -> None:
     head, first, *_ = csv_text(Score, told.scores, Variant("proxy", "v2", "json")).splitlines()
-    assert head == "model,prompt,answer,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
-    assert first.startswith("proxy,v2,json,single-local,success_rate,0.25,")
+    assert head == "model,prompt,answer,helpers,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
+    assert first.startswith("proxy,v2,json,,single-local,success_rate,0.25,")
 
 
 def test_success_unsafe_and_late_by_hand(told: Walked) -> None:
