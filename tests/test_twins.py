@@ -47,15 +47,13 @@ def family(request: pytest.FixtureRequest) -> Dataset:
 
 
 @pytest.fixture
-def answering(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None]]:
+def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     """Has a backend answer in the place of the card's."""
 
     def answer(backend: Any) -> None:
-        monkeypatch.setattr(asking, "open_backend", lambda card, **_: backend)
-        asking._opened.cache_clear()
+        monkeypatch.setattr(asking, "opened", lambda *_: backend)
 
-    yield answer
-    asking._opened.cache_clear()
+    return answer
 
 
 def spec_for(dataset: Dataset, model: str = "proxy", **options: Any) -> Spec:

@@ -7,7 +7,7 @@ Importing this loads no engine. A package from outside adds one by an entry poin
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal
@@ -201,6 +201,12 @@ def open_backend(
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     backend: Backend = resolve(engine.opens)(card, device=device, dtype=dtype, batch_size=batch_size)
     return backend
+
+
+@lru_cache(maxsize=8)
+def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> "Backend":
+    """This process's backend of a card, opened once (see `open_backend`)."""
+    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
 def resolve(place: str) -> Any:

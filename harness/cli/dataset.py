@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import as_mapping, console, echo_json, shown, table
+from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import as_mapping, shown
 
 if TYPE_CHECKING:
     from harness.studies.rank import Standing

@@ -1,7 +1,6 @@
-"""Numbers, tables and JSON as people and machines read them."""
+"""Tables and JSON in a terminal."""
 
 import json
-import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,34 +9,12 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from harness.core.statistics import Estimate
-
 WIDTH = 80  # columns of a terminal
 
 
 def echo_json(value: Any, indent: int | None = 1) -> None:
     """Print JSON."""
     typer.echo(json.dumps(value, indent=indent))
-
-
-def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
-    """`value`, `low`, `high` and `n`; null where there is no number."""
-    ends = {"value": estimate.value, "low": estimate.low, "high": estimate.high}
-    return {**{k: None if math.isnan(v) else v for k, v in ends.items()}, "n": estimate.n}
-
-
-def shown(estimate: "Estimate", scale: float = 100.0) -> str:
-    """`89.0 [81.4, 93.7]`: a share in percent, or with another scale."""
-    return interval(estimate.value, estimate.low, estimate.high, scale)
-
-
-def interval(
-    value: float | None, low: float | None, high: float | None, scale: float, decimals: int = 1
-) -> str:
-    """`value [low, high]`; a dash for what is not known."""
-    ends = (math.nan if number is None else number for number in (value, low, high))
-    numbers = ("–" if math.isnan(number) else f"{scale * number:.{decimals}f}" for number in ends)
-    return "{} [{}, {}]".format(*numbers)
 
 
 def console() -> "Console":

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import WIDTH, echo_json, interval
+from harness.cli.estimates import WIDTH, echo_json
 from harness.core.errors import printable
+from harness.core.figures import interval
 
 if TYPE_CHECKING:
     from harness.runs.listing import Listed

@@ -12,6 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.run import Together, free_folder
 from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.figures import shown
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
@@ -75,7 +76,7 @@ def _show(done: "Repeats") -> None:
     from harness.report.caveats import caveats, said
     from harness.runs.metrics import SUCCESS
     from harness.studies.repeats import BETWEEN, FLIPS, STABLE
-    from harness.studies.repeats_page import in_sentences, percent
+    from harness.studies.repeats_page import in_sentences
 
     text, k, m = console(), done.k, done.runs[0].manifest
     text.print(f"{printable(str(m.variant), 60)} · {printable(done.runs[0].source)}")
@@ -88,9 +89,9 @@ def _show(done: "Repeats") -> None:
         [
             (
                 c,
-                *(percent(done.estimate(c, metric)) for metric in decisions.values()),
+                *(shown(done.estimate(c, metric)) for metric in decisions.values()),
                 str(done.estimate(c, FLIPS).n),
-                percent(done.estimate(c, BETWEEN)),
+                shown(done.estimate(c, BETWEEN)),
             )
             for c in done.conditions
         ],
@@ -100,7 +101,7 @@ def _show(done: "Repeats") -> None:
     episodes = {"episodes succeed": SUCCESS, f"pass^{k}": f"pass^{k}", f"any@{k}": f"any@{k}"}
     table(
         ("%", *episodes),
-        [(c, *(percent(done.estimate(c, metric)) for metric in episodes.values())) for c in done.conditions],
+        [(c, *(shown(done.estimate(c, metric)) for metric in episodes.values())) for c in done.conditions],
         tight=True,
     )
     for sentence in in_sentences(done):

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from harness.cli.estimates import console, interval, table
+from harness.cli.estimates import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.figures import interval
 from harness.core.formats import WORK
 
 if TYPE_CHECKING:

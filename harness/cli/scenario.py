@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
-from harness.cli.estimates import as_mapping, console, echo_json, interval, shown, table
+from harness.cli.estimates import console, echo_json, table
 from harness.cli.progress import bar
 from harness.core.errors import UserError, printable
+from harness.core.figures import as_mapping, interval, shown
 from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:

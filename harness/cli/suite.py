@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from harness.cli.estimates import console, echo_json, interval, table
+from harness.cli.estimates import console, echo_json, table
 from harness.cli.run import Together, as_mapping, free_folder, origins
 from harness.core.errors import UserError, printable
+from harness.core.figures import interval
 from harness.core.formats import SUITE, WORK
 
 if TYPE_CHECKING:

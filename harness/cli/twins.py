@@ -12,6 +12,7 @@ from harness.cli.progress import bar
 from harness.cli.run import free_folder
 from harness.core import resources, work
 from harness.core.errors import printable, unknown
+from harness.core.figures import shown
 
 if TYPE_CHECKING:
     from harness.studies.twins.scoring import Row
@@ -119,9 +120,7 @@ def command(
 
 
 def _cells(row: "Row") -> tuple[str, ...]:
-    from harness.studies.twins.page import cell
-
     return (
-        row.twin.name, row.role, row.twin.holds, cell(row.invariance_rate, 100, 1),
-        cell(row.tv_distance, 1, 2), f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
+        row.twin.name, row.role, row.twin.holds, shown(row.invariance_rate, 100, 1),
+        shown(row.tv_distance, 1, 2), f"{100 * row.failed_rate.value:.1f}", str(row.invariance_rate.n),
     )  # fmt: skip

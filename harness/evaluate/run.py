@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import lru_cache, partial
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from harness.backends.base import Backend
-from harness.backends.cards import Card
-from harness.backends.registry import open_backend
+from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import work
 from harness.core.errors import UserError, printable
@@ -142,9 +141,6 @@ def _closed_loop(
     spec: Spec, source: "LiveSource", out: Path, begun: Begun | None, progress: Callable[[int], None],
     cache: Path | None, workers: int,
 ) -> Evaluated:  # fmt: skip
-    # Compiled templates do not travel between processes.
-    ego, *helpers = (replace(agent, prompt=replace(agent.prompt)) for agent in spec.agents)
-    spec = replace(spec, ego=ego, helpers=tuple(helpers))
     # Engines are opened where they answer: a forked process has none of their threads.
     [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
     begun = _begin(spec, out, begun, identity, latency)
@@ -198,12 +194,7 @@ def _latency(
 
 def _opened_all(spec: Spec) -> list[Backend]:
     """This process's backends of a run's agents."""
-    return [_opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
-
-
-@lru_cache(maxsize=8)
-def _opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
-    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
+    return [opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
 
 
 def _written(

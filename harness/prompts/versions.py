@@ -124,6 +124,10 @@ class Prompt:
         if self.max_answer_tokens.keys() != set(ROLES):
             raise ValueError("max_answer_tokens wants exactly ego and helper")
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: all but the compiled templates."""
+        return {name: value for name, value in vars(self).items() if name != "_templates"}
+
     @cached_property
     def _templates(self) -> dict[str, Template]:
         environment = Sandbox(undefined=StrictUndefined, keep_trailing_newline=False)

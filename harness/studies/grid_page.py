@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import Spec, versions
@@ -18,7 +19,6 @@ from harness.report.page import environment
 from harness.runs.metrics import LATENCY, SUCCESS
 from harness.studies.folder import write, write_manifest
 from harness.studies.grid import FIELDS, Cell, Effect, Grid, Halves, level
-from harness.studies.ledger import with_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,21 +50,14 @@ def _said(grid: Grid, h: Halves) -> str:
         verdict = "the helpers' half matters more"
     return (
         f"With {h.condition} {verdict}: of the differences between the {len(grid.cells)} combinations, which "
-        f"of {grid.rows} egos decides explains {_percent(h.ego)} %, which of {grid.columns} helpers answers "
-        f"{_percent(h.helpers)} %, both together {_percent(h.together)} % (n = {h.ego.n} episodes)."
+        f"of {grid.rows} egos decides explains {shown(h.ego)} %, which of {grid.columns} helpers answers "
+        f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
     )
-
-
-def _percent(e: Estimate) -> str:
-    return with_interval(100 * e.value, 100 * e.low, 100 * e.high)
 
 
 def text(metric: str, e: Estimate) -> str:
     """An estimate in a table: percent, or the metric's own unit; a dash where nothing is known."""
-    if np.isnan(e.value):
-        return "–"
-    scale = 100.0 if metric == SUCCESS else 1.0
-    return with_interval(scale * e.value, scale * e.low, scale * e.high)
+    return shown(e, 100.0 if metric == SUCCESS else 1.0)
 
 
 def front(cells: Sequence[Cell], condition: str) -> list[Cell]:

@@ -1,11 +1,11 @@
 """Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
 
 import csv
-import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from harness.core.figures import interval
 from harness.studies.calibrated import FITTED_ON
 
 if TYPE_CHECKING:
@@ -131,12 +131,6 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
     }
 
 
-def with_interval(mean: float, low: float, high: float) -> str:
-    """`94.7 [94.6, 94.9]`; a dash for an end that is not known."""
-    ends = ("–" if math.isnan(end) else f"{end:.1f}" for end in (low, high))
-    return f"{mean:.1f} [{', '.join(ends)}]"
-
-
 def shown(row: Any) -> dict[str, Any]:
     """One row of the ledger as text."""
     value = f" {row.value:g}" if isinstance(row.value, float) else ""
@@ -147,7 +141,7 @@ def shown(row: Any) -> dict[str, Any]:
         "id": row.id,
         "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
-        "ours": "" if cited else with_interval(row.ours, row.ci_low, row.ci_high),
+        "ours": "" if cited else interval(row.ours, row.ci_low, row.ci_high),
         "off": "" if cited else f"{row.difference:+.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from harness.coordination.operating_point import POINTS
+from harness.core.figures import interval
 from harness.core.files import write_whole
 from harness.evaluate.spec import versions
 from harness.report.library import picture
@@ -14,7 +15,7 @@ from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
 from harness.studies.calibrated import Calibrated
 from harness.studies.folder import write, write_manifest
-from harness.studies.ledger import ledger, marks, shown, tally, with_interval
+from harness.studies.ledger import ledger, marks, shown, tally
 from harness.studies.play import joined, play
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def equation_2(weights: "pd.DataFrame") -> str:
     """What the weights by distance do in the calibrated proxy, from the summary of their panel."""
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it, without = (
-        with_interval(*(100 * success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)))
+        interval(*(100 * success.loc[metres, ["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)))
         for metres in (1.0, EQUAL_M)
     )
     return (

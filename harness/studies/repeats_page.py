@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 
+from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import versions
@@ -14,7 +15,6 @@ from harness.report.page import environment
 from harness.runs.folder import csv_text
 from harness.runs.metrics import ALL, SUCCESS
 from harness.runs.records import Score
-from harness.studies.ledger import with_interval
 from harness.studies.repeats import BETWEEN, DOUBT, FLIPS, SAMPLED, STABLE, STATED, Repeats
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -22,17 +22,9 @@ MARKER, FIGURES, PAGE = "repeats.json", "repeats.csv", "index.html"
 MOST_POINTS = 12  # of those at which repeats disagree
 
 
-def percent(e: Estimate) -> str:
-    """A share in percent with its interval; a dash where it is not known."""
-    return "–" if math.isnan(e.value) else with_interval(100 * e.value, 100 * e.low, 100 * e.high)
-
-
 def nats(e: Estimate) -> str:
     """An entropy with its interval; a dash where it is not known."""
-    if math.isnan(e.value):
-        return "–"
-    ends = ("–" if math.isnan(end) else f"{end:.2f}" for end in (e.low, e.high))
-    return f"{e.value:.2f} [{', '.join(ends)}]"
+    return shown(e, 1.0, 2)
 
 
 def in_sentences(of: Repeats) -> list[str]:
@@ -47,9 +39,9 @@ def _flips(of: Repeats) -> str:
     flips, once = of.estimate(c, FLIPS), of.estimate(c, SUCCESS)
     everywhere, anywhere = of.estimate(c, f"pass^{k}"), of.estimate(c, f"any@{k}")
     return (
-        f"Asked again at temperature {m.temperature:g}, {m.variant} decides otherwise in {percent(flips)} % "
-        f"of decisions under {c} (n = {flips.n} decision points): {percent(once)} % of its episodes succeed, "
-        f"{percent(everywhere)} % in all {k} repeats and {percent(anywhere)} % in at least one "
+        f"Asked again at temperature {m.temperature:g}, {m.variant} decides otherwise in {shown(flips)} % "
+        f"of decisions under {c} (n = {flips.n} decision points): {shown(once)} % of its episodes succeed, "
+        f"{shown(everywhere)} % in all {k} repeats and {shown(anywhere)} % in at least one "
         f"(n = {once.n} episodes)."
     )
 
@@ -59,7 +51,7 @@ def _between(of: Repeats) -> Iterator[str]:
     if shares:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
-            f"Under {c}, {percent(shares[c])} % of the variance of success lies between episodes "
+            f"Under {c}, {shown(shares[c])} % of the variance of success lies between episodes "
             f"(n = {shares[c].n}); the rest is chance between repeats of one."
         )
 
@@ -85,7 +77,7 @@ def write_repeats(of: Repeats) -> Path:
     write_whole(of.path / FIGURES, csv_text(Score, of.scores, first.variant))
     page = of.path / PAGE
     rendered = environment(TEMPLATES).get_template("repeats.html.j2").render(
-        of=of, sentences=in_sentences(of), percent=percent, nats=nats, manifest=first,
+        of=of, sentences=in_sentences(of), percent=shown, nats=nats, manifest=first,
         caveats=said({run.path.name: run for run in of.runs}, lambda run: caveats(run.manifest, run.scores)),
         wavering=of.wavering(MOST_POINTS), source=of.runs[0].source, conditions=of.conditions,
         metrics=(FLIPS, STABLE, SUCCESS, f"pass^{of.k}", f"any@{of.k}", BETWEEN), success=SUCCESS,

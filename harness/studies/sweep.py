@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
+from harness.core.figures import interval
 from harness.core.files import write_whole
 from harness.evaluate.spec import versions
 from harness.report.library import picture
@@ -14,7 +15,6 @@ from harness.report.page import environment
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Axis, Setting, Value, described, grid
 from harness.studies.folder import write, write_manifest
-from harness.studies.ledger import with_interval
 from harness.studies.play import Source, joined, play
 from harness.studies.stored import Stored
 
@@ -144,7 +144,7 @@ def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:
         others = {name: f"{scale * of[metric]['mean']:.1f}" for name, metric, scale in COLUMNS}
         at = str(condition if panel == CORE else value if isinstance(value, str) else f"{value:g}")
         axis = "condition" if panel == CORE else str(panel)
-        found.setdefault(title, []).append(Row(axis, at, with_interval(*ends), others))
+        found.setdefault(title, []).append(Row(axis, at, interval(*ends), others))
     return found
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from harness.cli.estimates import interval
+from harness.core.figures import interval
 from harness.runs.metrics import over_episodes
 
 

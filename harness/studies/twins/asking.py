@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,7 @@ import msgspec
 
 from harness.backends.base import Backend, Request
 from harness.backends.cache import cached
-from harness.backends.cards import Card
-from harness.backends.registry import open_backend
+from harness.backends.registry import opened
 from harness.core import noise, work
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
@@ -126,9 +125,6 @@ def ask(
     """
     if (out / RESULT).exists():
         raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
-    # Compiled templates do not travel between processes.
-    ego = replace(study.spec.ego, prompt=replace(study.spec.ego.prompt))
-    study = replace(study, spec=replace(study.spec, ego=ego))
     [identity] = spread(_identity, [study.spec], workers, lambda done: None)
     begun = study.begin(identity)
     if left := work.begun(out, work.Begun):
@@ -142,13 +138,7 @@ def ask(
 
 
 def _identity(spec: Spec) -> str:
-    return digest(_opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size).identity())
-
-
-@lru_cache(maxsize=1)
-def _opened(card: Card, device: str | None, dtype: str | None, batch_size: int) -> Backend:
-    """This process's backend."""
-    return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
+    return digest(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size).identity())
 
 
 def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Sequence[str]]) -> list[Pair]:
@@ -157,7 +147,7 @@ def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Se
     scenes = study.dataset.scenes(ids)
 
     def backend() -> Backend:
-        return cached(_opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
+        return cached(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
 
     asker = Asker(spec, backend, PAPER, place / f"answers-{number:06d}.jsonl")
     twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from markupsafe import Markup, escape
 
 from harness.core.errors import printable
+from harness.core.figures import as_mapping, shown
 from harness.core.files import write_whole
-from harness.core.statistics import Estimate
 from harness.evaluate.spec import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
@@ -34,7 +33,7 @@ def write(
     write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
     page = environment(TEMPLATES).get_template("twins.html.j2").render(
         study=study, spec=study.spec, rows=rows, headline=headline(rows), notes=notes(study, rows),
-        points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, judged=judged, cell=cell,
+        points=decision_points(study), examples=EXAMPLES, verdicts=verdicts, judged=judged, cell=shown,
         difference=difference,
     )  # fmt: skip
     write_whole(out / "index.html", page)
@@ -48,7 +47,7 @@ def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> d
     table = [
         {
             "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
-            **{metric: _plain(getattr(row, metric)) for metric in METRICS},
+            **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
         }
         for row in rows
     ]  # fmt: skip
@@ -58,10 +57,6 @@ def mapping(study: Study, rows: Sequence[Row], verdicts: Sequence[Verdict]) -> d
         "seed": study.seed, "decision_points": decision_points(study), "rows": table,
         "left_out": missing(study, rows), "gates": gates,
     }  # fmt: skip
-
-
-def _plain(estimate: Estimate) -> dict[str, float | None]:
-    return {k: None if np.isnan(v) else v for k, v in asdict(estimate).items() if k != "n_excluded"}
 
 
 def decision_points(study: Study) -> int:
@@ -84,12 +79,6 @@ def notes(study: Study, rows: Sequence[Row]) -> list[str]:
     if not study.spec.ego.can.language_model:
         said.insert(0, f"{who} reads the scene and not the text, so this says nothing about the prompt")
     return said
-
-
-def cell(estimate: Estimate, scale: float, decimals: int) -> str:
-    """`value [low, high]`; a dash for what is not known."""
-    ends = (estimate.value, estimate.low, estimate.high)
-    return "{} [{}, {}]".format(*("–" if np.isnan(end) else f"{scale * end:.{decimals}f}" for end in ends))
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
