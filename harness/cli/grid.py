@@ -1,6 +1,6 @@
 """`harness grid`: every combination of ego and helper agents."""
 
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 
 import typer
@@ -8,7 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import console, table
 from harness.cli.progress import bar
-from harness.cli.run import file_name
+from harness.cli.run import file_name, first_folder
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable
 
@@ -84,7 +84,9 @@ def command(
     from harness.studies.grid_page import in_a_sentence, ranked, strongest, tables, text, write_grid
 
     names = "-".join(dict.fromkeys(file_name(agent.card.name) for agent in (*egos, *helpers)))
-    folder = out or _free(f"grid-{names}-{frozen.name}")
+    folder = out or first_folder(
+        f"grid-{names}-{frozen.name}", lambda folder: not (folder / "grid.json").exists()
+    )
     if (folder / "grid.json").exists():
         raise UserError(
             f"--out {printable(folder)} already holds a finished grid; choose another or delete it"
@@ -135,9 +137,3 @@ def _several(option: str, text: str) -> list[str]:
     if "" in names or len(set(names)) < len(names):
         raise UserError(f"{option} {printable(text)}: give different names, such as a,b")
     return names
-
-
-def _free(name: str) -> Path:
-    """The first folder of the name under reports/ without a finished grid."""
-    folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
-    return next(folder for folder in folders if not (folder / "grid.json").exists())

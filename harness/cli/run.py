@@ -95,8 +95,13 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
     for helper in helpers:
         name += f"-with-{file_name(helper.card.name)}-{helper.prompt.version}{_mode(helper)}"
     name += f"-{scenes}"
+    return first_folder(name, lambda folder: not folder.exists() or goes_on(folder))
+
+
+def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
+    """The first under reports/ of this name, or of this name with a number, that can be used."""
     folders = (Path("reports") / (name if n == 1 else f"{name}-{n}") for n in count(1))
-    return next(folder for folder in folders if not folder.exists() or goes_on(folder))
+    return next(filter(usable, folders))
 
 
 @dataclass(frozen=True)

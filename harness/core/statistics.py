@@ -209,6 +209,11 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     return Estimate(mean, mean - below, mean + above, n, n_excluded)
 
 
+def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
+    """How often each of n units counts: once each, then as drawn with replacement, `(1 + times, n)`."""
+    return np.vstack([np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)])
+
+
 def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:
     """Mean of shares `(E,)`, their distances from it, both ends of its interval, and their worth."""
     rate = float(np.mean(values))

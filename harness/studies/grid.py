@@ -19,7 +19,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate
+from harness.core.statistics import Estimate, resampled
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import made
 from harness.evaluate.spec import Spec
@@ -268,8 +268,7 @@ class Grid:
             return None
         each = np.array([np.mean(cell.values[SUCCESS][at], axis=0) for cell in self.cells])
         n = each.shape[1]
-        draws = noise.generator("grid", "halves").multinomial(n, [1 / n] * n, size=RESAMPLES)
-        weights = np.concatenate([np.ones((1, n)), draws]) / n
+        weights = resampled(noise.generator("grid", "halves"), n, RESAMPLES) / n
         squares = _squares((each @ weights.T).reshape(self.rows, self.columns, -1))
         # Episodes by chance add as much to the squares of what was played as resampling adds to those.
         by_chance = squares[:, 1:].mean(axis=1) - squares[:, 0]

@@ -18,7 +18,7 @@ from harness.coordination.trigger import entropy_nats
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval
+from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
 from harness.evaluate.run import made
 from harness.evaluate.spec import Spec
 from harness.runs.folder import Run
@@ -212,8 +212,7 @@ def between_share(values: Floats) -> Estimate:
     if n < 2:
         return unknown
     means, within = values.mean(axis=1), values.var(axis=1) * k
-    draws = noise.generator("repeats", "between").multinomial(n, [1 / n] * n, size=RESAMPLES)
-    weights = np.concatenate([np.ones((1, n)), draws])
+    weights = resampled(noise.generator("repeats", "between"), n, RESAMPLES)
     between = k * np.maximum(weights @ means**2 - (weights @ means) ** 2 / n, 0) / (n - 1)
     inside = weights @ within / (n * (k - 1))
     total = between + (k - 1) * inside

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import Estimate, known_mean
+from harness.core.statistics import Estimate, known_mean, resampled
 from harness.runs.metrics import PERCENTILES
 
 RESAMPLES, RESAMPLING_SEED = 999, 0
@@ -28,10 +28,7 @@ def differences(
     A run's percentile is the mean over its seeds. An episode that either run knows nothing of in a seed is
     left out there.
     """
-    draws = np.random.default_rng(RESAMPLING_SEED).multinomial(
-        episodes, np.full(episodes, 1 / episodes), RESAMPLES
-    )
-    weights = np.vstack([np.ones((1, episodes), dtype=np.int64), draws])
+    weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     both = [_met(one, other) for one, other in zip(a, b, strict=True)]
     n = len(set().union(*(set(one[0].tolist()) for one, _ in both)))
     if not n:
