@@ -34,6 +34,27 @@ def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats
     return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
 
 
+def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
+    """Where rays meet the walls of surfaces; wall k of a surface goes from its corner k to the next.
+
+    Args:
+        origin: (2,) m.
+        targets: (r, 2) direction vectors; a ray parameter of 1 is their length.
+        corners: (n, 4, 2) m.
+
+    Returns:
+        Ray parameter (r, 4n), inf where a wall is not met, and where along the wall from 0 to 1, (r, 4n).
+    """
+    start = corners.reshape(-1, 2) - origin
+    along = np.roll(corners, -1, axis=1).reshape(-1, 2) - origin - start
+    # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
+    determinant = targets[:, :1] * along[:, 1] - targets[:, 1:] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / determinant
+        u = (start[:, 0] * targets[:, 1:] - start[:, 1] * targets[:, :1]) / determinant
+    return np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf), u
+
+
 def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Where rays first meet a surface.
 
@@ -45,14 +66,7 @@ def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats
     Returns:
         Ray parameter (r,), inf where nothing is met, and index (r,) of the object that is met first.
     """
-    start = corners.reshape(-1, 2) - origin
-    along = np.roll(corners, -1, axis=1).reshape(-1, 2) - origin - start
-    # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
-    determinant = targets[:, :1] * along[:, 1] - targets[:, 1:] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / determinant
-        u = (start[:, 0] * targets[:, 1:] - start[:, 1] * targets[:, :1]) / determinant
-    t = np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf)
+    t, _ = meetings(origin, targets, corners)
     edge = t.argmin(axis=1)
     return t[np.arange(len(t)), edge], edge // 4
 

@@ -1,0 +1,249 @@
+"""What a vehicle's cameras see, as a picture: the front above the rear, each 120° wide.
+
+Two pinhole cameras at the vehicle's centre, from where the rays of its sensors go out too (`rays`). Whom the
+sensors do not report owns no pixel, and a column of pixels sees past a vehicle only what is higher. A frame
+is a pure function of the state, so datasets hold none.
+
+Everything is a box on a flat road: what is on the far side of a lower one shows above it. Heights, paint and
+lamps are declared for this harness.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import shapely
+from shapely.ops import substring
+from numpy.typing import NDArray
+
+from harness.core import noise
+from harness.core.arrays import Floats, Ints
+from harness.core.files import sha256_bytes
+from harness.world.perception.rays import meetings, sweep
+from harness.world.perception.sensors import HALF_FIELD_RAD, detect
+from harness.world.road import NORTH
+from harness.world.scenario import Scenario
+from harness.world.state import VehicleState, WorldState
+
+Pixels = NDArray[np.uint8]
+
+WIDTH, HEIGHT = 512, 256
+EYE_M = 1.4  # of a camera above the road
+HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
+BUILDING_M = 6.0
+HORIZON = 0.36  # of a camera's rows that are above it
+REACH_M, CELL_M = 160.0, 0.2  # of the map of the ground, from the origin; beyond there is grass
+LINE_M = 0.4  # width of a painted line
+DASH_M, GAP_M = 3.0, 4.5
+NOBODY = -1
+
+SKY, HAZE = (134, 178, 222), (205, 217, 228)
+GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
+WALL, BRICK = (182, 166, 142), (150, 132, 108)
+ROWS, COLUMNS = 32, 48  # of what is painted on a wall
+GLASS, TYRE, PLATE = (38, 48, 60), (28, 28, 30), (226, 226, 220)
+HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (250, 246, 222), (128, 22, 26), (255, 36, 32), (255, 170, 20)
+# None is like a lamp.
+COATS = ((36, 74, 140), (226, 228, 230), (56, 58, 62), (146, 150, 156), (44, 102, 70), (196, 176, 138))
+FRONT, RIGHT, REAR, LEFT = range(4)  # walls of a vehicle, as `VehicleState.corners` has them
+SHADE = np.array([0.96, 0.80, 0.88, 0.72])
+FADES_M = 260.0  # contrast falls to 1/e over so much air
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture.
+
+    Attributes:
+        pixels: (HEIGHT, WIDTH, 3) red, green and blue.
+        owners: (HEIGHT, WIDTH) place in `ids` of whose pixel it is; -1 for road, grass and sky.
+        ids: of vehicles and buildings.
+    """
+
+    pixels: Pixels
+    owners: Ints
+    ids: tuple[str, ...]
+
+    @property
+    def sha256(self) -> str:
+        """Digest of its size and its pixels, whatever file holds them."""
+        return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
+
+    def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
+        """Left, top, right and bottom of what each owns in either half, the last two beyond its pixels."""
+        half, found = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
+        for place, name in enumerate(self.ids):
+            for top in (0, half):
+                rows, columns = np.nonzero(self.owners[top : top + half] == place)
+                if len(rows):
+                    box = columns.min(), top + rows.min(), columns.max() + 1, top + rows.max() + 1
+                    found.setdefault(name, []).append((int(box[0]), int(box[1]), int(box[2]), int(box[3])))
+        return found
+
+
+def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
+    """What the cameras of one vehicle see."""
+    viewer = state.vehicle(viewer_id)
+    reported = detect(state, viewer, sweep(state, viewer))
+    boxes = [*(_vehicle(state, state.vehicle(d.id)) for d in reported), *(_building(b.id, b.corners()) for b in state.buildings)]
+    halves = [_half(scenario, viewer, boxes, turned) for turned in (0.0, np.pi)]
+    pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
+    return Frame(pixels, owners, tuple(box.name for box in boxes))
+
+
+@dataclass(frozen=True)
+class Box:
+    """Something solid: corners (4, 2) m, its height, and what is painted on each of its walls, (4, V, U, 3)."""
+
+    name: str
+    corners: Floats
+    height_m: float
+    walls: Pixels
+
+
+def _half(
+    scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float
+) -> tuple[Pixels, Ints]:
+    """Pixels and owners of one camera, (HEIGHT / 2, WIDTH, ...)."""
+    rows, eye = HEIGHT // 2, np.array([viewer.x_m, viewer.y_m])
+    focal = WIDTH / 2 / np.tan(HALF_FIELD_RAD)
+    heading = viewer.heading_rad + turned_rad
+    ahead, right = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    # A ray of a column goes 1 m ahead, so that its parameter is the depth in metres.
+    across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / focal
+    rays = ahead + across[:, None] * right
+    below = np.arange(rows) + 0.5 - HORIZON * rows  # the horizon
+    pixels = _background(scenario, eye, rays, below, focal)
+    owners = np.full((rows, WIDTH), NOBODY, dtype=np.int16)
+    if not boxes:
+        return pixels, owners
+    t, along = meetings(eye, rays, np.array([box.corners for box in boxes]))
+    t, along = t.reshape(WIDTH, -1, 4), along.reshape(WIDTH, -1, 4)
+    wall = t.argmin(axis=2)
+    depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
+    heights, walls = np.array([box.height_m for box in boxes]), np.array([box.walls for box in boxes])
+    far_first = np.argsort(-depth, axis=1, kind="stable")
+    for place in far_first.T:
+        columns = np.flatnonzero(np.isfinite(depth[np.arange(WIDTH), place]))
+        if not len(columns):
+            continue
+        box = place[columns]
+        z, side, u = (a[columns, box] for a in (depth, wall, along))
+        height_m = EYE_M - below[:, None] * z / focal  # above the road, of each pixel
+        row, column = np.nonzero((height_m >= 0) & (height_m < heights[box]))
+        onward = np.minimum(u * COLUMNS, COLUMNS - 1).astype(int)
+        shades = SHADE[side, None, None] * walls[box, side, :, onward]
+        strips = _hazy(shades, z[:, None]).astype(np.uint8)  # of each column, from the road up
+        up = (height_m[row, column] * (ROWS / heights[box])[column]).astype(int)
+        at = row * WIDTH + columns[column]
+        pixels.reshape(-1, 3)[at] = strips[column, up]
+        owners.reshape(-1)[at] = box[column]
+    return pixels, owners
+
+
+def _vehicle(state: WorldState, v: VehicleState) -> Box:
+    """A vehicle, in a coat that says nothing of it, with its lamps."""
+    coat = COATS[int(noise.uniforms((1,), "coat", state.episode_seed, v.id)[0] * len(COATS))]
+    return Box(v.id, v.corners(), HEIGHTS_M[v.kind], _vehicle_walls(v.kind, coat, v.indicator, v.braking))
+
+
+@lru_cache(maxsize=256)
+def _vehicle_walls(kind: str, coat: tuple[int, int, int], indicator: str, braking: bool) -> Pixels:
+    """What is painted on a vehicle, (4, ROWS, COLUMNS, 3), from the road up."""
+    walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
+    walls[:] = coat
+    low, high = {"car": (0.55, 0.92), "van": (0.52, 0.86), "truck": (0.45, 0.72)}[kind]
+    cab = {"car": 0.80, "van": 0.28, "truck": 0.20}[kind]  # of the length, from the front, that has windows
+    side = (low, high, 0.06 if kind != "car" else 0.18, cab)
+    _paint(walls[FRONT], (low, high, 0.08, 0.92), GLASS)
+    _paint(walls[REAR], (low, high, 0.12, 0.88), GLASS if kind == "car" else PLATE)
+    for wall, mirrored in ((walls[RIGHT], False), (walls[LEFT], True)):
+        _paint(wall, side, GLASS, mirrored)
+        for at in (0.10, 0.74):
+            _paint(wall, (0.0, 0.30 if kind == "car" else 0.22, at, at + 0.16), TYRE, mirrored)
+    walls[:, : max(1, ROWS // 16)] = TYRE  # its shadow
+    for mirrored in (False, True):
+        _paint(walls[FRONT], (0.30, 0.44, 0.04, 0.20), HEADLAMP, mirrored)
+        _paint(walls[REAR], (0.30, 0.50, 0.02, 0.20), BRAKE_LAMP if braking else REAR_LAMP, mirrored)
+    if indicator != "off":
+        to_right = indicator == "right"  # the front wall begins at the left, the rear one at the right
+        _paint(walls[FRONT], (0.44, 0.58, 0.0, 0.16), AMBER, to_right)
+        _paint(walls[REAR], (0.50, 0.64, 0.0, 0.16), AMBER, not to_right)
+        _paint(walls[RIGHT if to_right else LEFT], (0.30, 0.45, 0.0, 0.08), AMBER, not to_right)
+    return walls
+
+
+def _building(name: str, corners: Floats) -> Box:
+    walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
+    walls[:] = WALL
+    walls[:, ::6] = BRICK
+    return Box(name, corners, BUILDING_M, walls)
+
+
+def _paint(
+    wall: Pixels, part: tuple[float, float, float, float], colour: tuple[int, int, int], mirrored: bool = False
+) -> None:
+    """Paint from one share of its height to another, and of its length."""
+    bottom, top, start, end = part
+    if mirrored:
+        start, end = 1 - end, 1 - start
+    wall[round(bottom * ROWS) : round(top * ROWS), round(start * COLUMNS) : round(end * COLUMNS)] = colour
+
+
+def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats, focal: float) -> Pixels:
+    """Sky and ground, (rows, WIDTH, 3)."""
+    pixels = np.empty((len(below), len(rays), 3), dtype=np.uint8)
+    sky = int(np.count_nonzero(below <= 0))
+    up = (below[:sky] / below[0])[:, None]
+    pixels[:sky] = (up * np.array(SKY) + (1 - up) * np.array(HAZE))[:, None]
+    depth_m = EYE_M * focal / below[sky:]
+    ground = _ground_map(scenario)
+    x, y = (
+        ((np.multiply.outer(depth_m, rays[:, k]) + (eye[k] + REACH_M)) / CELL_M)
+        .astype(np.int32).clip(0, len(ground) - 1)
+        for k in (0, 1)
+    )  # fmt: skip
+    colours = _hazy(np.array([GRASS, ASPHALT, PAINT], dtype=float), depth_m[:, None])  # of each row
+    what = ground[y, x] + 3 * np.arange(len(depth_m))[:, None]
+    pixels[sky:] = colours.astype(np.uint8).reshape(-1, 3)[what]
+    return pixels
+
+
+def _hazy(colours: Floats, depth_m: Floats) -> Floats:
+    """Colours as they are after so much air."""
+    clear = np.exp(-depth_m / FADES_M)[..., None]
+    return np.asarray(clear * colours + (1 - clear) * np.array(HAZE))
+
+
+@lru_cache(maxsize=8)
+def _ground_map(scenario: Scenario) -> Pixels:
+    """What lies where, (y, x) by `CELL_M` from the north-west: 0 grass, 1 asphalt, 2 paint."""
+    ground = scenario.road().ground(REACH_M)
+    middles = (np.arange(round(2 * REACH_M / CELL_M)) + 0.5) * CELL_M - REACH_M
+    x, y = np.meshgrid(middles, middles)
+    edges = [shapely.Polygon(edge * NORTH) for edge in ground.outlines]
+    marks = [dash for mark in ground.marks for dash in _dashes(shapely.LineString(mark * NORTH))]
+    marks += [shapely.LineString(stop * NORTH) for stop in ground.stops]
+    surface = np.zeros(x.shape, dtype=np.uint8)
+    for edge in edges:  # what is inside of two is no road: it goes round it
+        surface ^= _inside(edge, x, y)
+    for line in (*marks, *(edge.exterior for edge in edges)):
+        surface[_inside(line.buffer(LINE_M / 2, cap_style="flat"), x, y) & (surface > 0)] = 2
+    surface[[0, -1]] = surface[:, [0, -1]] = 0  # what lies beyond is taken to be like the edge
+    return surface
+
+
+def _inside(area: shapely.Geometry, x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """Which of the grid's points lie in an area."""
+    inside = np.zeros(x.shape, dtype=bool)
+    west, north, east, south = area.bounds
+    columns = slice(*np.searchsorted(x[0], (west, east)))
+    rows = slice(*np.searchsorted(y[:, 0], (north, south)))
+    shapely.prepare(area)
+    inside[rows, columns] = shapely.contains_xy(area, x[rows, columns], y[rows, columns])
+    return inside
+
+
+def _dashes(line: shapely.LineString) -> list[shapely.Geometry]:
+    starts = np.arange(0.0, line.length, DASH_M + GAP_M)
+    return [substring(line, s, min(s + DASH_M, line.length)) for s in starts]

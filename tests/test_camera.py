@@ -1,0 +1,136 @@
+"""What a vehicle's cameras see: nothing that its sensors do not, and everything else where it is."""
+
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.core.png import png
+from harness.core.resources import folder
+from harness.dataset.load import Dataset, load
+from harness.world import scenarios
+from harness.world.perception import camera
+from harness.world.perception.camera import AMBER, BRAKE_LAMP, EYE_M, HEIGHT, HORIZON, WIDTH, Frame, frame
+from harness.world.perception.rays import sweep
+from harness.world.perception.sensors import HALF_FIELD_RAD, LEAST_RAYS, detect
+from harness.world.state import VehicleState, WorldState
+
+DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/manifest.json"))
+SCENES = 12  # of each dataset, four viewers each
+ROAD = scenarios.get("hard-brake-ahead")
+FOCAL = WIDTH / 2 / np.tan(HALF_FIELD_RAD)
+
+
+@pytest.fixture(params=DATASETS)
+def dataset(request: pytest.FixtureRequest) -> Dataset:
+    """The layouts of each dataset that ships."""
+    return load(folder("datasets") / request.param)
+
+
+def moments(dataset: Dataset) -> list[tuple[WorldState, str]]:
+    """Some decision points, those that only errors lead to among them, and their viewers."""
+    drawn = np.random.default_rng(0).choice(len(dataset.forest.ids), SCENES, replace=False)
+    scenes = dataset.scenes([dataset.forest.ids[n] for n in sorted(drawn)])
+    return [(scene.state, viewer) for scene in scenes for viewer in scene.viewers]
+
+
+def test_a_hidden_vehicle_changes_no_pixel(dataset: Dataset):
+    hidden = 0
+    for state, viewer in moments(dataset):
+        eye = state.vehicle(viewer)
+        reported = {d.id for d in detect(state, eye, sweep(state, eye))} | {viewer}
+        without = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
+        hidden += len(state.vehicles) - len(without.vehicles)
+        seen = frame(dataset.scenario, state, viewer)
+        assert seen.boxes().keys() <= reported | {b.id for b in state.buildings}
+        assert seen.sha256 == frame(dataset.scenario, without, viewer).sha256
+    assert hidden
+
+
+def test_a_vehicle_in_sight_and_in_the_field_owns_pixels(dataset: Dataset):
+    owners = 0
+    for state, viewer in moments(dataset):
+        eye = state.vehicle(viewer)
+        seen, view = frame(dataset.scenario, state, viewer).boxes(), sweep(state, eye)
+        off = np.abs((view.bearing_rad - eye.heading_rad + np.pi / 2) % np.pi - np.pi / 2)
+        for d in detect(state, eye, view):
+            if np.count_nonzero(off[view.hits[d.id]] < HALF_FIELD_RAD) >= LEAST_RAYS:
+                owners += 1
+                assert d.id in seen, (state.episode_seed, state.step, viewer, d.id)
+    assert owners
+
+
+def test_a_frame_is_the_same_every_time_and_another_for_another_viewer():
+    state, viewer = moments(load(folder("datasets") / DATASETS[0]))[0]
+    of = scenarios.get(state.scenario)
+    pixels = frame(of, state, viewer).pixels
+    assert pixels.shape == (HEIGHT, WIDTH, 3)
+    assert np.array_equal(pixels, frame(of, state, viewer).pixels)
+    assert frame(of, state, viewer).sha256 != frame(of, state, state.helpers[-1].id).sha256
+
+
+def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: object) -> VehicleState:
+    stated = {"kind": "car", "part": "other", "heading_rad": 0.0, "speed_mps": 20.0, "approach": "west"}
+    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, "route": "straight", **stated, **others})  # type: ignore[arg-type]
+
+
+def seen_by_the_first(*vehicles: VehicleState) -> Frame:
+    state = WorldState(ROAD.name, 0, 0, 0.0, 20.0, vehicles, ())
+    return frame(ROAD, state, vehicles[0].id)
+
+
+def test_a_car_is_where_and_as_large_as_a_pinhole_shows_it():
+    # Its rear wall is 20 m ahead and 2 m wide; its middle 4 m to the right.
+    of = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 22.5, 4.0))
+    [(left, top, right, bottom)] = of.boxes()["v2"]
+    # Its left side shows as well, from 3 m to the right, 25 m ahead.
+    assert left == pytest.approx(WIDTH / 2 + FOCAL * 3 / 25, abs=1)
+    assert right == pytest.approx(WIDTH / 2 + FOCAL * 5 / 20, abs=1)
+    horizon = HORIZON * HEIGHT / 2
+    assert bottom == pytest.approx(horizon + FOCAL * EYE_M / 20, abs=1)
+    assert top == pytest.approx(horizon - FOCAL * (1.5 - EYE_M) / 20, abs=1)
+
+
+def test_what_is_behind_is_in_the_lower_half():
+    of = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", -20.0))
+    [(_, top, _, _)] = of.boxes()["v2"]
+    assert top >= HEIGHT // 2
+
+
+def test_a_truck_shows_above_a_car_only_if_a_ray_reaches_it():
+    hidden = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, kind="truck"))
+    assert set(hidden.boxes()) == {"v2"}
+    beside = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, 4.0, kind="truck"))
+    [(_, car_top, car_right, _)], [(truck_left, truck_top, _, _)] = beside.boxes()["v2"], beside.boxes()["v3"]
+    assert truck_top < car_top
+    assert truck_left <= car_right
+
+
+def columns_of(of: Frame, colour: tuple[int, int, int]) -> np.ndarray:
+    """Columns in which a lamp is lit, however the air dims it."""
+    towards = of.pixels.astype(float) - np.array(camera.HAZE)
+    wanted = np.array(colour) * camera.SHADE[camera.REAR] - np.array(camera.HAZE)
+    along = (towards @ wanted) / np.linalg.norm(towards, axis=2).clip(1e-9) / np.linalg.norm(wanted)
+    return np.unique(np.nonzero((along > 0.995) & (of.owners >= 0))[1])
+
+
+def test_lamps_show_what_a_vehicle_does():
+    def ahead(**others: object) -> Frame:
+        return seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0, kind="van", **others))
+
+    assert not len(columns_of(ahead(), BRAKE_LAMP))
+    lit = columns_of(ahead(braking=True), BRAKE_LAMP)
+    assert lit.min() < WIDTH / 2 < lit.max()
+    assert not len(columns_of(ahead(), AMBER))
+    assert columns_of(ahead(route="left"), AMBER).max() < WIDTH / 2
+    assert columns_of(ahead(route="right"), AMBER).min() > WIDTH / 2
+
+
+def test_a_picture_is_a_png_of_the_same_pixels():
+    image = pytest.importorskip("PIL.Image")
+    pixels = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0)).pixels
+    read = image.open(BytesIO(png(pixels)))
+    assert np.array_equal(np.asarray(read), pixels)
+    assert read.mode == "RGB"
