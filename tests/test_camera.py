@@ -3,6 +3,7 @@
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,17 @@ from harness.core.resources import folder
 from harness.dataset.load import Dataset, load
 from harness.world import scenarios
 from harness.world.perception import camera
-from harness.world.perception.camera import AMBER, BRAKE_LAMP, EYE_M, HEIGHT, HORIZON, WIDTH, Frame, frame
+from harness.world.perception.camera import (
+    AMBER,
+    BRAKE_LAMP,
+    EYE_M,
+    FOCAL_PX,
+    HEIGHT,
+    HORIZON,
+    WIDTH,
+    Frame,
+    frame,
+)
 from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import HALF_FIELD_RAD, LEAST_RAYS, detect
 from harness.world.state import VehicleState, WorldState
@@ -20,7 +31,6 @@ from harness.world.state import VehicleState, WorldState
 DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/manifest.json"))
 SCENES = 12  # of each dataset, four viewers each
 ROAD = scenarios.get("hard-brake-ahead")
-FOCAL = WIDTH / 2 / np.tan(HALF_FIELD_RAD)
 
 
 @pytest.fixture(params=DATASETS)
@@ -71,9 +81,15 @@ def test_a_frame_is_the_same_every_time_and_another_for_another_viewer():
     assert frame(of, state, viewer).sha256 != frame(of, state, state.helpers[-1].id).sha256
 
 
-def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: object) -> VehicleState:
-    stated = {"kind": "car", "part": "other", "heading_rad": 0.0, "speed_mps": 20.0, "approach": "west"}
-    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, "route": "straight", **stated, **others})  # type: ignore[arg-type]
+def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: Any) -> VehicleState:
+    stated: dict[str, Any] = {
+        "kind": "car",
+        "part": "other",
+        "heading_rad": 0.0,
+        "speed_mps": 20.0,
+        "approach": "west",
+    }
+    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, "route": "straight", **stated, **others})
 
 
 def seen_by_the_first(*vehicles: VehicleState) -> Frame:
@@ -86,11 +102,11 @@ def test_a_car_is_where_and_as_large_as_a_pinhole_shows_it():
     of = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 22.5, 4.0))
     [(left, top, right, bottom)] = of.boxes()["v2"]
     # Its left side shows as well, from 3 m to the right, 25 m ahead.
-    assert left == pytest.approx(WIDTH / 2 + FOCAL * 3 / 25, abs=1)
-    assert right == pytest.approx(WIDTH / 2 + FOCAL * 5 / 20, abs=1)
+    assert left == pytest.approx(WIDTH / 2 + FOCAL_PX * 3 / 25, abs=1)
+    assert right == pytest.approx(WIDTH / 2 + FOCAL_PX * 5 / 20, abs=1)
     horizon = HORIZON * HEIGHT / 2
-    assert bottom == pytest.approx(horizon + FOCAL * EYE_M / 20, abs=1)
-    assert top == pytest.approx(horizon - FOCAL * (1.5 - EYE_M) / 20, abs=1)
+    assert bottom == pytest.approx(horizon + FOCAL_PX * EYE_M / 20, abs=1)
+    assert top == pytest.approx(horizon - FOCAL_PX * (1.5 - EYE_M) / 20, abs=1)
 
 
 def test_what_is_behind_is_in_the_lower_half():
@@ -102,7 +118,9 @@ def test_what_is_behind_is_in_the_lower_half():
 def test_a_truck_shows_above_a_car_only_if_a_ray_reaches_it():
     hidden = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, kind="truck"))
     assert set(hidden.boxes()) == {"v2"}
-    beside = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, 4.0, kind="truck"))
+    beside = seen_by_the_first(
+        vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, 4.0, kind="truck")
+    )
     [(_, car_top, car_right, _)], [(truck_left, truck_top, _, _)] = beside.boxes()["v2"], beside.boxes()["v3"]
     assert truck_top < car_top
     assert truck_left <= car_right
@@ -117,7 +135,7 @@ def columns_of(of: Frame, colour: tuple[int, int, int]) -> np.ndarray:
 
 
 def test_lamps_show_what_a_vehicle_does():
-    def ahead(**others: object) -> Frame:
+    def ahead(**others: Any) -> Frame:
         return seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0, kind="van", **others))
 
     assert not len(columns_of(ahead(), BRAKE_LAMP))

@@ -86,21 +86,35 @@ def show(
     scene: str = typer.Argument(help="Scene id, such as 00003-0."),
     out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
     viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
+    camera: bool = typer.Option(
+        False, "--camera", help="What its cameras see, the front above the rear, as a .png."
+    ),
 ) -> None:
-    """Draw a scene from above, with what one vehicle sees of it."""
+    """Draw a scene from above, with what one vehicle sees of it, or as its cameras see it."""
     from io import BytesIO
 
     from harness.core.files import write_whole
     from harness.dataset import load
-    from harness.report.drawing.scene import draw
 
-    if out.suffix not in (".svg", ".png"):
-        raise UserError(f"--out {printable(out)} is no picture that can be written; end it in .svg or .png")
-    drawn = load.load(load.find(dataset)).scene(scene)
+    kinds = (".png",) if camera else (".svg", ".png")
+    if out.suffix not in kinds:
+        raise UserError(
+            f"--out {printable(out)} is no picture that can be written; end it in {' or '.join(kinds)}"
+        )
+    data = load.load(load.find(dataset))
+    drawn = data.scene(scene)
     if viewer is not None and viewer not in drawn.viewers:
         raise unknown(f"viewer of scene {drawn.id}", viewer, drawn.viewers)
     picture = BytesIO()
-    draw(drawn, picture, "png" if out.suffix == ".png" else "svg", viewer)
+    if camera:
+        from harness.core.png import png
+        from harness.world.perception.camera import frame
+
+        picture.write(png(frame(data.scenario, drawn.state, viewer or drawn.viewers[0]).pixels))
+    else:
+        from harness.report.drawing.scene import draw
+
+        draw(drawn, picture, "png" if out.suffix == ".png" else "svg", viewer)
     try:
         write_whole(out, picture.getvalue())
     except OSError as error:

@@ -133,6 +133,8 @@ def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
         ("dataset show SMALL 00099-0 --out OUT.svg", "unknown scene '00099-0'"),
         ("dataset show SMALL 00000-0 --out OUT.gif", "end it in .svg or .png"),
         ("dataset show SMALL 00000-0 --viewer v9 --out OUT.svg", "unknown viewer of scene 00000-0-"),
+        ("dataset show SMALL 00000-0 --camera --out OUT.svg", "end it in .png"),
+        ("dataset show SMALL 00000-0 --camera --viewer v9 --out OUT.png", "unknown viewer of scene 00000-0-"),
         ("dataset show EMPTY 00000-0 --out OUT.svg", "is no dataset"),
     ],
 )

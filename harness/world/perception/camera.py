@@ -8,16 +8,17 @@ Everything is a box on a flat road: what is on the far side of a lower one shows
 lamps are declared for this harness.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import shapely
-from shapely.ops import substring
 from numpy.typing import NDArray
+from shapely.ops import substring
 
 from harness.core import noise
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Floats
 from harness.core.files import sha256_bytes
 from harness.world.perception.rays import meetings, sweep
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
@@ -26,8 +27,10 @@ from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
 
 Pixels = NDArray[np.uint8]
+Places = NDArray[np.int16]
 
 WIDTH, HEIGHT = 512, 256
+FOCAL_PX = WIDTH / 2 / math.tan(HALF_FIELD_RAD)
 EYE_M = 1.4  # of a camera above the road
 HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 BUILDING_M = 6.0
@@ -61,7 +64,7 @@ class Frame:
     """
 
     pixels: Pixels
-    owners: Ints
+    owners: Places
     ids: tuple[str, ...]
 
     @property
@@ -85,7 +88,10 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
     """What the cameras of one vehicle see."""
     viewer = state.vehicle(viewer_id)
     reported = detect(state, viewer, sweep(state, viewer))
-    boxes = [*(_vehicle(state, state.vehicle(d.id)) for d in reported), *(_building(b.id, b.corners()) for b in state.buildings)]
+    boxes = [
+        *(_vehicle(state, state.vehicle(d.id)) for d in reported),
+        *(_building(b.id, b.corners()) for b in state.buildings),
+    ]
     halves = [_half(scenario, viewer, boxes, turned) for turned in (0.0, np.pi)]
     pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
     return Frame(pixels, owners, tuple(box.name for box in boxes))
@@ -93,7 +99,7 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
 
 @dataclass(frozen=True)
 class Box:
-    """Something solid: corners (4, 2) m, its height, and what is painted on each of its walls, (4, V, U, 3)."""
+    """Something solid: corners (4, 2) m, its height, and the paint on its walls, (4, ROWS, COLUMNS, 3)."""
 
     name: str
     corners: Floats
@@ -103,17 +109,16 @@ class Box:
 
 def _half(
     scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float
-) -> tuple[Pixels, Ints]:
+) -> tuple[Pixels, Places]:
     """Pixels and owners of one camera, (HEIGHT / 2, WIDTH, ...)."""
     rows, eye = HEIGHT // 2, np.array([viewer.x_m, viewer.y_m])
-    focal = WIDTH / 2 / np.tan(HALF_FIELD_RAD)
     heading = viewer.heading_rad + turned_rad
     ahead, right = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     # A ray of a column goes 1 m ahead, so that its parameter is the depth in metres.
-    across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / focal
+    across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX
     rays = ahead + across[:, None] * right
-    below = np.arange(rows) + 0.5 - HORIZON * rows  # the horizon
-    pixels = _background(scenario, eye, rays, below, focal)
+    below: Floats = np.arange(rows) + 0.5 - HORIZON * rows  # the horizon
+    pixels = _background(scenario, eye, rays, below)
     owners = np.full((rows, WIDTH), NOBODY, dtype=np.int16)
     if not boxes:
         return pixels, owners
@@ -122,14 +127,17 @@ def _half(
     wall = t.argmin(axis=2)
     depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
     heights, walls = np.array([box.height_m for box in boxes]), np.array([box.walls for box in boxes])
-    far_first = np.argsort(-depth, axis=1, kind="stable")
-    for place in far_first.T:
-        columns = np.flatnonzero(np.isfinite(depth[np.arange(WIDTH), place]))
+    near_first = np.argsort(depth, axis=1, kind="stable")
+    up_to_m = np.where(np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0)
+    nearer_m = np.pad(np.maximum.accumulate(up_to_m, axis=1), ((0, 0), (1, 0)))[:, :-1]
+    # All are higher than the eye: who is not higher than what is nearer does not show.
+    for place, shows in reversed(list(zip(near_first.T, (up_to_m > nearer_m).T, strict=True))):
+        columns = np.flatnonzero(shows)
         if not len(columns):
             continue
         box = place[columns]
         z, side, u = (a[columns, box] for a in (depth, wall, along))
-        height_m = EYE_M - below[:, None] * z / focal  # above the road, of each pixel
+        height_m = EYE_M - below[:, None] * z / FOCAL_PX  # above the road, of each pixel
         row, column = np.nonzero((height_m >= 0) & (height_m < heights[box]))
         onward = np.minimum(u * COLUMNS, COLUMNS - 1).astype(int)
         shades = SHADE[side, None, None] * walls[box, side, :, onward]
@@ -181,7 +189,10 @@ def _building(name: str, corners: Floats) -> Box:
 
 
 def _paint(
-    wall: Pixels, part: tuple[float, float, float, float], colour: tuple[int, int, int], mirrored: bool = False
+    wall: Pixels,
+    part: tuple[float, float, float, float],
+    colour: tuple[int, int, int],
+    mirrored: bool = False,
 ) -> None:
     """Paint from one share of its height to another, and of its length."""
     bottom, top, start, end = part
@@ -190,13 +201,13 @@ def _paint(
     wall[round(bottom * ROWS) : round(top * ROWS), round(start * COLUMNS) : round(end * COLUMNS)] = colour
 
 
-def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats, focal: float) -> Pixels:
+def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) -> Pixels:
     """Sky and ground, (rows, WIDTH, 3)."""
     pixels = np.empty((len(below), len(rays), 3), dtype=np.uint8)
     sky = int(np.count_nonzero(below <= 0))
     up = (below[:sky] / below[0])[:, None]
     pixels[:sky] = (up * np.array(SKY) + (1 - up) * np.array(HAZE))[:, None]
-    depth_m = EYE_M * focal / below[sky:]
+    depth_m = EYE_M * FOCAL_PX / below[sky:]
     ground = _ground_map(scenario)
     x, y = (
         ((np.multiply.outer(depth_m, rays[:, k]) + (eye[k] + REACH_M)) / CELL_M)
