@@ -1,4 +1,7 @@
-"""One still of a driven episode, from above: what moves is drawn over a ground that was drawn once."""
+"""One still of a driven episode: from above, and as the cameras of the ego and of one helper see it.
+
+What moves is drawn over a ground that was drawn once.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
@@ -12,7 +15,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
-from numpy.typing import NDArray
 
 from harness.core.errors import printable
 from harness.evaluate.replay import Played, Still
@@ -21,11 +23,11 @@ from harness.report.drawing.colours import actions as colours_of
 from harness.report.drawing.geometry import VIEW_M, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.scene import style_of
+from harness.world.perception.camera import HEIGHT, WIDTH, Pixels, frame
 from harness.world.state import Building, VehicleState, WorldState
 
-Pixels = NDArray[np.uint8]  # (height, width, 3)
-
 SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
+CAMERA_IN, CAPTION_PX = WIDTH / DPI, 23
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 
 
@@ -34,17 +36,23 @@ class Canvas:
 
     def __init__(self, played: Played, buildings: Iterable[Building]) -> None:
         self.played, self.actions = played, played.scenario.actions
-        height = SIDE_IN + BARS_IN
-        self.figure = Figure(figsize=(SIDE_IN, height), dpi=DPI)
-        place = 0.0, BARS_IN / height, 1.0, SIDE_IN / height
+        height, width = SIDE_IN + BARS_IN, SIDE_IN + CAMERA_IN
+        self.figure = Figure(figsize=(width, height), dpi=DPI)
+        place = 0.0, BARS_IN / height, SIDE_IN / width, SIDE_IN / height
         self.axes = ground(self.figure, place, played.scenario, buildings)
-        self.bars = self.figure.add_axes((0.62, 0.28 / height, 0.35, 0.8 / height))
+        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, 1.75 / width, 0.8 / height))
         self.bars.set(xlim=(0, 1), ylim=(len(self.actions) - 0.5, -0.5), xticks=[0, 0.5, 1])
         self.bars.set_yticks(range(len(self.actions)), labels=self.actions, size=7)
         self.bars.tick_params(labelsize=6, length=2)
-        self.lines = [self.figure.text(0.02, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
+        self.lines = [self.figure.text(0.1 / width, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
         self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
         self.lines[1].set_text(printable(played.condition, 34))
+        self.captions = [
+            self.figure.text(
+                (SIDE_IN + 0.06) / width, 1 - (top + CAPTION_PX - 7) / (height * DPI), "", size=8
+            )
+            for top in (0, CAPTION_PX + HEIGHT)
+        ]
         self.canvas = FigureCanvasAgg(self.figure)
         self.canvas.draw()  # type: ignore[no-untyped-call]
         self.fixed = self.canvas.copy_from_bbox(self.figure.bbox)  # type: ignore[no-untyped-call]
@@ -66,16 +74,31 @@ class Canvas:
         self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
         decision = f"decision {still.decision.action} at {still.decision.acts_at_s:.2f} s"
         self.lines[3].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
-        for line in self.lines[2:]:
+        viewers = _watched(still.state, seen)
+        for viewer, caption in zip(viewers, self.captions, strict=False):
+            whose = "ego" if viewer == ego.id else "helper"
+            caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")
+        for line in (*self.lines[2:], *self.captions[: len(viewers)]):
             self.figure.draw_artist(line)
-        pixels = np.asarray(self.canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-        return np.ascontiguousarray(pixels[..., :3])
+        pixels = np.ascontiguousarray(np.asarray(self.canvas.buffer_rgba())[..., :3])  # type: ignore[no-untyped-call]
+        for n, viewer in enumerate(viewers):
+            top = CAPTION_PX + n * (CAPTION_PX + HEIGHT)
+            pixels[top : top + HEIGHT, -WIDTH:] = frame(self.played.scenario, still.state, viewer).pixels
+        return pixels
 
     def _over(self, *artists: Artist) -> None:
         for artist in artists:
             self.axes.add_artist(artist)
             self.axes.draw_artist(artist)
             artist.remove()
+
+
+def _watched(state: WorldState, seen: dict[str, list[str]]) -> list[str]:
+    """The ego, and the helper that saw most of whom the ego did not see."""
+    ego = state.ego.id
+    helpers = [v.id for v in state.vehicles if v.id in seen and v.id != ego]
+    more = {helper: len({*seen[helper]} - {*seen[ego], ego, helper}) for helper in helpers}
+    return [ego, *sorted(helpers, key=lambda helper: -more[helper])[:1]]
 
 
 def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:

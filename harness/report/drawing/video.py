@@ -1,4 +1,4 @@
-"""A driven episode from above, as a moving picture.
+"""A driven episode from above and through cameras, as a moving picture.
 
 Thinking is shown slowly: a still a frame of 20 ms while a decision is open, else ten a second, all for the
 same time. So messages can be seen to travel.
@@ -17,7 +17,8 @@ from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.evaluate.replay import Played, stills
 from harness.report.drawing.pictures import styled
-from harness.report.drawing.still import Canvas, Pixels
+from harness.report.drawing.still import Canvas
+from harness.world.perception.camera import Pixels
 from harness.world.perception.graph import scene_graph
 from harness.world.state import WorldState
 

@@ -117,7 +117,7 @@ def _half(
     # A ray of a column goes 1 m ahead, so that its parameter is the depth in metres.
     across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX
     rays = ahead + across[:, None] * right
-    below: Floats = np.arange(rows) + 0.5 - HORIZON * rows  # the horizon
+    below = np.arange(0.5, rows) - HORIZON * rows  # the horizon
     pixels = _background(scenario, eye, rays, below)
     owners = np.full((rows, WIDTH), NOBODY, dtype=np.int16)
     if not boxes:
