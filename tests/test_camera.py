@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from harness.core.errors import UserError
 from harness.core.png import png
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load
 from harness.world import scenarios
+from harness.world.ambient import AMBIENTS, sun_rad
 from harness.world.perception import camera
 from harness.world.perception.camera import (
     AMBER,
@@ -24,6 +26,7 @@ from harness.world.perception.camera import (
     Frame,
     frame,
 )
+from harness.world.perception.graph import scene_graph
 from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import HALF_FIELD_RAD, LEAST_RAYS, detect
 from harness.world.state import VehicleState, WorldState
@@ -82,19 +85,16 @@ def test_a_frame_is_the_same_every_time_and_another_for_another_viewer():
 
 
 def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: Any) -> VehicleState:
-    stated: dict[str, Any] = {
-        "kind": "car",
-        "part": "other",
-        "heading_rad": 0.0,
-        "speed_mps": 20.0,
-        "approach": "west",
-    }
-    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, "route": "straight", **stated, **others})
+    """A car on the motorway, heading east."""
+    approach, route = ROAD.road().ego
+    stated: dict[str, Any] = {"kind": "car", "part": "other", "heading_rad": 0.0, "speed_mps": 20.0}
+    stated |= {"approach": approach, "route": route}
+    return VehicleState(**{"id": name, "x_m": x_m, "y_m": y_m, **stated, **others})
 
 
-def seen_by_the_first(*vehicles: VehicleState) -> Frame:
+def seen_by_the_first(*vehicles: VehicleState, ambient: str = "day") -> Frame:
     state = WorldState(ROAD.name, 0, 0, 0.0, 20.0, vehicles, ())
-    return frame(ROAD, state, vehicles[0].id)
+    return frame(scenarios.get(f"{ROAD.name}:ambient={ambient}"), state, vehicles[0].id)
 
 
 def test_a_car_is_where_and_as_large_as_a_pinhole_shows_it():
@@ -128,8 +128,8 @@ def test_a_truck_shows_above_a_car_only_if_a_ray_reaches_it():
 
 def columns_of(of: Frame, colour: tuple[int, int, int]) -> np.ndarray:
     """Columns in which a lamp is lit, however the air dims it."""
-    towards = of.pixels.astype(float) - np.array(camera.HAZE)
-    wanted = np.array(colour) * camera.SHADE[camera.REAR] - np.array(camera.HAZE)
+    towards = of.pixels.astype(float) - np.array(camera.LAMPS.haze)
+    wanted = np.array(colour) * camera.SHADE[camera.REAR] - np.array(camera.LAMPS.haze)
     along = (towards @ wanted) / np.linalg.norm(towards, axis=2).clip(1e-9) / np.linalg.norm(wanted)
     return np.unique(np.nonzero((along > 0.995) & (of.owners >= 0))[1])
 
@@ -144,6 +144,54 @@ def test_lamps_show_what_a_vehicle_does():
     assert not len(columns_of(ahead(), AMBER))
     assert columns_of(ahead(route="left"), AMBER).max() < WIDTH / 2
     assert columns_of(ahead(route="right"), AMBER).min() > WIDTH / 2
+
+
+def reported(ambient: str, *others: VehicleState) -> dict[str, bool]:
+    """Whether the camera is among the sensors that the first vehicle has of each other one."""
+    state = WorldState(ROAD.name, 0, 0, 0.0, 20.0, (vehicle("v1", 0.0, part="ego"), *others), ())
+    graph = scene_graph(scenarios.get(f"{ROAD.name}:ambient={ambient}"), state, "v1")
+    return {node["id"]: "camera" in node["sensors"] for node in graph["nodes"]}
+
+
+def test_bad_light_takes_range_from_the_camera_and_from_no_other_sensor():
+    near, far = vehicle("v2", 25.0, -2.0), vehicle("v3", 50.0, 4.0)
+    assert reported("day", near, far) == {"v2": True, "v3": True}
+    assert reported("night", near, far) == {"v2": True, "v3": False}
+    assert reported("fog", near, far) == {"v2": True, "v3": False}
+    assert reported("fog", vehicle("v2", 31.0)) == {"v2": False}
+
+
+def test_a_low_sun_takes_what_is_before_it_alone():
+    sun = sun_rad(0)
+    before, beside = (
+        vehicle(name, 30 * np.cos(sun + off), 30 * np.sin(sun + off))
+        for name, off in (("v2", 0.0), ("v3", 0.6))
+    )
+    by_day = reported("day", before, beside)
+    assert reported("glare", before, beside) == {"v2": False, "v3": by_day["v3"]}
+
+
+@pytest.mark.parametrize("ambient", AMBIENTS)
+def test_contrast_falls_with_distance_as_the_air_says(ambient):
+    def contrast(name: str, x_m: float) -> float:
+        of = seen_by_the_first(vehicle("v1", 0.0), vehicle(name, x_m, kind="van"), ambient=ambient)
+        [(left, top, right, bottom)] = of.boxes()[name]
+        coat = of.pixels[bottom - round(0.3 * (bottom - top)), (left + right) // 2].astype(float)
+        return float(np.abs(coat - AMBIENTS[ambient].haze).sum())
+
+    clearest = max((f"v{n}" for n in range(2, 12)), key=lambda name: contrast(name, 23.25))
+    measured = contrast(clearest, 43.25) / contrast(clearest, 23.25)  # 20 m farther
+    assert measured == pytest.approx(np.exp(-20 / AMBIENTS[ambient].fades_m), abs=0.02)
+
+
+def test_lamps_shine_at_night():
+    ahead = vehicle("v2", 30.0, kind="van", braking=True)
+    assert seen_by_the_first(vehicle("v1", 0.0), ahead, ambient="night").pixels[..., 0].max() > 200
+
+
+def test_a_light_that_there_is_not_is_refused():
+    with pytest.raises(UserError, match="ambient is dusk; it must be day or night or rain or fog or glare"):
+        scenarios.get("occluded-intersection:ambient=dusk")
 
 
 def test_a_picture_is_a_png_of_the_same_pixels():

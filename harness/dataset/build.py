@@ -9,7 +9,6 @@ import json
 import re
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -77,7 +76,7 @@ def build(
     config = {
         "scenario": scenario.name,
         "actions": list(scenario.actions),
-        "parameters": json.loads(canonical_json(asdict(scenario.parameters))),
+        "parameters": json.loads(canonical_json(scenario.parameters.stated())),
         "episodes": episodes,
         "seed": seed,
         "purpose": purpose(seed, episodes),

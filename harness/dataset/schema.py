@@ -291,7 +291,7 @@ class Manifest(Closed, frozen=True):
     name: FileName
     scenario: Annotated[str, Meta(max_length=4000)]
     actions: Annotated[list[Text], Meta(min_length=2, extra_json_schema={"uniqueItems": True})]
-    parameters: dict[str, bool | Number | list[Number]]
+    parameters: dict[str, bool | Number | Text | list[Number]]
     episodes: Annotated[int, Meta(ge=1, le=LAST_EPISODE + 1)]
     nodes: Annotated[int, Meta(ge=1, le=10_000_000)]
     seed: Annotated[int, Meta(ge=0, le=LAST_SEED)]

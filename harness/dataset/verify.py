@@ -65,7 +65,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             yield f"[parameters]: {unknown('parameter', name, expected)}"
         elif isinstance(value, list) != isinstance(expected[name], tuple):
             yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
-    if missing := expected.keys() - manifest.parameters.keys():
+    if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.start and manifest.environment != (here := environment.config(scenario.name)):
         differing = sorted(k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v)

@@ -6,7 +6,7 @@ action. A decision that is still open when the next is due continues, and the ne
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
@@ -62,7 +62,7 @@ class LiveSource:
 
     def record(self) -> ClosedLoop:
         """The scenario, and which of its layouts."""
-        parameters = asdict(self.scenario.parameters)
+        parameters = self.scenario.parameters.stated()
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
             episodes=len(self.numbers),

@@ -38,7 +38,7 @@ class Curriculum:
         """What a run that goes on must have in common with what it began as, as plain values."""
         return {
             "scenarios": {
-                scenario.name: sha256_bytes(canonical_json(asdict(scenario.parameters)).encode())
+                scenario.name: sha256_bytes(canonical_json(scenario.parameters.stated()).encode())
                 for scenario in self.prompts
             },
             "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from harness.core import noise
 from harness.core.errors import UserError
+from harness.world.ambient import AMBIENTS, DAY, Ambient
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
 
@@ -40,6 +41,7 @@ class Parameters:
         beacon_noise_m: standard deviation of a beacon's position on each axis.
         beacon_noise_mps: standard deviation of a beacon's speed.
         beacon_noise_rad: standard deviation of a beacon's heading.
+        ambient: light and weather, one of `harness.world.ambient`.
     """
 
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
@@ -58,9 +60,11 @@ class Parameters:
     beacon_noise_m: float = 0.2
     beacon_noise_mps: float = 0.1
     beacon_noise_rad: float = 0.0035
+    ambient: str = DAY
 
     def __post_init__(self) -> None:
         bounds = {
+            "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
             "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
             "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
             "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
@@ -79,6 +83,15 @@ class Parameters:
                 raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be {allowed}")
 
     @property
+    def light(self) -> Ambient:
+        """What `ambient` names."""
+        return AMBIENTS[self.ambient]
+
+    def stated(self) -> dict[str, Any]:
+        """All dials as plain values; of `ambient` only what is not day."""
+        return {k: v for k, v in asdict(self).items() if (k, v) != ("ambient", DAY)}
+
+    @property
     def lag_frames(self) -> int:
         """`decision_lag_s` in whole frames."""
         return frames(self.decision_lag_s, self.simulation_hz)
@@ -89,8 +102,9 @@ class Parameters:
         return round(due_s * self.simulation_hz)
 
 
-BEACON_DIALS = tuple(
-    field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_"))
+# What changes neither who is there nor how they drive, but what is known of them.
+DIALS = tuple(
+    field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
 )
 
 

@@ -18,7 +18,7 @@ from harness.report.words import facts
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.records import Episode, FrozenScenes
-from harness.world.scenario import BEACON_DIALS
+from harness.world.scenario import DIALS
 
 SETTINGS = (
     "model", "prompt", "answer", "thinking", "temperature", "sampling_seed", "helpers", "dtype", "latency",
@@ -32,7 +32,7 @@ def scenes_of(run: Run) -> Any:
     if isinstance(world, FrozenScenes):
         return world.sha256
     name, parameters = world.scenario["name"].partition(":")[0], world.scenario["parameters"]
-    dials = {key: value for key, value in parameters.items() if key not in BEACON_DIALS}
+    dials = {key: value for key, value in parameters.items() if key not in DIALS}
     return name, dials, world.first_seed
 
 
@@ -139,7 +139,7 @@ def _side(run: Run) -> Side:
     named = {key: stated[key] for key in SETTINGS}
     if run.world == "closed-loop":
         parameters = stated["world"]["scenario"]["parameters"]
-        named["scenario"] = {key: parameters[key] for key in BEACON_DIALS if key in parameters}
+        named["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
     # Through the class, which gives a setting that the run does not know the value it had then.
     points = [asdict(OperatingPoint.from_dict(condition)) for condition in stated["conditions"]]
     named["condition"] = {point["name"]: point for point in points}

@@ -5,7 +5,7 @@ sensors do not report owns no pixel, and a column of pixels sees past a vehicle 
 is a pure function of the state, so datasets hold none.
 
 Everything is a box on a flat road: what is on the far side of a lower one shows above it. Heights, paint and
-lamps are declared for this harness.
+lamps are declared for this harness; light and weather are those of `harness.world.ambient`.
 """
 
 import math
@@ -20,6 +20,7 @@ from shapely.ops import substring
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import sha256_bytes
+from harness.world.ambient import AMBIENTS, DAY, Ambient, Colour, sun_rad
 from harness.world.perception.rays import meetings, sweep
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
 from harness.world.road import NORTH
@@ -28,6 +29,7 @@ from harness.world.state import VehicleState, WorldState
 
 Pixels = NDArray[np.uint8]
 Places = NDArray[np.int16]
+Lit = NDArray[np.bool_]
 
 WIDTH, HEIGHT = 512, 256
 FOCAL_PX = WIDTH / 2 / math.tan(HALF_FIELD_RAD)
@@ -40,7 +42,7 @@ LINE_M = 0.4  # width of a painted line
 DASH_M, GAP_M = 3.0, 4.5
 NOBODY = -1
 
-SKY, HAZE = (134, 178, 222), (205, 217, 228)
+GLARE = (255, 247, 224)
 GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
 WALL, BRICK = (182, 166, 142), (150, 132, 108)
 ROWS, COLUMNS = 32, 48  # of what is painted on a wall
@@ -50,7 +52,7 @@ HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (250, 246, 222), (128, 22, 26), (255, 3
 COATS = ((36, 74, 140), (226, 228, 230), (56, 58, 62), (146, 150, 156), (44, 102, 70), (196, 176, 138))
 FRONT, RIGHT, REAR, LEFT = range(4)  # walls of a vehicle, as `VehicleState.corners` has them
 SHADE = np.array([0.96, 0.80, 0.88, 0.72])
-FADES_M = 260.0  # contrast falls to 1/e over so much air
+LAMPS = AMBIENTS[DAY]  # light of their own carries as by day
 
 
 @dataclass(frozen=True)
@@ -87,24 +89,40 @@ class Frame:
 def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
     """What the cameras of one vehicle see."""
     viewer = state.vehicle(viewer_id)
-    reported = detect(state, viewer, sweep(state, viewer))
+    ambient = scenario.parameters.light
+    reported = detect(state, viewer, sweep(state, viewer), ambient)
     boxes = [
         *(_vehicle(state, state.vehicle(d.id)) for d in reported),
         *(_building(b.id, b.corners()) for b in state.buildings),
     ]
     halves = [_half(scenario, viewer, boxes, turned) for turned in (0.0, np.pi)]
     pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
+    if ambient.glare_rad:
+        sun = sun_rad(state.episode_seed) - viewer.heading_rad
+        pixels = np.concatenate([
+            _dazzling(half, sun - turned, ambient)
+            for half, turned in zip(np.split(pixels, 2), (0.0, np.pi), strict=True)
+        ])  # fmt: skip
     return Frame(pixels, owners, tuple(box.name for box in boxes))
 
 
 @dataclass(frozen=True)
 class Box:
-    """Something solid: corners (4, 2) m, its height, and the paint on its walls, (4, ROWS, COLUMNS, 3)."""
+    """Something solid.
+
+    Attributes:
+        name: its id.
+        corners: (4, 2) m.
+        height_m: above the road.
+        walls: the paint on its walls, (4, ROWS, COLUMNS, 3).
+        lamps: which of that shines by itself, (4, ROWS, COLUMNS).
+    """
 
     name: str
     corners: Floats
     height_m: float
     walls: Pixels
+    lamps: Lit
 
 
 def _half(
@@ -118,6 +136,7 @@ def _half(
     across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX
     rays = ahead + across[:, None] * right
     below = np.arange(0.5, rows) - HORIZON * rows  # the horizon
+    ambient = scenario.parameters.light
     pixels = _background(scenario, eye, rays, below)
     owners = np.full((rows, WIDTH), NOBODY, dtype=np.int16)
     if not boxes:
@@ -127,6 +146,7 @@ def _half(
     wall = t.argmin(axis=2)
     depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
     heights, walls = np.array([box.height_m for box in boxes]), np.array([box.walls for box in boxes])
+    lamps = np.array([box.lamps for box in boxes])
     near_first = np.argsort(depth, axis=1, kind="stable")
     up_to_m = np.where(np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0)
     nearer_m = np.pad(np.maximum.accumulate(up_to_m, axis=1), ((0, 0), (1, 0)))[:, :-1]
@@ -141,7 +161,11 @@ def _half(
         row, column = np.nonzero((height_m >= 0) & (height_m < heights[box]))
         onward = np.minimum(u * COLUMNS, COLUMNS - 1).astype(int)
         shades = SHADE[side, None, None] * walls[box, side, :, onward]
-        strips = _hazy(shades, z[:, None]).astype(np.uint8)  # of each column, from the road up
+        # Of each column, from the road up.
+        strips = np.where(
+            lamps[box, side, :, onward][..., None], _hazy(shades, z[:, None], LAMPS),
+            _hazy(ambient.light * shades, z[:, None], ambient),
+        ).astype(np.uint8)  # fmt: skip
         up = (height_m[row, column] * (ROWS / heights[box])[column]).astype(int)
         at = row * WIDTH + columns[column]
         pixels.reshape(-1, 3)[at] = strips[column, up]
@@ -152,12 +176,12 @@ def _half(
 def _vehicle(state: WorldState, v: VehicleState) -> Box:
     """A vehicle, in a coat that says nothing of it, with its lamps."""
     coat = COATS[int(noise.uniforms((1,), "coat", state.episode_seed, v.id)[0] * len(COATS))]
-    return Box(v.id, v.corners(), HEIGHTS_M[v.kind], _vehicle_walls(v.kind, coat, v.indicator, v.braking))
+    return Box(v.id, v.corners(), HEIGHTS_M[v.kind], *_vehicle_walls(v.kind, coat, v.indicator, v.braking))
 
 
 @lru_cache(maxsize=256)
-def _vehicle_walls(kind: str, coat: tuple[int, int, int], indicator: str, braking: bool) -> Pixels:
-    """What is painted on a vehicle, (4, ROWS, COLUMNS, 3), from the road up."""
+def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tuple[Pixels, Lit]:
+    """What is painted on a vehicle from the road up, and what of it shines."""
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = coat
     low, high = {"car": (0.55, 0.92), "van": (0.52, 0.86), "truck": (0.45, 0.72)}[kind]
@@ -170,6 +194,7 @@ def _vehicle_walls(kind: str, coat: tuple[int, int, int], indicator: str, brakin
         for at in (0.10, 0.74):
             _paint(wall, (0.0, 0.30 if kind == "car" else 0.22, at, at + 0.16), TYRE, mirrored)
     walls[:, : max(1, ROWS // 16)] = TYRE  # its shadow
+    dark = walls.copy()
     for mirrored in (False, True):
         _paint(walls[FRONT], (0.30, 0.44, 0.04, 0.20), HEADLAMP, mirrored)
         _paint(walls[REAR], (0.30, 0.50, 0.02, 0.20), BRAKE_LAMP if braking else REAR_LAMP, mirrored)
@@ -178,20 +203,20 @@ def _vehicle_walls(kind: str, coat: tuple[int, int, int], indicator: str, brakin
         _paint(walls[FRONT], (0.44, 0.58, 0.0, 0.16), AMBER, to_right)
         _paint(walls[REAR], (0.50, 0.64, 0.0, 0.16), AMBER, not to_right)
         _paint(walls[RIGHT if to_right else LEFT], (0.30, 0.45, 0.0, 0.08), AMBER, not to_right)
-    return walls
+    return walls, (walls != dark).any(axis=-1)
 
 
 def _building(name: str, corners: Floats) -> Box:
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = WALL
     walls[:, ::6] = BRICK
-    return Box(name, corners, BUILDING_M, walls)
+    return Box(name, corners, BUILDING_M, walls, np.zeros(walls.shape[:-1], dtype=bool))
 
 
 def _paint(
     wall: Pixels,
     part: tuple[float, float, float, float],
-    colour: tuple[int, int, int],
+    colour: Colour,
     mirrored: bool = False,
 ) -> None:
     """Paint from one share of its height to another, and of its length."""
@@ -203,10 +228,11 @@ def _paint(
 
 def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) -> Pixels:
     """Sky and ground, (rows, WIDTH, 3)."""
+    ambient = scenario.parameters.light
     pixels = np.empty((len(below), len(rays), 3), dtype=np.uint8)
     sky = int(np.count_nonzero(below <= 0))
     up = (below[:sky] / below[0])[:, None]
-    pixels[:sky] = (up * np.array(SKY) + (1 - up) * np.array(HAZE))[:, None]
+    pixels[:sky] = (up * np.array(ambient.sky) + (1 - up) * np.array(ambient.haze))[:, None]
     depth_m = EYE_M * FOCAL_PX / below[sky:]
     ground = _ground_map(scenario)
     x, y = (
@@ -214,16 +240,26 @@ def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) ->
         .astype(np.int32).clip(0, len(ground) - 1)
         for k in (0, 1)
     )  # fmt: skip
-    colours = _hazy(np.array([GRASS, ASPHALT, PAINT], dtype=float), depth_m[:, None])  # of each row
+    colours = _hazy(
+        ambient.light * np.array([GRASS, ASPHALT, PAINT]), depth_m[:, None], ambient
+    )  # of each row
     what = ground[y, x] + 3 * np.arange(len(depth_m))[:, None]
     pixels[sky:] = colours.astype(np.uint8).reshape(-1, 3)[what]
     return pixels
 
 
-def _hazy(colours: Floats, depth_m: Floats) -> Floats:
+def _hazy(colours: Floats, depth_m: Floats, ambient: Ambient) -> Floats:
     """Colours as they are after so much air."""
-    clear = np.exp(-depth_m / FADES_M)[..., None]
-    return np.asarray(clear * colours + (1 - clear) * np.array(HAZE))
+    clear = np.exp(-depth_m / ambient.fades_m)[..., None]
+    return np.asarray(clear * colours + (1 - clear) * np.array(ambient.haze))
+
+
+def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
+    """One camera's pixels with the sun at this angle to the right of its middle."""
+    off = np.arctan((np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX) - sun_rad
+    off = (off + np.pi) % (2 * np.pi) - np.pi
+    clear = (1 - np.exp(-((off / ambient.glare_rad) ** 2)))[:, None]
+    return np.asarray(clear * pixels + (1 - clear) * np.array(GLARE)).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)

@@ -32,7 +32,7 @@ Graph = dict[str, Any]
 def scene_graph(scenario: Scenario, state: WorldState, viewer_id: str) -> Graph:
     """What the sensors of one vehicle know."""
     road, viewer = scenario.road(), state.vehicle(viewer_id)
-    detections = detect(state, viewer, sweep(state, viewer))
+    detections = detect(state, viewer, sweep(state, viewer), scenario.parameters.light)
     # What no sensor reports must not show by what it hides.
     reported = {viewer.id, *(d.id for d in detections)}
     known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))

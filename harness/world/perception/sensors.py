@@ -3,7 +3,8 @@
 LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8 m/s.
 Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°, range rate
 to 0.15 m/s, and tracking with it gives speed to 0.2 m/s.
-Camera: 60° to either side of the front and of the rear, 60 m; class and turn indicator. It never adds to a
+Camera: 60° to either side of the front and of the rear, 60 m by day and else as `harness.world.ambient`
+says; class and turn indicator. It never adds to a
 position, because the LiDAR sees all that it sees and places it better.
 Noise is Gaussian with those standard deviations (declared for this harness, typical of automotive
 data sheets, no particular product), keyed by episode, step, viewer and object.
@@ -14,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core import noise
+from harness.world.ambient import AMBIENTS, DAY, Ambient, sun_rad
 from harness.world.perception.rays import Sweep
 from harness.world.state import VehicleState, WorldState
 
-LIDAR_RANGE_M, RADAR_RANGE_M, CAMERA_RANGE_M = 80.0, 150.0, 60.0
+LIDAR_RANGE_M, RADAR_RANGE_M = 80.0, 150.0
 HALF_FIELD_RAD = np.radians(60.0)
 LEAST_RAYS = 3  # rays on an object below which no sensor reports it
 # Standard deviations: the LiDAR's position on each axis, the radar's range.
@@ -53,24 +55,26 @@ class Detection:
     braking: bool | None = None
 
 
-def detect(state: WorldState, viewer: VehicleState, view: Sweep) -> list[Detection]:
+def detect(
+    state: WorldState, viewer: VehicleState, view: Sweep, ambient: Ambient = AMBIENTS[DAY]
+) -> list[Detection]:
     """What the sensors of one vehicle report, in the order of ids."""
     found = []
     for v in state.vehicles:
         if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS:
-            detection = _fused(state, viewer, v)
+            detection = _fused(state, viewer, v, ambient)
             if detection:
                 found.append(detection)
     return found
 
 
-def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detection | None:
+def _fused(state: WorldState, viewer: VehicleState, v: VehicleState, ambient: Ambient) -> Detection | None:
     dx, dy = v.x_m - viewer.x_m, v.y_m - viewer.y_m
     distance, bearing = float(np.hypot(dx, dy)), float(np.arctan2(dy, dx))
     off_axis = abs((bearing - viewer.heading_rad + np.pi) % (2 * np.pi) - np.pi)
     in_field = min(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
     seen = {
-        "camera": in_field and distance <= CAMERA_RANGE_M,
+        "camera": in_field and distance <= ambient.camera_m and not _dazzled(state, bearing, ambient),
         "lidar": distance <= LIDAR_RANGE_M,
         "radar": in_field and distance <= RADAR_RANGE_M,
     }
@@ -106,3 +110,11 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState) -> Detectio
         range_rate_mps=rate,
         braking=v.braking if seen["camera"] else None,
     )
+
+
+def _dazzled(state: WorldState, bearing_rad: float, ambient: Ambient) -> bool:
+    """Whether the sun shines into a camera from there."""
+    if not ambient.glare_rad:
+        return False
+    off = (bearing_rad - sun_rad(state.episode_seed) + np.pi) % (2 * np.pi) - np.pi
+    return bool(abs(off) < ambient.glare_rad)

@@ -13,7 +13,7 @@ from typing import Any
 from harness.core.errors import UserError, printable, unknown
 from harness.world.environments import environment
 from harness.world.environments import scenario as environments
-from harness.world.scenario import BEACON_DIALS, Parameters, Scenario
+from harness.world.scenario import DIALS, Parameters, Scenario
 
 GROUP = "swarmdrive.scenarios"
 DEFAULT = "occluded-intersection"  # where none is named
@@ -25,7 +25,7 @@ def names() -> tuple[str, ...]:
 
 
 def get(text: str) -> Scenario:
-    """The scenario of that name, or one with other beacons: `occluded-intersection:perfect_knowledge=true`.
+    """The scenario of that name, or one with other beacons or light: `occluded-intersection:ambient=fog`.
 
     Raises UserError if there is none, or no such setting, or a value is not allowed.
     """
@@ -42,17 +42,19 @@ def get(text: str) -> Scenario:
 
 
 def dials(scenario: Scenario) -> tuple[str, ...]:
-    """The parameters that a name may set: `NAME:beacon_loss=0.3`."""
-    return (*BEACON_DIALS, *(environments.DIALS if scenario.start else ()))
+    """The parameters that a name may set: `NAME:beacon_loss=0.3`, `NAME:ambient=fog`."""
+    return (*DIALS, *(environments.DIALS if scenario.start else ()))
 
 
-def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float]:
+def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float | str]:
     key, _, value = text.partition("=")
     shown, known = printable(scenario.name), dials(scenario)
     if key not in known:
         raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
     if key == "perfect_knowledge" and value in ("true", "false"):
         return key, value == "true"
+    if key == "ambient":
+        return key, value
     try:
         return key, (int if type(getattr(scenario.parameters, key)) is int else float)(value)
     except ValueError:
