@@ -51,7 +51,7 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     for parameter, of in parameters.items():
         values = of["value"] if isinstance(of["value"], tuple) else (of["value"],)
-        shown_values = ", ".join(str(v).lower() if isinstance(v, bool) else f"{v:g}" for v in values)
+        shown_values = ", ".join(f"{v:g}" if type(v) in (int, float) else str(v).lower() for v in values)
         typer.echo(f"{parameter} = {shown_values}")
         typer.echo(textwrap.fill(of["meaning"], 80, initial_indent="    ", subsequent_indent="    "))
 
