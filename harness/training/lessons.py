@@ -1,15 +1,15 @@
 """The decision points that a model learns from, and what it should have intended there.
 
-They are drawn from the decision trees of train layouts: of each level up to `OF_A_LEVEL` points, whose
-actions are all tried. So a model sees the scenes that its own errors lead to, for a tenth of what whole trees
-cost.
+They are drawn from the decision trees of train layouts: of each level up to `OF_A_LEVEL` points. So a model
+sees the scenes that its own errors lead to.
 
 An action is safe if the episode still succeeds when the driver that sees no more than the ego takes the rest:
 what only one who sees everything could still save is not safe for who does not. Each safe action has the
 weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one has none. Where IDLE and
 another come to the same (FASTER at the highest speed level, a lane as good) most goes to IDLE. A viewer that
 cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure. A
-point at which nothing is safe any more teaches nothing, and is not gone on from.
+point at which nothing is safe any more teaches nothing; what follows it may, where that driver is too bold to
+take the rest and one more SLOWER saves it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +36,8 @@ from harness.world.world import World
 
 TEACHER = "local-view"
 SOFTNESS_S = 0.25
-OF_A_LEVEL = 5
+OF_A_LEVEL = 6  # decision points that are learnt from
+TRIED = 40  # at most, to find them
 CALM = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}  # prior weight of an action, 1 if not named
 
 
@@ -109,9 +110,11 @@ def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
     level = [World.start(scenario, seed)]
     while level:
         following: dict[str, World] = {}
-        for n in sorted(rng.permutation(len(level))[:OF_A_LEVEL].tolist()):
+        taken = 0
+        for n in rng.permutation(len(level))[:TRIED].tolist():
+            if taken == OF_A_LEVEL:
+                break
             world, state = level[n], level[n].state()
-            seen = moment(world, state, number, (state.ego, *state.helpers))
             children: dict[str, World] = {}
             ends_s = dict.fromkeys(world.actions, float(np.inf))
             for edge in edges(world, number, children):
@@ -121,9 +124,11 @@ def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
                     outcome = finish(list(children.values())[edge.to or 0].branch(), TEACHER)
                 if outcome.judged(reference, scenario.parameters).success and outcome.time_s is not None:
                     ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
+            following.update(children)
             if np.isfinite(list(ends_s.values())).any():
+                taken += 1
+                seen = moment(world, state, number, (state.ego, *state.helpers))
                 points.append({"moment": seen, "label": label(ends_s).tolist()})
-                following.update(children)
         level = list(following.values())
     return points
 
