@@ -1,6 +1,7 @@
 """Prompts: what a model is sent, word by word, and everything that can be wrong with a version."""
 
 import os
+import pickle
 import re
 import shutil
 from collections.abc import Callable
@@ -62,6 +63,15 @@ def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_cou
     assert re.search(
         rf"{5 - prompt.max_objects} (more )?farther|{5 - prompt.max_objects} more", user["content"]
     )
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_version_that_was_used_travels_to_another_process(version: str) -> None:
+    prompt, (seen, messages) = prompts.load(version), CASES["ego-messages"]
+    said = prompt.render(seen, ACTIONS, messages, CROSSING)
+    there = pickle.loads(pickle.dumps(prompt))
+    assert there == prompt
+    assert there.render(seen, ACTIONS, messages, CROSSING) == said
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -7,7 +7,7 @@ is a new version.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -125,8 +125,8 @@ class Prompt:
             raise ValueError("max_answer_tokens wants exactly ego and helper")
 
     def __getstate__(self) -> dict[str, Any]:
-        """What goes to another process: all but the compiled templates."""
-        return {name: value for name, value in vars(self).items() if name != "_templates"}
+        """What goes to another process: all but what is compiled."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def _templates(self) -> dict[str, Template]:
