@@ -28,6 +28,13 @@ class Asked(NamedTuple):
         self.handler.end_headers()
         self.handler.wfile.write(data)
 
+    def stream(self, *pieces: Any, between: Callable[[], Any] = lambda: None) -> None:
+        """Answer as a decent server streams: an event a piece, or bytes as they are, and hang up."""
+        self.raw(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream; charset=utf-8\r\n\r\n")
+        for piece in pieces:
+            self.raw(piece if isinstance(piece, bytes) else event(piece))
+            between()
+
     def raw(self, data: bytes) -> None:
         """Write bytes in place of an answer, and hang up."""
         self.handler.wfile.write(data)
@@ -73,6 +80,23 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""
+
+
+def event(piece: Any) -> bytes:
+    """A piece of a stream."""
+    return f"data: {json.dumps(piece)}\n\n".encode()
+
+
+def pieces(*texts: str, finish_reason: str | None = "stop", usage: bool = True, **first: Any) -> list[Any]:
+    """A completion in pieces, as vLLM sends it: who speaks, each text, why it ends, and the tokens' count."""
+    deltas = [{"role": "assistant", "content": "", **first}, *({"content": text} for text in texts)]
+    made: list[Any] = [{"choices": [{"index": 0, "delta": delta, "finish_reason": None}]} for delta in deltas]
+    if finish_reason:
+        made.append({"choices": [{"index": 0, "delta": {}, "finish_reason": finish_reason}]})
+    if usage:
+        counted = {"prompt_tokens": 12, "completion_tokens": len(texts) + 1}
+        made.append({"choices": [], "usage": counted})
+    return [*made, b"data: [DONE]\n\n"]
 
 
 def completion(content: Any = "hello", finish_reason: str = "stop", **message: Any) -> dict[str, Any]:

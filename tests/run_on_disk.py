@@ -19,6 +19,8 @@ from harness.runs.summary import counted, scores
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 Row = dict[str, Any]
 Change = Callable[[Row], object]
+# What the machine adds to an answer.
+UNTIMED: Row = {"seconds": None, "first_token_s": None, "token_s": None}
 
 _FROZEN = FrozenScenes(
     name="made-up",

@@ -14,7 +14,7 @@ from evaluating import Scripted, failed, same_decisions, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 from misbehaving import completion, serving
-from run_on_disk import answers_of
+from run_on_disk import UNTIMED, answers_of
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request
@@ -46,12 +46,13 @@ CHANGED: dict[str, Any] = {
     "reasons_first": True,
     "temperature": 0.7,
     "sample": 1,
+    "timed": True,
     "agent": 1,
     "view": {"nodes": []},
     "truth": {"nodes": []},
     "scenario": SCENARIO,
 }
-READ_BY_NO_MODEL = ("id", "agent", "reasons_first", "view", "truth", "scenario")
+READ_BY_NO_MODEL = ("id", "timed", "agent", "reasons_first", "view", "truth", "scenario")
 
 
 class Talker(Scripted):
@@ -135,11 +136,12 @@ def test_what_was_answered_is_not_asked_again_and_the_order_holds(file: Path) ->
     assert [c.cached for c in done] == [False, True, True, True, False, False]
 
 
-def test_an_answer_from_the_cache_has_all_but_its_seconds(file: Path) -> None:
-    said = Completion(BASE.id, "x", 12, 5, "length", 0.7, 1, label_mass=0.5, retries=2)
+def test_an_answer_from_the_cache_has_all_but_its_times(file: Path) -> None:
+    times: Any = {"seconds": 0.7, "first_token_s": 0.3, "token_s": 0.1}
+    said = Completion(BASE.id, "x", 12, 5, "length", batch_size=1, label_mass=0.5, retries=2, **times)
     assert Cached(Talker({BASE.id: said}), file).complete([BASE]) == [said]
     [again] = Cached(Talker(), file).complete([BASE])
-    assert again == replace(said, seconds=None, retries=0, cached=True)
+    assert again == replace(said, **dict.fromkeys(times), retries=0, cached=True)
 
 
 def test_errors_are_asked_again(file: Path) -> None:
@@ -274,7 +276,7 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     # Decision points that a viewer cannot tell apart have one prompt, so a run meets its own answers.
     alike = [
         [
-            msgspec.structs.replace(a, batch_size=0, cached=False, seconds=None)
+            msgspec.structs.replace(a, batch_size=0, cached=False, **UNTIMED)
             for a in answers_of(tmp_path / name)
         ]
         for name in ("asked", "first")

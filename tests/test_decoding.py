@@ -17,7 +17,9 @@ import tiny_qwen3
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from run_on_disk import UNTIMED
 
+from harness.backends import decoding, sampling
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import resolve
 from harness.backends.decoding import Decoding
@@ -100,6 +102,57 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
         assert completion.finish_reason == ("stop" if stopped else "length")
         lengths.add(len(said))
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
+
+
+# -- times ------------------------------------------------------------------------------------------
+
+
+class Ticking:
+    """An engine by a clock of its own: half a second to read a prompt, a tenth to go on by some tokens."""
+
+    def __init__(self, engine: TransformersEngine) -> None:
+        self._engine = engine
+        self.now_s = 0.0
+
+    def begin(self, prompts: Sequence[Sequence[int]]) -> Any:
+        session = self._engine.begin(prompts)
+        self.now_s += 0.5
+        go_on = session.advance
+
+        def advance(chunks: Sequence[Sequence[int]]) -> None:
+            self.now_s += 0.1
+            go_on(chunks)
+
+        session.advance = advance  # type: ignore[method-assign]
+        return session
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+
+@pytest.mark.parametrize(
+    ("answer", "seconds", "first_token_s", "token_s"),
+    [
+        # Each of four tokens but the last is read before the next is chosen.
+        ("json", 0.8, 0.5, 0.1),
+        # Before each of six digits what is fixed is read, the digit before it among that.
+        ("constrained", 1.1, 0.6, 0.1),
+        ("readout", 0.5, 0.5, None),
+    ],
+)
+def test_the_first_token_is_there_when_the_model_has_chosen_it(
+    backend: LanguageModel, answer: AnswerMode, seconds: float, first_token_s: float, token_s: float | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    engine = Ticking(engine_of(backend))
+    for module in (decoding, sampling):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: engine.now_s))
+    timed = LanguageModel(engine, 4)
+    [one] = timed.complete([ask(3, answer, max_tokens=4 if answer == "json" else 80)])
+    assert one.finish_reason == ("length" if answer == "json" else "stop")
+    assert (one.seconds, one.first_token_s, one.token_s) == pytest.approx((seconds, first_token_s, token_s))
+    both = timed.complete([ask(i, answer) for i in (3, 4)])
+    assert {(c.batch_size, c.seconds, c.first_token_s, c.token_s) for c in both} == {(2, None, None, None)}
 
 
 # -- constrained --------------------------------------------------------------------------------------
@@ -208,7 +261,7 @@ def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
 def same(one: Sequence[Completion], other: Sequence[Completion]) -> None:
     """Equal but for company: a read-out's numbers may differ by what float32 rounds."""
     for a, b in zip(one, other, strict=True):
-        alone: Any = {"batch_size": 1, "seconds": None, "text": "", "label_mass": None}
+        alone: Any = {**UNTIMED, "batch_size": 1, "text": "", "label_mass": None}
         assert replace(a, **alone) == replace(b, **alone)
         if a.label_mass is None:
             assert a.text == b.text

@@ -26,7 +26,7 @@ from evaluating import (
     spec_of,
     sure,
 )
-from run_on_disk import answers_of, configure
+from run_on_disk import UNTIMED, answers_of, configure
 
 from harness.backends.base import Completion, Request
 from harness.coordination.channel import Draws
@@ -260,7 +260,7 @@ def test_killed_among_the_fusion_calls_it_goes_on(
     run(spec, tmp_path / "run")
     assert same_decisions(tmp_path / "run", done.out)
     timeless = [
-        [msgspec.structs.replace(answer, seconds=None) for answer in answers_of(out)]
+        [msgspec.structs.replace(answer, **UNTIMED) for answer in answers_of(out)]
         for out in (tmp_path / "run", done.out)
     ]
     assert timeless[0] == timeless[1], "but for the seconds of one that was asked alone"
@@ -291,7 +291,7 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
     begun = json.loads((tmp_path / "run/.work/config.json").read_text())["latency"]
     monkeypatch.setattr(timing, "load_a_core", lambda: 9.0)
     resumed = run(spec, tmp_path / "run")
-    assert msgspec.to_builtins(resumed.manifest.latency) == begun
+    assert json.loads(msgspec.json.encode(resumed.manifest.latency)) == begun
     assert 0 < begun["ego_s"] < begun["fusion_s"]
     fused = [d for d in decisions(tmp_path / "run", FUSION.name) if any(m.on_time for m in d.messages)]
     rules = {(d.scene, d.seed): d.latency_ms for d in decisions(tmp_path / "run", "6g")}

@@ -30,6 +30,8 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.latency import PAPER, as_declared, declared, known, times
 from harness.evaluate.timing import IDLE, measured
 from harness.prompts import versions
+from harness.report.words import pace
+from harness.runs import folder
 from harness.runs.records import Latency, Times
 
 LANGUAGE_MODEL = "swarm-tiny"
@@ -130,6 +132,7 @@ class Clock(Scripted):
     """An ego takes 0.2 s, a helper 0.1 s and a fusion call 0.4 s, but for the completions written down."""
 
     def _say(self, request: Request) -> Completion:
+        assert request.timed, "a server streams what is asked to be timed, and nothing else"
         done = super()._say(request)
         if request.id in self.lines:
             return done
@@ -150,7 +153,8 @@ def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset)
     latency = measured(spec, backend, scenes)
     helpers = sum(len(scene.viewers) - 1 for scene in scenes)
     assert (latency.ego_s, latency.helper_s, latency.fusion_s) == (0.2, 0.1, 0.4)
-    assert latency.sample["ego"] == Times(3, 0.2, 0.2, 0.29)
+    ego = latency.sample["ego"]
+    assert (ego.n, ego.median_s, ego.p5_s, ego.p95_s) == (3, 0.2, 0.2, 0.29)
     assert (latency.sample["helper"].n, latency.sample["merge"].n) == (helpers, len(scenes))
     assert latency.source == "measured"
     # Letters have no messages to fuse, and a role without a time has the ego's.
@@ -206,7 +210,63 @@ def test_times_by_hand(small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small), tmp_path / "run")
     one = answers_of(tmp_path / "run")[0]
     took = [msgspec.structs.replace(one, seconds=s / 100) for s in range(101)]
-    assert times(took) == {"ego": Times(101, 0.5, 0.05, 0.95)}
+    assert times(took) == {"ego": Times(101, 0.5, 0.05, 0.95)}, "of one episode: no interval over episodes"
+
+
+def test_times_to_the_first_token_and_of_each_after_it(small: Dataset, tmp_path: Path) -> None:
+    """Ten episodes of one answer, of which the second half never told of tokens."""
+    run(spec_of(small), tmp_path / "run")
+    one = answers_of(tmp_path / "run")[0]
+    took = [
+        msgspec.structs.replace(
+            one, scene=f"{n:05d}-0", seconds=0.1 * (1 + n), first_token_s=0.02 * (1 + n) if n < 5 else None,
+            token_s=0.001 if n < 5 else None,
+        )
+        for n in range(10)
+    ]  # fmt: skip
+    [(role, found)] = times(took).items()
+    first, token = found.first_token, found.token
+    assert first is not None
+    assert token is not None
+    assert (role, found.n, found.median_s) == ("ego", 10, 0.55)
+    assert (first.n, first.median_s, first.p5_s, first.p95_s) == (5, 0.06, 0.024, 0.096)
+    for each in (found, first):
+        assert each.median_ci_s is not None
+        assert each.p95_ci_s is not None
+        assert each.median_ci_s[0] < each.median_s < each.median_ci_s[1] <= each.p95_ci_s[1]
+    assert token == Times(5, 0.001, 0.001, 0.001), "all alike: nothing is known of other episodes"
+
+
+def test_a_replay_keeps_its_runs_times_to_first_token(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Told(Scripted):
+        def _say(self, request: Request) -> Completion:
+            return replace(super()._say(request), seconds=0.5, first_token_s=0.3, token_s=0.01)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "open_backend", lambda *_, **__: Told({}))
+        first = run(spec_of(small, LANGUAGE_MODEL), tmp_path / "run").manifest
+    again = run(spec_of(small, f"replay:{tmp_path / 'run'}"), tmp_path / "again").manifest
+    ego = first.answer_times["ego"]
+    assert again.answer_times == first.answer_times
+    assert ego.first_token == Times(ego.n, 0.3, 0.3, 0.3)
+    assert list(pace(again))[:3] == [
+        "ego: 60 % of the median answer is prefill (batch 1, measured where it ran)",
+        f"  ego TTFT 300.0 [–, –] ms, p95 300.0 [–, –], n = {ego.n}",
+        f"  ego TPOT 10.0 [–, –] ms, p95 10.0 [–, –], n = {ego.n}",
+    ]
+
+
+def test_answers_of_before_there_were_times_to_first_token_have_none(small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small), tmp_path / "run")
+    file = tmp_path / "run/answers.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    old = [{k: v for k, v in line.items() if k not in ("first_token_s", "token_s")} for line in lines]
+    assert len(old[0]) == len(lines[0]) - 2
+    file.write_text("".join(json.dumps(line) + "\n" for line in old))
+    assert {(a.first_token_s, a.token_s) for a in answers_of(tmp_path / "run")} == {(None, None)}
+    assert list(pace(folder.read(tmp_path / "run").manifest)) == []
 
 
 def same_rows(one: Path, other: Path) -> bool:

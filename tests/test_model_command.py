@@ -121,6 +121,7 @@ def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answ
     answers = [line.split(maxsplit=3) for line in out.splitlines() if " ms, " in line]
     assert [a[0] for a in answers] == ["json", "constrained", "readout"]
     assert all(float(a[1]) > 0 for a in answers)
+    assert ["first token after" in " ".join(a) for a in answers] == [True, True, False]
     assert answers[2][3].startswith('1 tokens, stop: \'{"action_distribution":')
 
 

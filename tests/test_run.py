@@ -25,7 +25,7 @@ from evaluating import (
     spec_of,
     with_ego,
 )
-from run_on_disk import answers_of, rows_of
+from run_on_disk import UNTIMED, answers_of, rows_of
 
 from harness.backends import cards
 from harness.backends.cards import Latency
@@ -51,7 +51,7 @@ def proxy_run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def without_company(answers: list[Answer]) -> list[Answer]:
     """Answers less what may differ with the batch: its size, and the seconds of an answer asked alone."""
-    return [msgspec.structs.replace(answer, batch_size=0, seconds=None) for answer in answers]
+    return [msgspec.structs.replace(answer, batch_size=0, **UNTIMED) for answer in answers]
 
 
 # -- twins ----------------------------------------------------------------------------------------------

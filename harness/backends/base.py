@@ -36,6 +36,7 @@ class Request:
             temperature).
         sample: which of several answers to one question, and so the seed of its draws; 0 where one is asked
             for.
+        timed: whether it is asked to measure its time: a server streams it then, which shows its first token.
         agent: which of the run's agents is asked: 0 is the ego's.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
@@ -54,6 +55,7 @@ class Request:
     reasons_first: bool = False
     temperature: float = 0.0
     sample: int = 0
+    timed: bool = False
     agent: int = 0
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
@@ -78,6 +80,8 @@ class Completion:
         retries: attempts that failed before this one; their time is in `seconds`.
         cached: it comes from the cache, so it has no seconds.
         slow_s: seconds that this answer is declared to take beyond its card's latency: a proxy's slow tail.
+        first_token_s: time to first token (TTFT), prefill included; None where `seconds` is, or not known.
+        token_s: time per output token (TPOT, see `per_token_s`); None where there is none after the first.
     """
 
     request_id: str
@@ -92,6 +96,19 @@ class Completion:
     retries: int = 0
     cached: bool = False
     slow_s: float = 0.0
+    first_token_s: float | None = None
+    token_s: float | None = None
+
+
+def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
+    """Time per output token (TPOT): seconds after the first token, for each token after it.
+
+    (seconds - first_token_s) / (tokens - 1), as `vllm bench serve` has it. Tokens are those that the model
+    chose: the fixed ones of a constrained answer are read, and their time is in that of the next one chosen.
+    """
+    if first_token_s is None or tokens is None or tokens < 2:
+        return None
+    return (seconds - first_token_s) / (tokens - 1)
 
 
 class Backend(Protocol):

@@ -27,13 +27,14 @@ NOT_IN_KEY = {
     "id": "names the place in a run; the model never reads it",
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
     "agent": "which model is asked; what it is, is in the identity",
+    "timed": "how the answer is sent; whoever measures asks past the cache",
     "reasons_first": "how the answer is read; the prompt asks for it in words",
     "view": "no language model reads it",
     "truth": "no language model reads it",
     "scenario": "no language model reads it; its actions are a field of their own",
 }
 # What a completion has of its own asking, and not of its answer.
-_NOT_KEPT = ("request_id", "seconds", "error", "retries", "cached")
+_NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached")
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
 _WAIT_S = 30.0  # for another process that is writing
 _AT_ONCE = 500  # keys of one look-up; SQLite has a limit

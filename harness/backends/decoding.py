@@ -5,11 +5,12 @@ for one letter, and the letters' probabilities are the answer.
 """
 
 import math
+import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from harness.backends.base import FinishReason, Request
+from harness.backends.base import FinishReason, Request, per_token_s
 from harness.backends.engine import Engine, Session
 from harness.backends.sampling import Choice
 from harness.backends.skeleton import Skeleton, finished, tokens_after
@@ -26,12 +27,18 @@ class Answer:
         tokens: how many were written, the fixed ones of a skeleton and the stop token included.
         finish_reason: `stop` or `length`.
         label_mass: probability on the letters together, of a read-out.
+        seconds: of an answer alone, as are the next two; None in a batch.
+        first_token_s: until its first token was chosen; of a read-out, until it was there.
+        token_s: for each token chosen after the first (`per_token_s`).
     """
 
     text: str
     tokens: int
     finish_reason: FinishReason
     label_mass: float | None = None
+    seconds: float | None = None
+    first_token_s: float | None = None
+    token_s: float | None = None
 
 
 class Decoding:
@@ -63,11 +70,20 @@ class Decoding:
             requests: all to be answered the same way, and `room` was there for each.
             prompts: their rendered messages, in tokens.
         """
+        start_s = time.perf_counter()
+        choice = Choice(requests, prompts)
         with closing(self._engine.begin(prompts)) as session:
             if requests[0].answer == "readout":
-                return self._read_out(session, requests)
-            way = self._free if requests[0].answer == "json" else self._constrained
-            return way(session, requests, Choice(requests, prompts))
+                answers = self._read_out(session, requests)
+            else:
+                way = self._free if requests[0].answer == "json" else self._constrained
+                answers = way(session, requests, choice)
+        end_s = time.perf_counter()
+        if len(answers) > 1:
+            return answers
+        seconds, first_s = end_s - start_s, (choice.first_at_s or end_s) - start_s
+        token_s = per_token_s(seconds, first_s, choice.rounds)
+        return [replace(answers[0], seconds=seconds, first_token_s=first_s, token_s=token_s)]
 
     def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         said: list[list[int]] = [[] for _ in requests]

@@ -1,6 +1,5 @@
 """The backend of every language model that runs in this process, whatever its engine."""
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import groupby
@@ -104,25 +103,24 @@ class LanguageModel:
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
         """Completions of a batch, or the engine's message."""
         try:
-            start_s = time.perf_counter()
             answers = self._decoding.answer([p.request for p in batch], [p.ids for p in batch])
-            seconds = time.perf_counter() - start_s
         except Exception as error:  # an engine may fail in any way; what it says is data
             return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
-        alone = seconds if len(batch) == 1 else None
-        return [_completion(p, answer, alone, len(batch)) for p, answer in zip(batch, answers, strict=True)]
+        return [_completion(p, answer, len(batch)) for p, answer in zip(batch, answers, strict=True)]
 
 
-def _completion(prompt: _Prompt, answer: Answer, seconds: float | None, batch_size: int) -> Completion:
+def _completion(prompt: _Prompt, answer: Answer, batch_size: int) -> Completion:
     return Completion(
         request_id=prompt.request.id,
         text=answer.text,
         prompt_tokens=len(prompt.ids),
         completion_tokens=answer.tokens,
         finish_reason=answer.finish_reason,
-        seconds=seconds,
+        seconds=answer.seconds,
         batch_size=batch_size,
         label_mass=answer.label_mass,
+        first_token_s=answer.first_token_s,
+        token_s=answer.token_s,
     )
 
 

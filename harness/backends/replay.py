@@ -115,7 +115,8 @@ class Replay:
         return Completion(
             request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
-            answer.label_mass, answer.retries, answer.cached, answer.slow_s,
+            answer.label_mass, answer.retries, answer.cached, answer.slow_s, answer.first_token_s,
+            answer.token_s,
         )  # fmt: skip
 
     def latency(self) -> Latency:

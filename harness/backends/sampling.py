@@ -3,6 +3,7 @@
 Draws are keyed by what the model reads and by which answer it is, so company, order and a resume change none.
 """
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,9 +15,16 @@ from harness.core.arrays import Floats
 
 
 class Choice:
-    """Chooses the tokens of some answers: a uniform draw for each token of those that are drawn."""
+    """Chooses the tokens of some answers: a uniform draw for each token of those that are drawn.
+
+    Attributes:
+        first_at_s: when the first was there, by `time.perf_counter`; None before.
+        rounds: how often some were chosen: of an answer alone, its tokens.
+    """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
+        self.first_at_s: float | None = None
+        self.rounds = 0
         self._drawn = {
             place: (request.temperature, noise.generator("answer", tuple(ids), request.sample))
             for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
@@ -33,13 +41,16 @@ class Choice:
             places: of their requests.
             among: tokens that are allowed.
         """
-        if not self._drawn:
-            return session.argmax(among)
-        chosen, log_p = session.argmax(among), session.log_probs()
-        for row, (place, tokens) in enumerate(zip(places, among, strict=True)):
-            if place in self._drawn:
-                temperature, generator = self._drawn[place]
-                chosen[row] = drawn(log_p[row], tokens, temperature, generator.random())
+        chosen = session.argmax(among)
+        if self._drawn:
+            log_p = session.log_probs()
+            for row, (place, tokens) in enumerate(zip(places, among, strict=True)):
+                if place in self._drawn:
+                    temperature, generator = self._drawn[place]
+                    chosen[row] = drawn(log_p[row], tokens, temperature, generator.random())
+        if not self.rounds:
+            self.first_at_s = time.perf_counter()
+        self.rounds += 1
         return chosen
 
 

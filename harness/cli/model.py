@@ -144,6 +144,8 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
             typer.echo(f"{way:<13}no answer: {printable(answer.error, 300)}")
             continue
         took = "" if answer.seconds is None else f"{answer.seconds * 1000:.1f} ms, "
+        if answer.first_token_s is not None and answer.token_s is not None:
+            took += f"first token after {answer.first_token_s * 1000:.1f} ms, "
         tokens = "" if answer.completion_tokens is None else f"{answer.completion_tokens} tokens, "
         typer.echo(f"{way:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
 

@@ -190,6 +190,9 @@ def show(
 
 def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
     """Where a run's times come from and how its answers were read."""
+    from harness.report.words import pace
+
+    yield from pace(m)
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
     for role, took in m.answer_times.items():
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))

@@ -86,6 +86,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         prompt_tokens=completion.prompt_tokens, completion_tokens=completion.completion_tokens,
         seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
         retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
+        first_token_s=completion.first_token_s, token_s=completion.token_s,
         prompt_sha256=digest(request.messages), status=str(said.status), verdict=said.verdict,
         repairs=tuple(map(str, said.repairs)), intent=said.intent, mass=said.mass, message=said.message,
         detail=said.detail,

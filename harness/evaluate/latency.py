@@ -4,6 +4,7 @@ They are fixed before a run, so that its own speed changes none of its rows. Wha
 beside them.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import cycle, islice
 from typing import cast
@@ -16,6 +17,7 @@ from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
+from harness.runs import percentiles
 from harness.runs.records import Answer, Latency, Times
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
@@ -112,11 +114,26 @@ def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
 
 def times(answers: Iterable[Answer]) -> dict[str, Times]:
     """How long answers took that were asked alone and came at the first attempt, by role."""
-    by_role: dict[str, list[float]] = {}
+    by_role: dict[str, list[Answer]] = {}
     for answer in answers:
         if answer.seconds is not None and answer.error is None and not answer.retries:
-            by_role.setdefault(answer.role, []).append(answer.seconds)
-    return {
-        role: Times(len(each), *np.percentile(each, (50, 5, 95)).round(6).tolist())
-        for role, each in by_role.items()
+            by_role.setdefault(answer.role, []).append(answer)
+    found = {}
+    for role, each in by_role.items():
+        parts = {"first_token": _times(each, "first_token_s"), "token": _times(each, "token_s")}
+        found[role] = replace(cast("Times", _times(each, "seconds")), **parts)
+    return found
+
+
+def _times(answers: Sequence[Answer], which: str) -> Times | None:
+    """Percentiles of one of their times; None where no answer has it."""
+    known = [(s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None]
+    if not known:
+        return None
+    values, episodes = np.array([s for s, _ in known]), [episode for _, episode in known]
+    ends = {
+        percent: None if math.isnan(low) else (round(low, 6), round(high, 6))
+        for percent, (low, high) in percentiles.intervals(values, episodes).items()
     }
+    half, low, high = np.percentile(values, (50, 5, 95)).round(6).tolist()
+    return Times(len(known), half, low, high, ends[50], ends[95])

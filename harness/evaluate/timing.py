@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 
 from harness.backends.base import Backend
 from harness.core.errors import UserError, printable
@@ -55,14 +56,14 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     Raises:
         UserError: no answer of the ego can be timed.
     """
-    first = list(requests(spec, scenes))
+    first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first answer of a process pays for warming up
     answers = {r.id: answer_of(r, backend.complete([r])[0]) for r in first}
     fusion = []
     for scene in scenes if spec.unmergeable is None else ():
         said = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
         if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
-            fusion.append(fusion_request(spec, scene, said, heard))
+            fusion.append(replace(fusion_request(spec, scene, said, heard), timed=True))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
         name = printable(spec.ego.card.name)

@@ -159,7 +159,7 @@ def environment(*more: Path) -> Environment:
     )
     templates.filters |= {
         "number": words.number, "facts": words.facts, "shown": words.shown, "p_value": words.p_value,
-        "latency_source": words.latency_source, "answer_times": words.answer_times,
+        "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
         "mapping": msgspec.to_builtins, "columns": _table,
     }  # fmt: skip
     return templates

@@ -1,18 +1,20 @@
 """Numbers and findings in the words of the report."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from harness.core import multiplicity
+from harness.core.errors import printable
+from harness.core.figures import interval as with_interval
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate, mean_of
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.metrics import GAIN, LATENCY, SUCCESS, unit
-from harness.runs.records import Latency, Score, Times
+from harness.runs.records import Latency, Manifest, Score, Times
 from harness.runs.suite import SuiteRun
 
 
@@ -131,6 +133,33 @@ def answer_times(times: Mapping[str, Times]) -> str:
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
         told.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
     return ", ".join(told) or "not known, since no answer was asked alone"
+
+
+def pace(m: Manifest) -> Iterator[str]:
+    """What prefill and decode take of answers that were asked alone, a role after the other, as lines.
+
+    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own answers;
+    where it knows none of these, of those that its latency was measured with.
+    """
+    own = {role: took for role, took in m.answer_times.items() if took.first_token}
+    for role, took in (m.latency.sample | own).items():
+        first = took.first_token
+        if first is None:
+            continue
+        if first.n == took.n and took.median_s:
+            share = 100 * first.median_s / took.median_s
+            said = f"{share:.0f} % of the median answer is prefill"
+            yield f"{printable(role)}: {said} (batch 1, measured where it ran)"
+        for what, of in (("TTFT", first), ("TPOT", took.token)):
+            if of:
+                half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
+                yield f"  {printable(role)} {what} {half} ms, p95 {high}, n = {of.n}"
+
+
+def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
+    """With a decimal, or two below ten, and the interval."""
+    low, high = ends or (None, None)
+    return with_interval(seconds, low, high, 1000.0, 1 if seconds >= 0.01 else 2)
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

@@ -29,6 +29,8 @@ class Answer(Struct, frozen=True, kw_only=True):
         retries: attempts that failed before this one.
         cached: it comes from the cache.
         slow_s: seconds that it is declared to take beyond its card's latency.
+        first_token_s: time to its first token, prefill included; None where `seconds` is, or not known.
+        token_s: time of each token after the first; None where `first_token_s` is, or there is none.
         prompt_sha256: digest of the chat messages.
         status: the parser's one outcome (`harness.parsing.status`).
         verdict: the status in three classes: `strict`, `recovered` or `failed`.
@@ -62,6 +64,8 @@ class Answer(Struct, frozen=True, kw_only=True):
     mass: float | None
     message: dict[str, Any] | None
     detail: str
+    first_token_s: float | None = None
+    token_s: float | None = None
 
     @property
     def id(self) -> str:
@@ -74,13 +78,24 @@ class Answer(Struct, frozen=True, kw_only=True):
         return "+".join((self.viewer, *self.heard))
 
 
-class Times(Struct, frozen=True):
-    """How long some answers took, each asked alone: how many, and percentiles in seconds."""
+class Times(Struct, frozen=True, omit_defaults=True):
+    """How long some answers took, each asked alone: how many, and percentiles in seconds.
+
+    Attributes:
+        median_ci_s: 95 % interval of the median, over episodes; None where they cannot bound it.
+        p95_ci_s: of the 95th percentile.
+        first_token: the same of the time to first token, where the engine can tell.
+        token: the same of the time per output token.
+    """
 
     n: int
     median_s: float
     p5_s: float
     p95_s: float
+    median_ci_s: tuple[float, float] | None = None
+    p95_ci_s: tuple[float, float] | None = None
+    first_token: "Times | None" = None
+    token: "Times | None" = None
 
 
 class Latency(Struct, frozen=True, omit_defaults=True):

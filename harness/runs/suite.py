@@ -52,11 +52,12 @@ class SuiteRun:
 
     @property
     def manifest(self) -> Manifest:
-        """The first run's, with all runs' counts. Others have another world, and may have another prompt."""
+        """The first run's with all runs' counts, and no times: others have other worlds, or prompts."""
         every = [run.manifest for run in self.runs.values()]
         counts = ("cached_answers", "engine_errors", "retries")
         totals = {name: sum(getattr(m, name) for m in every) for name in counts}
-        return msgspec.structs.replace(every[0], answer_times={}, **totals)
+        latency = msgspec.structs.replace(every[0].latency, sample={})
+        return msgspec.structs.replace(every[0], latency=latency, answer_times={}, **totals)
 
     @property
     def conditions(self) -> tuple[str, ...]:

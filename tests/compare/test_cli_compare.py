@@ -165,6 +165,21 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
         assert part in said, part
 
 
+def test_prefill_and_decode_of_each_run_are_said(
+    runs: tuple[Path, Path], harness: Harness, tmp_path: Path
+) -> None:
+    first = {"n": 8, "median_s": 0.03, "p5_s": 0.02, "p95_s": 0.04}
+    configure(runs[1], answer_times={"ego": {**first, "median_s": 0.12, "first_token": first}})
+    out = harness("compare", *runs, "--html", tmp_path / "page.html")[1]
+    said = "B: ego: 25 % of the median answer is prefill (batch 1, measured where it ran)"
+    for text in (out, (tmp_path / "page.html").read_text()):
+        assert said in text
+        assert "B: ego TTFT 30.0 [–, –] ms, p95 40.0 [–, –], n = 8" in text
+    told = json.loads(harness("compare", *runs, "--json")[1])
+    assert told["a"]["answer_times"] == {}
+    assert told["b"]["answer_times"]["ego"]["first_token"] == first
+
+
 def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harness: Harness) -> None:
     change(worse[1], answer=lambda row: row["viewer"] == "v2" and row.update(verdict="recovered"))
     told = json.loads(harness("compare", *worse, "--show", "1", "--json")[1], parse_constant=pytest.fail)

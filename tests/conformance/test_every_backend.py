@@ -117,6 +117,8 @@ def test_each_completion_keeps_the_contract(case: Case) -> None:
         assert c.finish_reason == "error" or c.text, "these five are answered with some text"
         assert c.batch_size >= 1
         assert c.seconds is None or (c.batch_size == 1 and c.seconds > 0)
+        assert c.first_token_s is None or (c.seconds is not None and 0 < c.first_token_s <= c.seconds)
+        assert c.token_s is None or (c.first_token_s is not None and c.token_s > 0)
         for tokens in (c.prompt_tokens, c.completion_tokens):
             assert tokens is None or tokens > 0
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, column, decisions, driven, spec
 from evaluating import spec_of
+from run_on_disk import UNTIMED
 
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
@@ -241,7 +242,7 @@ def test_a_language_model_in_float32_drives_alike_in_any_company():
     assert any(answer.role == "merge" for answer in answers)
 
     def said(answers):
-        return [msgspec.structs.replace(answer, batch_size=0, seconds=None) for answer in answers]
+        return [msgspec.structs.replace(answer, batch_size=0, **UNTIMED) for answer in answers]
 
     assert said(together.answers) == said(answers)
     rows = [row for made in alone for row in made.decisions.table.to_pylist()]

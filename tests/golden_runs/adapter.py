@@ -21,7 +21,7 @@ Row = dict[str, str]
 Table = list[Row]
 
 # How a run came by its answers is not what it says: seconds are the machine's, batches the engine's.
-NOT_HELD = ("seconds", "batch_size")
+NOT_HELD = ("seconds", "first_token_s", "token_s", "batch_size")
 SETTINGS = (
     "actions", "conditions", "seeds", "answer", "thinking", "latency", "delay_allowance_s", "late_against",
     "engine_errors",

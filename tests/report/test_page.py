@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -29,7 +30,7 @@ from harness.prompts import versions as prompts
 from harness.report.decisions import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
-from harness.report.words import answer_times, figures, headline, latency_source
+from harness.report.words import answer_times, figures, headline, latency_source, pace
 from harness.runs.folder import csv_text, read
 from harness.runs.records import Episode, Latency, Score, Times
 
@@ -354,6 +355,27 @@ def test_what_answers_took_in_words():
     assert answer_times({}) == "not known, since no answer was asked alone"
     told = answer_times({"ego": Times(240, 0.0312, 0.0281, 0.0403), "merge": Times(1, 0.2, 0.2, 0.2)})
     assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), merge 200 ms (5 to 95 %: 200 to 200; n = 1)"
+
+
+def test_prefill_and_decode_in_words(run):
+    """Half a millisecond a token has two decimals. Where some TTFTs are unknown there is no share."""
+    first = Times(240, 0.021, 0.02, 0.03, (0.0205, 0.0215), (0.029, 0.031))
+    ego = Times(240, 0.042, 0.03, 0.05, first_token=first, token=Times(240, 0.0005, 0.0004, 0.0006))
+    helper = msgspec.structs.replace(ego, n=241)
+    manifest = msgspec.structs.replace(
+        read(run).manifest, answer_times={"ego": ego, "helper": helper, "merge": Times(1, 0.2, 0.2, 0.2)}
+    )
+    of_both = [
+        "TTFT 21.0 [20.5, 21.5] ms, p95 30.0 [29.0, 31.0], n = 240",
+        "TPOT 0.50 [–, –] ms, p95 0.60 [–, –], n = 240",
+    ]
+    assert list(pace(manifest)) == [
+        "ego: 50 % of the median answer is prefill (batch 1, measured where it ran)",
+        *(f"  ego {line}" for line in of_both),
+        *(f"  helper {line}" for line in of_both),
+    ]
+    assert all(len(line) <= 80 for line in pace(manifest))
+    assert list(pace(msgspec.structs.replace(manifest, answer_times={}))) == []
 
 
 def copied(run, tmp_path):

@@ -3,16 +3,19 @@
 import asyncio
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from harness.backends.base import Completion, Request
+from harness.backends.base import Completion, Request, per_token_s
 from harness.backends.cards import Card
-from harness.backends.openai.http import Client
+from harness.backends.openai.http import Client, Reply
 from harness.backends.openai.shapes import Said, body, read
+from harness.backends.openai.stream import ASKED
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
 
+_PATH = "/chat/completions"
 _LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates: a server says when it was started
 
 
@@ -35,6 +38,7 @@ class OpenAIBackend:
         self._server = server
         self._batch_size = batch_size
         self._client = Client(server, batch_size)
+        self._streams = True  # until it refuses to
         self._listed = asyncio.run(self._look())
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
@@ -42,7 +46,8 @@ class OpenAIBackend:
 
         Where requests are asked one at a time, `seconds` is the time from asking to the last byte, failed
         attempts and the waits between them included; an answer that never came has spent its time, too. The
-        first of a call takes a connection, which the others go on with.
+        first of a call takes a connection, which the others go on with. One that is asked to be timed is
+        streamed. No other is: some servers count no tokens in a stream, or part thoughts otherwise.
         """
         return asyncio.run(self._all(requests))
 
@@ -73,21 +78,40 @@ class OpenAIBackend:
 
     async def _answer(self, request: Request, together: int) -> Completion:
         start_s = time.perf_counter()
-        reply = await self._client.post("/chat/completions", body(self._card, self._server, request))
-        seconds = time.perf_counter() - start_s
+        reply = await self._asked(request, together == 1 and request.timed)
+        end_s = time.perf_counter()
+        seconds = end_s - start_s if together == 1 else None
         said = Said(error=reply.fault) if reply.fault else read(reply.payload, request)
+        first_at_s, tokens = reply.first_at_s, said.completion_tokens
+        if request.answer == "readout":
+            first_at_s, tokens = end_s, 1
+        first_s = None if seconds is None or first_at_s is None or said.error else first_at_s - start_s
         return Completion(
             request_id=request.id,
             text=said.text,
             prompt_tokens=said.prompt_tokens,
             completion_tokens=said.completion_tokens,
             finish_reason=said.finish_reason,
-            seconds=seconds if together == 1 else None,
+            seconds=seconds,
             batch_size=together,
             error=said.error,
             label_mass=said.label_mass,
             retries=reply.retries,
+            first_token_s=first_s,
+            token_s=None if seconds is None else per_token_s(seconds, first_s, tokens),
         )
+
+    async def _asked(self, request: Request, streamed: bool) -> Reply:
+        """The server's reply; a server that will not stream is asked again, and never to stream again."""
+        asked = body(self._card, self._server, request)
+        if not streamed or not self._streams or request.answer == "readout":
+            return await self._client.post(_PATH, asked)
+        reply = await self._client.post(_PATH, {**asked, **ASKED})
+        if reply.status in (None, 200) or "stream" not in (reply.fault or "").lower():
+            return reply
+        self._streams = False
+        plain = await self._client.post(_PATH, asked)
+        return replace(plain, retries=reply.retries + 1 + plain.retries)
 
     async def _look(self) -> dict[str, Any] | None:
         """What the server's list says of the model; None where it has no list, or the model is not on it."""

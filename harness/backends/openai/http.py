@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import httpx
 
+from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
@@ -35,6 +36,7 @@ class Reply:
         status: of HTTP; None where none came.
         again: whether another attempt may do better.
         after_s: seconds that the server asks to wait before it.
+        first_at_s: when the first text of a stream came, by `time.perf_counter`; None where none was seen.
     """
 
     payload: Any = None
@@ -43,6 +45,7 @@ class Reply:
     status: int | None = None
     again: bool = False
     after_s: float | None = None
+    first_at_s: float | None = None
 
 
 class Client:
@@ -110,16 +113,25 @@ class Client:
 
     async def _once(self, method: str, path: str, content: bytes | None, within_s: float) -> Reply:
         url = self._server.base_url.rstrip("/") + path
-        data = bytearray()
+        data, stream = bytearray(), Stream()
         async with (
             asyncio.timeout(within_s),  # of the whole attempt: a server may drip for ever
             self._http.stream(method, url, content=content) as response,
         ):
+            streamed = response.headers.get("content-type", "").startswith("text/event-stream")
             async for chunk in response.aiter_raw():
                 data += chunk
                 if len(data) > MOST_BYTES:
                     return Reply(fault=f"the answer is longer than {MOST_BYTES} bytes")
+                if streamed:
+                    stream.take(chunk, time.perf_counter())
         status = response.status_code
+        if streamed and status == 200:
+            if stream.fault:
+                return Reply(fault=self._shown(stream.fault), status=status, again=stream.again)
+            # Put together before the key is looked for, since pieces may cut through it.
+            payload, _ = self._payload(json.dumps(stream.payload()).encode())
+            return Reply(payload, status=status, first_at_s=stream.first_at_s)
         payload, readable = self._payload(bytes(data))
         if status == 200:
             return Reply(payload, fault=None if readable else "the answer is no JSON", status=status)

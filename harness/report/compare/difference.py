@@ -13,9 +13,9 @@ from harness.core.paired import SuccessTest, success_test
 from harness.core.statistics import Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.prompts.versions import as_it_was
-from harness.report.compare import percentiles
 from harness.report.compare.flips import LOST_BY, DecisionFlip, flips
 from harness.report.compare.pair import Pair
+from harness.runs import percentiles
 from harness.runs.metrics import SUCCESS, difference, metrics_of, p_value
 
 

@@ -13,10 +13,10 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
-from harness.report.compare.percentiles import Decided
 from harness.report.words import facts
 from harness.runs.folder import Run, read
 from harness.runs.metrics import by_episode, metrics_of
+from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.scenario import DIALS
 

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from textwrap import wrap
 from typing import Any
 
+import msgspec
+
 from harness.core.errors import printable
 from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
@@ -37,6 +39,7 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
     yield words.differing(comparison)
     yield from (f"  {setting}" for setting in words.settings(comparison))
     yield from words.prompts(comparison)
+    yield from words.paces(pair)
     for c in comparison.conditions:
         label = printable(c.condition)
         if len(label) > 25:
@@ -79,7 +82,7 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> 
     said += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
     said += [] if comparison.answers else ["- no answer changed its verdict"]
     said += [f"- {code(setting)}" for setting in words.settings(comparison)]
-    said += [f"- {code(line.strip())}" for line in words.prompts(comparison)]
+    said += [f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))]
     return "\n".join([*said, "", "</details>"])
 
 
@@ -111,8 +114,13 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
     """For machines: metrics in their own units, null where there is no number."""
     pair = comparison.pair
     return {
-        "a": {"run": str(pair.a.run.path), "settings": dict(pair.a.settings)},
-        "b": {"run": str(pair.b.run.path), "settings": dict(pair.b.settings)},
+        **{
+            name: {
+                "run": str(side.run.path), "settings": dict(side.settings),
+                "answer_times": msgspec.to_builtins(side.run.manifest.answer_times),
+            }
+            for name, side in (("a", pair.a), ("b", pair.b))
+        },
         "caveats": words.caveats(pair),
         "scenes": where(pair.a.run),
         "seeds": list(pair.seeds),

@@ -12,7 +12,7 @@ from harness.report.compare.difference import Comparison, Difference, Flip, InCo
 from harness.report.compare.flips import LOST_BY, DecisionFlip
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
-from harness.report.words import p_value
+from harness.report.words import p_value, pace
 from harness.runs.metrics import SUCCESS, unit
 
 # Of all other metrics less is better.
@@ -109,6 +109,12 @@ def who(side: Side) -> str:
 def sides(pair: Pair) -> list[tuple[str, str]]:
     """`A` and `B`, each with its folder and who answered."""
     return [(name, f"{side.run.path}: {who(side)}") for name, side in (("A", pair.a), ("B", pair.b))]
+
+
+def paces(pair: Pair) -> list[str]:
+    """What prefill and decode take, with the run's letter."""
+    sides = (("A", pair.a.run), ("B", pair.b.run))
+    return [f"{name}: {line.strip()}" for name, run in sides for line in pace(run.manifest)]
 
 
 def caveats(pair: Pair) -> list[str]:

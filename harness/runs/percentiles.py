@@ -1,8 +1,8 @@
-"""Differences of latency percentiles.
+"""Latency percentiles: their intervals, and their differences between two runs.
 
-A percentile is of all decisions of a run: episodes have none of their own whose differences have a mean. The
-interval is a bootstrap: both runs are resampled by the same episodes, each with all of its decisions, and the
-ends are percentiles of what B - A then is (Efron and Tibshirani 1993, chapter 13).
+A percentile is of all decisions or answers of a run: episodes have none of their own that have a mean. The
+interval is a bootstrap: episodes are resampled, each with all that is of it, in two runs the same ones, and
+the ends are percentiles of what the percentile, or B - A, then is (Efron and Tibshirani 1993, chapter 13).
 """
 
 import math
@@ -37,13 +37,23 @@ def differences(
         known_mean(np.array([_percentiles(pair[side], weights) for pair in both]), 0) for side in (0, 1)
     )
     for percent, x, y in zip(PERCENTILES, before, after, strict=True):
-        change = y - x
-        sampled = change[1:][~np.isnan(change[1:])]
-        low, high = np.percentile(sampled, (2.5, 97.5)) if n > 1 else (math.nan, math.nan)
-        if low == high:  # resamples that nearly all say the same tell nothing of other episodes
-            low = high = math.nan
-        estimate = Estimate(float(change[0]), float(low), float(high), n, episodes - n)
+        estimate = Estimate(float(y[0] - x[0]), *_ends(y - x, n), n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate
+
+
+def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
+    """The 95 % interval of each of `PERCENTILES` of some values, (n,), each of an episode; NaN for none."""
+    names, place = np.unique(episodes, return_inverse=True)
+    weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)
+    found = _percentiles((place, values), weights)
+    return {p: _ends(each, len(names)) for p, each in zip(PERCENTILES, found, strict=True)}
+
+
+def _ends(found: Floats, episodes: int) -> tuple[float, float]:
+    """Where the middle 95 % of the resamples end; NaN where they tell nothing of other episodes."""
+    sampled = found[1:][~np.isnan(found[1:])]
+    low, high = np.percentile(sampled, (2.5, 97.5)) if episodes > 1 else (math.nan, math.nan)
+    return (math.nan, math.nan) if low == high else (float(low), float(high))
 
 
 def _met(a: Decided, b: Decided) -> tuple[Decided, Decided]:

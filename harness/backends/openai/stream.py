@@ -1,0 +1,75 @@
+"""A chat completion that a server sends in pieces, put together again, and when its first token came.
+
+Pieces are server-sent events (WHATWG HTML, 9.2), each a `data:` line of JSON, up to `[DONE]`. Nothing that
+comes raises: what is wrong with it is a fault, in one sentence.
+"""
+
+import json
+from typing import Any
+
+ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # tokens are counted in the last piece
+_CUT_OFF = "the stream ends before the answer does"
+_THOUGHTS = ("reasoning_content", "reasoning")
+
+
+class Stream:
+    """What came so far of one completion.
+
+    Attributes:
+        fault: why it is none, unbounded text of the server; None as long as it may become one.
+        again: whether another attempt may do better.
+    """
+
+    def __init__(self) -> None:
+        self.fault: str | None = _CUT_OFF
+        self.again = True
+        self._rest = b""
+        self._texts: dict[str, str] = {}
+        self._finish: str | None = None
+        self._usage: dict[str, int] = {}
+        self._first_at_s: float | None = None
+        self._last_at_s: float | None = None
+
+    def take(self, data: bytes, at_s: float) -> None:
+        """Read on: bytes as they come, cut anywhere, and when they came."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            field, _, value = line.strip().partition(b":")
+            if field == b"data" and self.fault in (None, _CUT_OFF):  # a comment keeps the connection alive
+                self._event(value.strip().decode("utf-8", "replace"), at_s)
+
+    def _event(self, text: str, at_s: float) -> None:
+        if text == "[DONE]":
+            self.fault = None
+            return
+        try:
+            self._piece(json.loads(text), at_s)
+        except (ValueError, RecursionError):
+            self.fault, self.again = "a piece of the stream is no JSON", False
+        except (LookupError, TypeError, AttributeError):
+            self.fault, self.again = "a piece of the stream is no part of a chat completion", False
+
+    def _piece(self, piece: Any, at_s: float) -> None:
+        if error := piece.get("error"):
+            self.fault = f"the stream broke off: {error.get('message') if isinstance(error, dict) else error}"
+            return
+        self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
+        for choice in (piece.get("choices") or [])[:1]:  # the last piece may have none, but the tokens' count
+            said = choice.get("delta") or {}
+            told = {name: said[name] for name in ("content", *_THOUGHTS) if said.get(name) is not None}
+            for name, text in told.items():
+                self._texts[name] = self._texts.get(name, "") + text
+            if any(told.values()):
+                self._first_at_s, self._last_at_s = self._first_at_s or at_s, at_s
+            if choice.get("finish_reason"):
+                self._finish, self.fault = str(choice["finish_reason"]), None
+
+    @property
+    def first_at_s(self) -> float | None:
+        """When the first text came; None where all of it came at once: something on the way held it back."""
+        return None if self._first_at_s == self._last_at_s else self._first_at_s
+
+    def payload(self) -> dict[str, Any]:
+        """The completion as it would be in one piece."""
+        choice = {"message": {"content": "", **self._texts}, "finish_reason": self._finish}
+        return {"choices": [choice], "usage": self._usage}
