@@ -118,6 +118,26 @@ def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, 
     assert not Path("pairs.jsonl").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "changed", "said"),
+    [
+        ("decision", {"scene": "x"}, "decisions.parquet has scene 'x', which its dataset has not; make"),
+        ("answer", {"scene": "x"}, "answers.jsonl has scene 'x', which its dataset has not; make"),
+        ("answer", {"viewer": "v9"}, "answers.jsonl has an answer of 'v9' in 00000-"),
+    ],
+)
+def test_a_run_of_scenes_that_its_dataset_has_not_is_one_line(
+    name: str, changed: Row, said: str, run: Path, harness: Harness
+) -> None:
+    scene = next(iter(read(run).decisions.scenes))
+    here = {"scene": scene, **({"viewer": "v2"} if name == "answer" else {})}
+    change(run, **{name: lambda row: here.items() <= row.items() and row.update(changed)})
+    code, out, err = harness("export", run, "--sft", "pairs.jsonl", "--report-seeds-too")
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert said in err
+    assert not Path("pairs.jsonl").exists()
+
+
 def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> None:
     made_up(tmp_path / "driven", closed_loop=True)
     code, _, err = harness("export", "driven", "--sft", "pairs.jsonl")

@@ -6,7 +6,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
@@ -16,7 +15,7 @@ from harness.prompts import readout, versions
 from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.runs import Runs
-from harness.runs.folder import Run
+from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision
 from harness.world import scenarios
 
@@ -88,14 +87,8 @@ class Decisions:
 
     def _frozen(self) -> dict[str, Scene]:
         assert self._runs.dataset is not None
-        places = self._runs.dataset.forest.place
         for run in self._runs.runs:
-            for scene in run.decisions.scenes:
-                if scene not in places:
-                    raise UserError(
-                        f"{printable(run.path / 'decisions.parquet')} has scene {printable(scene)!r}, "
-                        "which its dataset has not; make the run again"
-                    )
+            check_scenes(run, self._runs.dataset)
         return dict(zip(self.ids, self._runs.dataset.scenes(self.ids), strict=True))
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:

@@ -18,7 +18,7 @@ from harness.core.files import digest, replacing
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
 from harness.report.decisions import prompts_of
-from harness.runs.folder import Run, dataset_of
+from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import Answer, FrozenScenes
 
 VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
@@ -138,7 +138,8 @@ def _scenes(run: Run) -> dict[str, Scene]:
     if not isinstance(run.manifest.world, FrozenScenes):
         return {}
     try:
-        names = list(run.decisions.scenes)
-        return dict(zip(names, dataset_of(run).scenes(names), strict=True))
+        names, dataset = list(run.decisions.scenes), dataset_of(run)
+        check_scenes(run, dataset)
+        return dict(zip(names, dataset.scenes(names), strict=True))
     except UserError:
         return {}

@@ -263,6 +263,20 @@ def dataset_of(run: Run) -> Dataset:
     return dataset
 
 
+def check_scenes(run: Run, dataset: Dataset) -> None:
+    """Raise UserError if a run decided or answered in a scene that its dataset has not."""
+    of_files: dict[str, Iterable[str]] = {
+        "decisions.parquet": run.decisions.scenes, "answers.jsonl": run.answers_by_scene,
+    }  # fmt: skip
+    for file, scenes in of_files.items():
+        for scene in scenes:
+            if scene not in dataset.forest.place:
+                raise UserError(
+                    f"{printable(run.path / file)} has scene {printable(scene)!r}, "
+                    "which its dataset has not; make the run again"
+                )
+
+
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
     """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
     text = io.StringIO()

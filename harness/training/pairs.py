@@ -17,7 +17,7 @@ from harness.core.seeds import FIRST, purpose, stated
 from harness.evaluate.fusion import messages_of
 from harness.prompts import readout
 from harness.prompts.versions import as_it_was
-from harness.runs.folder import Run, dataset_of
+from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import FrozenScenes
 from harness.training.answers import answer
 from harness.training.examples import question
@@ -69,6 +69,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
             )
         prompts[version] = prompt
     dataset = dataset_of(run)
+    check_scenes(run, dataset)
     forest, names = dataset.forest, list(run.decisions.scenes)
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)
     labels = {
@@ -80,6 +81,11 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
     for scene in scenes:
         answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
         for one in answers.values():
+            if one.viewer not in scene.record["graphs"]:
+                raise UserError(
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(one.viewer)!r} in "
+                    f"{scene.id}, where {', '.join(scene.viewers)} were asked; make the run again"
+                )
             agent = run.agent(one)
             prompt = prompts[agent["prompt"]["version"]]
             q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
