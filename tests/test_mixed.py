@@ -1,5 +1,6 @@
 """Mixed swarms: the ego and its helpers have different models, prompts or answer modes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -164,6 +165,27 @@ def test_a_mix_that_means_nothing_is_refused(
     with pytest.raises(UserError) as caught:
         mixed(small, *map(helper, helpers), model=ego, **options)
     assert str(caught.value).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "said"),
+    [
+        ("eval", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
+        ("drive", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
+        ("grid", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
+        ("grid", "--helper-model proxy,proxy", "--helper-model proxy,proxy: give different names"),
+        ("eval", "--helper-thinking", "--helper-thinking: proxy cannot think; leave it out"),
+        ("eval", "--model swarm-tiny --answer readout --helper-model proxy",
+         "helpers: --answer readout: proxy is no language model; use json"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_helper_names_the_option_that_was_typed(
+    command: str, typed: str, said: str, harness: Callable[..., Any], small_path: Path
+) -> None:
+    data = () if command == "drive" else ("--dataset", small_path)
+    code, out, err = harness(command, *data, *typed.split())
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"harness: {said}")
 
 
 def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:

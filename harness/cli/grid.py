@@ -1,5 +1,6 @@
 """`harness grid`: every combination of ego and helper agents."""
 
+from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import console, table
 from harness.cli.progress import bar
-from harness.cli.run import file_name, first_folder
+from harness.cli.run import file_name, first_folder, helper_options
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable
 
@@ -55,19 +56,18 @@ def command(
     extras.need("harness grid", "matplotlib")
     frozen = load.load(load.find(dataset), limit)
     prompt = prompt or frozen.scenario.prompt
-    egos, helpers = (
-        [
-            Agent(cards.resolve(m), versions.load(p), a)  # type: ignore[arg-type]  # Agent checks the mode
-            for m, p, a in product(*(_several(option, text) for option, text in choices.items()))
-        ]
-        for choices in (
-            {"--model": model, "--prompt": prompt, "--answer": answer},
-            {
-                "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
-                "--helper-answer": helper_answer or answer,
-            },
-        )
-    )  # fmt: skip
+
+    def agents(choices: Mapping[str, str]) -> list[Agent]:
+        each = product(*(_several(option, text) for option, text in choices.items()))
+        # Agent checks the mode.
+        return [Agent(cards.resolve(m), versions.load(p), a) for m, p, a in each]  # type: ignore[arg-type]
+
+    egos = agents({"--model": model, "--prompt": prompt, "--answer": answer})
+    with helper_options({"--answer": helper_answer}):
+        helpers = agents({
+            "--helper-model": helper_model or model, "--helper-prompt": helper_prompt or prompt,
+            "--helper-answer": helper_answer or answer,
+        })  # fmt: skip
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
         raise UserError(f"{cells} combinations; vary something, and give {MOST_CELLS} at most")
     spec = Spec(

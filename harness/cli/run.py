@@ -1,6 +1,7 @@
 """What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -69,10 +70,24 @@ class Swarm:
         prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
         thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
         others = [cards.resolve(name.strip()) for name in models] or [card]
-        try:
+        with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
             return {"ego": ego, "helpers": tuple(Agent(other, prompt, mode, thinks) for other in others)}
-        except UserError as error:
-            raise UserError(f"helpers: {error}") from None
+
+
+@contextmanager
+def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
+    """Name a helper's option in what is wrong with a helper.
+
+    Args:
+        typed: what was given as the helper's own, by the ego's option; None where the ego's holds.
+    """
+    try:
+        yield
+    except UserError as error:
+        said = str(error)
+        if typed.get(said.partition(" ")[0].rstrip(":")) is not None:
+            said = said.replace("--", "--helper-", 1)
+        raise UserError(said if said.startswith("--helper-") else f"helpers: {said}") from None
 
 
 def file_name(model: str) -> str:
