@@ -133,7 +133,7 @@ def command(
         "intervals over episodes; missed: decisions that outlast the window;\n"
         "gap: the least; clear: seconds to clear, where the ego did; both are means",
     )
-    show(done, "closed loop", COLUMNS, notes, tight=True)
+    show(done, "closed loop", COLUMNS, notes)
     if videos:
         typer.echo(f"wrote {where / 'videos'}: {', '.join(video.name for video in videos)}")
     elif save_video:

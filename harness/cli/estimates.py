@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 WIDTH = 80  # columns of a terminal
+HEAD = 21  # of a table's column at most: three of them leave room for a name
 
 
 def echo_json(value: Any, indent: int | None = 1) -> None:
@@ -28,14 +29,28 @@ def console() -> "Console":
     return Plain(width=WIDTH, markup=False, highlight=False)
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], tight: bool = False) -> None:
-    """Print columns, the first folded and the others aligned right; `tight` ones are one space apart."""
-    from rich.table import Table
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print columns, the first aligned left and the others right.
 
-    drawn = Table(box=None, width=WIDTH, pad_edge=False, padding=(0, 1, 0, 0) if tight else (0, 1))
-    drawn.add_column(heads[0], overflow="fold")
-    for head in heads[1:]:
-        drawn.add_column(head, justify="right", no_wrap=True)
-    for row in rows:
-        drawn.add_row(*row)
-    console().print(drawn)
+    They are two spaces apart, or one where a name needs the room. A name that leaves no room for its row even
+    so stands above it; heads longer than `HEAD` are folded.
+    """
+    from rich.cells import cell_len, chop_cells
+
+    stacks = [chop_cells(head, HEAD) or [""] for head in heads[1:]]
+    height = max(map(len, stacks))
+    folded = zip(*([""] * (height - len(stack)) + stack for stack in stacks), strict=True)
+    names_of_heads = [""] * (height - 1) + [heads[0]]
+    lines = [*((name, *cells) for name, cells in zip(names_of_heads, folded, strict=True)), *rows]
+    names, *others = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
+    widths = [max(column) for column in others]
+    rooms = {gap: WIDTH - sum(widths) - gap * len(widths) for gap in (2, 1)}
+    gap, room = max(rooms.items(), key=lambda item: sum(length <= item[1] for length in names))
+    first = max((length for length in names if length <= room), default=0)
+    for (name, *cells), length in zip(lines, names, strict=True):
+        if length > room:
+            for piece in chop_cells(name, WIDTH):
+                typer.echo(piece)
+            name, length = "", 0
+        figures = (f"{' ' * (gap + w - cell_len(cell))}{cell}" for w, cell in zip(widths, cells, strict=True))
+        typer.echo(f"{name}{' ' * (first - length)}{''.join(figures)}".rstrip())

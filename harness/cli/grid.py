@@ -113,7 +113,6 @@ def command(
             )
             for c in ranked(grid, last)
         ],
-        tight=True,
     )
     table(
         (f"effect, {last}", "points [95 % CI]", "p"),
@@ -121,7 +120,6 @@ def command(
             (printable(e.what, 90), text("success_rate", e.estimate), "–" if e.p is None else f"{e.p:.3f}")
             for e in strongest(grid.effects, last, MOST_EFFECTS)
         ],
-        tight=True,
     )
     for sentence in in_a_sentence(grid):
         plain.print(sentence)

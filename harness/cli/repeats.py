@@ -95,14 +95,12 @@ def _show(done: "Repeats") -> None:
             )
             for c in done.conditions
         ],
-        tight=True,
     )
     typer.echo()
     episodes = {"episodes succeed": SUCCESS, f"pass^{k}": f"pass^{k}", f"any@{k}": f"any@{k}"}
     table(
         ("%", *episodes),
         [(c, *(shown(done.estimate(c, metric)) for metric in episodes.values())) for c in done.conditions],
-        tight=True,
     )
     for sentence in in_sentences(done):
         text.print(sentence)

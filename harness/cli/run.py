@@ -179,9 +179,7 @@ def as_mapping(done: "Evaluated") -> dict[str, Any]:
     }
 
 
-def show(
-    done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str], tight: bool = False
-) -> None:
+def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str]) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it."""
     from harness.report.caveats import caveats
 
@@ -197,7 +195,6 @@ def show(
     table(
         ("condition", *(column.head for column in columns)),
         [(name, *(column.cell(figures.get((name, column.metric))) for column in columns)) for name in names],
-        tight,
     )
     for note in (*notes, *origins(m, figures)):
         text.print(note)

@@ -121,7 +121,6 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
             )
             for line in lines
         ],
-        True,
     )  # fmt: skip
     text.print(
         f"n: episodes, each × {len(done.manifest.seeds)} channel seeds; seeds: what the layouts are for; "
@@ -137,7 +136,7 @@ def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[
     for start in range(0, len(conditions), MOST_INTERVALS):
         some = conditions[start : start + MOST_INTERVALS]
         rows = [(line.name, *(_cell(getattr(line.cells[c], what)) for c in some)) for line in lines]
-        table((head, *some), rows, tight=True)
+        table((head, *some), rows)
         typer.echo()
 
 

@@ -106,7 +106,7 @@ def command(
         echo_json(page.mapping(study, rows, verdicts))
     elif not quiet:
         typer.echo(f"{printable(spec.ego.name)} · {source.name}")
-        table(HEADS, map(_cells, rows), tight=True)
+        table(HEADS, map(_cells, rows))
         typer.echo(
             f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
             "intervals over episodes\n"
