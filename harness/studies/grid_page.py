@@ -12,6 +12,7 @@ from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import Spec, versions
+from harness.report.compare.page import beside
 from harness.report.drawing.colours import INK, PALE, conditions
 from harness.report.drawing.pictures import styled
 from harness.report.library import picture
@@ -165,7 +166,7 @@ def write_grid(grid: Grid, spec: Spec, out: Path) -> Path:
         pictures={name: picture((out / f"{name}.svg").read_bytes()) for name in drawn},
         by_condition={c: ranked(grid, c) for c in grid.conditions}, fronts=_fronts(grid),
         effects=[e for e in grid.effects if not np.isnan(e.estimate.value)], source=spec.source.name,
-        seeds=spec.seeds, points=lambda e: text(SUCCESS, e.estimate),
+        place=beside(page), seeds=spec.seeds, points=lambda e: text(SUCCESS, e.estimate),
     )  # fmt: skip
     write_whole(page, rendered)
     manifest = {

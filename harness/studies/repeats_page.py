@@ -11,6 +11,7 @@ from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.evaluate.spec import versions
 from harness.report.caveats import caveats, said
+from harness.report.compare.page import beside
 from harness.report.page import environment
 from harness.runs.folder import csv_text
 from harness.runs.metrics import ALL, SUCCESS
@@ -81,7 +82,7 @@ def write_repeats(of: Repeats) -> Path:
         caveats=said({run.path.name: run for run in of.runs}, lambda run: caveats(run.manifest, run.scores)),
         wavering=of.wavering(MOST_POINTS), source=of.runs[0].source, conditions=of.conditions,
         metrics=(FLIPS, STABLE, SUCCESS, f"pass^{of.k}", f"any@{of.k}", BETWEEN), success=SUCCESS,
-        entropies=(STATED, SAMPLED, DOUBT), all=ALL,
+        entropies=(STATED, SAMPLED, DOUBT), all=ALL, place=beside(page),
     )  # fmt: skip
     write_whole(page, rendered)
     manifest = {

@@ -158,6 +158,7 @@ def test_the_front_is_what_none_beats_without_taking_longer() -> None:
 def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset) -> None:
     pytest.importorskip("matplotlib", reason="needs the report extra")
     out = grid.cells[0].run.path.parent.parent
+    (out / "cells/1-2/report.html").write_text("what `harness report` wrote")
     page = write_grid(grid, spec_of(small), out).read_text()
     cells, effects = pd.read_csv(out / "cells.csv"), pd.read_csv(out / "effects.csv")
     assert len(cells) == 4 * 3 * 3
@@ -168,3 +169,4 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     for name in ("heat-map", "pareto"):
         assert (out / f"{name}.svg").stat().st_size > 1000
     assert "proxy-faulty · v2 · json" in page
+    assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3

@@ -226,7 +226,10 @@ def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer:
 
 def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     of = repeated(hot(course(small, 2, OUTCOMES)), tmp_path / "repeats")
+    assert "<a href=" not in write_repeats(of).read_text()
+    (of.path / "repeat-2/report.html").write_text("what `harness report` wrote")
     page = write_repeats(of).read_text()
+    assert '<a href="repeat-2/report.html">Report of repeat-2</a>' in page
     assert page.index("decides otherwise in 55.6 [") < page.index("<table")
     assert "pass^3" in page
     assert "2 × SLOWER, 2 × IDLE" in page
