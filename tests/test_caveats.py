@@ -118,13 +118,14 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
 
 
 def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path) -> None:
-    """Four episodes; decisions over v2x take longer than the dataset's lag; one condition is a control."""
-    points = (POINTS["v2x"], named_point("6g:messages=shuffled"))
+    """Four episodes; decisions over v2x take longer than the dataset's lag; two conditions are controls."""
+    points = (POINTS["v2x"], *map(named_point, ("6g:messages=shuffled", "6g:messages=blind")))
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
     assert list(of_run(folder.read(done.out))) == [
         "Only 4 episodes: a rate's interval may reach 49 points to either side.",
         "6g:messages=shuffled is a control: the ego hears what helpers say in another layout. A decision's "
         "page shows what its own helpers say.",
+        "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
         "With v2x most decisions take longer than these frozen scenes allow for: driving may end otherwise "
         "(harness fidelity).",
     ]

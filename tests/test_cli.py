@@ -346,5 +346,5 @@ def test_a_control_stands_beside_every_condition_with_a_channel(
 
 
 def test_an_unknown_control_is_refused() -> None:
-    with pytest.raises(UserError, match="unknown --control 'blind'"):
-        points(["6g"], ["blind"])
+    with pytest.raises(UserError, match="unknown --control 'deaf'"):
+        points(["6g"], ["deaf"])

@@ -15,7 +15,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest, sha256_file
 from harness.runs.folder import Run, read
-from harness.runs.records import Answer, Latency
+from harness.runs.records import BLIND, Answer, Latency
 
 
 def open(card: Card, **_: Any) -> "Replay":
@@ -66,8 +66,9 @@ class Replay:
         manifest, shown = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
-            # A run has an answer wherever an episode begins, if it has the episode.
-            other = _step(request.id) == "0" or _episode(request.id) not in self._episodes
+            # A run has an answer wherever an episode begins, if it has the episode; blind ones it may lack.
+            begins = _step(request.id) == "0" and not request.id.endswith(BLIND)
+            other = begins or _episode(request.id) not in self._episodes
             if other or "+" in request.id or (role == "helper" and len(manifest.helpers) > 1):
                 raise UserError(
                     f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"

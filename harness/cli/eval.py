@@ -1,6 +1,7 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -166,7 +167,8 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
     count = counter(tokenizer, spec.ego.card)
     sizes: dict[str, list[int]] = {}
     asked, scenes = 0, dataset.scenes(dataset.courses())
-    for request in requests(spec, scenes):
+    blind = any(point.asks_blind for point in spec.points)
+    for request in chain(requests(spec, scenes), requests(spec, scenes, blind=True) if blind else ()):
         asked += 1
         if count:
             sizes.setdefault(request.role, []).append(count(request.messages))

@@ -42,7 +42,7 @@ Controls = Annotated[
     Option(
         "--control",
         help="shuffled-messages: beside each condition with a channel, one whose ego hears the helpers of "
-        "another layout; no-messages: one that loses all. Repeatable.",
+        "another layout; no-messages: one that loses all; blind: one whose helpers see nothing. Repeatable.",
     ),
 ]
 Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
@@ -81,7 +81,7 @@ Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, Option("--quiet", help="Print nothing but errors, and what --json asks for.")]
 
 
-CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1"}
+CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
 
 
 def points(

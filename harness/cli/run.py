@@ -215,7 +215,7 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterat
         yield f"{m.engine_errors} answers are errors of the engine; answers.jsonl has its messages"
     if m.retries:
         yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
-    for role in ("ego", "helper", "merge"):
+    for role in ("ego", "helper", "merge", "blind"):
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)

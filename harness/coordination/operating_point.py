@@ -10,7 +10,7 @@ from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 
 FALLBACKS = ("uniform", "brake")
-MESSAGES = ("own", "shuffled")
+MESSAGES = ("own", "shuffled", "blind")
 OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
 _LARGEST = sys.float_info.max
 
@@ -41,7 +41,8 @@ class OperatingPoint:
         roadside_edge: replies travel over a roadside edge node as well (`channel.Radio`).
         on_demand: a helper infers when it is asked, and not in parallel with the ego.
         messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
-            (`shuffled`). A gain of cooperation is gone then, unless it is no gain of what messages say.
+            (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
+            gain of what helpers see.
     """
 
     name: str
@@ -128,6 +129,11 @@ class OperatingPoint:
     def asks_again(self) -> bool:
         """Whether fusion asks the ego's model a second time, with the messages."""
         return self.profile is not None and self.consensus == EGO_PROMPT
+
+    @property
+    def asks_blind(self) -> bool:
+        """Whether helpers are asked who see nothing."""
+        return self.profile is not None and self.messages == "blind"
 
     def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
         value = getattr(self, key)

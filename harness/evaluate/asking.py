@@ -20,26 +20,34 @@ from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
-from harness.runs.records import Answer, Latency
-from harness.world.perception.graph import truth_graph
+from harness.runs.records import BLIND, Answer, Latency
+from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
 
 
-def requests(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
-    """The requests, scene by scene, the ego first."""
+def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
+    """The requests, scene by scene, the ego first; of `blind` helpers alone, who are shown nothing."""
     for scene in scenes:
         truth = None
         if any(agent.card.privileged for agent in spec.agents):
             truth = truth_graph(spec.scenario, scene.state)
         for place, viewer in enumerate(spec.viewers(scene)):
             graph, who = scene.record["graphs"][viewer], spec.agent(place)
-            agent = spec.agents[who]
+            agent, name = spec.agents[who], _id(scene, viewer, blind)
+            if blind:
+                if not place:
+                    continue
+                graph = blinded(graph)
             yield _request(
-                spec, who, f"{scene.id}/{viewer}", graph["role"],
+                spec, who, name, graph["role"],
                 agent.messages(graph, spec.actions, spec.scenario.prompt_words),
                 view=graph, truth=truth if agent.card.privileged else None, scenario=spec.scenario,
             )  # fmt: skip
+
+
+def _id(scene: Scene, viewer: str, blind: bool) -> str:
+    return f"{scene.id}/{viewer}{BLIND if blind else ''}"
 
 
 def _request(
@@ -73,7 +81,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     # A lone surrogate cannot be written to a file; nothing else of the text is touched.
     raw = completion.text.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
-    viewer, *heard = viewers.split("+")
+    viewer, *heard = viewers.removesuffix(BLIND).split("+")
     said = parse(
         # A read-out is a bare distribution, a helper's too.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
@@ -81,7 +89,8 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
     return Answer(
-        scene=scene, viewer=viewer, heard=tuple(heard), role="merge" if heard else request.role, raw=raw,
+        scene=scene, viewer=viewer, heard=tuple(heard),
+        role="merge" if heard else "blind" if viewers.endswith(BLIND) else request.role, raw=raw,
         finish_reason=completion.finish_reason, error=completion.error,
         prompt_tokens=completion.prompt_tokens, completion_tokens=completion.completion_tokens,
         seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
@@ -150,13 +159,24 @@ class Asker:
             self._owed(list(requests(self.spec, moments)))
         return self.laid_out(moments)
 
-    def lacks(self, moments: Sequence[Scene]) -> list[bool]:
-        """Whether some viewer's answer is missing, of each."""
-        return [any(f"{s.id}/{v}" not in self.answers for v in self.spec.viewers(s)) for s in moments]
+    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
+        """The same where helpers are shown nothing; NaN for those of other moments than these."""
+        wanted = [moments[n] for n in at.tolist()]
+        if any(self.lacks(wanted, blind=True)):
+            self._owed(list(requests(self.spec, wanted, blind=True)))
+        return self.laid_out(moments, blind=True)
 
-    def laid_out(self, moments: Sequence[Scene]) -> Intents:
+    def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
+        """Whether some viewer's answer is missing, of each; some helper's who is shown nothing."""
+        return [
+            any(_id(s, v, blind) not in self.answers for v in self.spec.viewers(s)[blind:]) for s in moments
+        ]
+
+    def laid_out(self, moments: Sequence[Scene], blind: bool = False) -> Intents:
         """The answers that are there as arrays; NaN for one that is not, or that failed."""
-        answers = [[self.answers.get(f"{s.id}/{v}") for v in s.viewers] for s in moments]
+        answers = [
+            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
+        ]
         width, actions = max(map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
         distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)

@@ -181,7 +181,7 @@ class Spec:
 
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego
-        if point.messages != "own" and self.source.kind != "frozen":
+        if point.messages == "shuffled" and self.source.kind != "frozen":
             raise UserError(f"{shown}: messages={point.messages} is for frozen scenes; use harness eval")
         if not point.asks_again:
             return

@@ -84,6 +84,10 @@ class Ask(Protocol[AskedMoment]):
         """What every vehicle intends in these moments, (n, ...)."""
         ...
 
+    def blind(self, moments: Sequence[AskedMoment], at: Ints) -> Intents:
+        """The same where helpers are shown nothing, (n, ...); it has to be known at these places alone."""
+        ...
+
     def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,)."""
         ...
@@ -98,11 +102,13 @@ def walk(
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
         calls = _fusion_calls(due, moments, intents, ask)
+        places = [each.at for point, each in due.items() if point.asks_blind]
+        blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
         decided = []
         for point, each in due.items():
             call = calls(each.at) if calls and point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, _heard(point, intents, each), each.draws, fusion)
+            result = coordinate(point, _heard(point, intents, blind, each), each.draws, fusion)
             decided.append(Decided(point, moments, each, result))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
@@ -110,14 +116,18 @@ def walk(
         world.step(decided)
 
 
-def _heard(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
-    """What the vehicles of each decision intend; `shuffled`, its helpers say what those of another layout do.
+def _heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
+    """What the vehicles of each decision intend; in a control, its helpers say something else.
 
-    That is the next layout in which the same seed has a decision at this step; an ego without one hears
-    nobody. Who is asked, how far it is and how long it takes stay.
+    `blind`, what they say who are shown nothing. `shuffled`, what those of another layout do: the next layout
+    in which the same seed has a decision at this step; an ego without one hears nobody. Who is asked, how far
+    it is and how long it takes stay.
     """
     own = intents.take(due.at)
-    if point.messages == "own":
+    if point.asks_blind and blind:
+        said = blind.take(due.at)
+        return replace(own, helpers=said.helpers, valid=said.valid, payload_bits=said.payload_bits)
+    if point.messages != "shuffled":
         return own
     order = np.lexsort((due.episode, due.seed))
     following = np.roll(order, -1)

@@ -17,6 +17,10 @@ _FAILED = {
     "helper": ("the helpers'", "they send no message"),
     "merge": ("the fusion calls'", "the ego keeps the policy it had without them"),
 }
+_CONTROLS = {
+    "shuffled": "what helpers say in another layout. A decision's page shows what its own helpers say",
+    "blind": "helpers that are shown nothing",
+}
 
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
@@ -59,12 +63,9 @@ def of_run(run: Run) -> Iterator[str]:
     if run.manifest.engine_errors or retries:
         errors = run.manifest.engine_errors
         yield f"The engine stumbled: {errors} requests ended in an error, {retries} attempts were repeated."
-    shuffled = [c["name"] for c in run.manifest.conditions if c.get("messages", "own") != "own"]
-    if shuffled:
-        yield (
-            f"{', '.join(map(printable, shuffled))} is a control: the ego hears what helpers say in another "
-            "layout. A decision's page shows what its own helpers say."
-        )
+    for control, heard in _CONTROLS.items():
+        if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
+            yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
     if off:
         yield (

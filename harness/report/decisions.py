@@ -18,6 +18,7 @@ from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision
 from harness.world import scenarios
+from harness.world.perception.graph import blinded
 
 BLOCK = 24  # scenes that are compressed and read together
 REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
@@ -51,6 +52,14 @@ def prompts_of(run: Run) -> Sent | None:
         return readout.asked(messages, run.actions) if agent["answer"] == "readout" else messages
 
     return sent
+
+
+def as_shown(scene: Scene, answer: Answer) -> Scene:
+    """A decision point as it was shown to who answered."""
+    if answer.role != "blind":
+        return scene
+    graphs = {viewer: blinded(graph) for viewer, graph in scene.record["graphs"].items()}
+    return Scene({**scene.record, "graphs": graphs})
 
 
 class Decisions:
@@ -171,7 +180,8 @@ class Decisions:
             }
             asked = None
             if scene and prompts:
-                messages = prompts(scene, answer.viewer, messages_of(by_viewer, answer.heard))
+                shown_to = as_shown(scene, answer)
+                messages = prompts(shown_to, answer.viewer, messages_of(by_viewer, answer.heard))
                 key = digest(messages)
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)
@@ -200,7 +210,7 @@ def _shown(d: Decision) -> dict[str, Any]:
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
-    role = "helper" if answer.role == "helper" else "ego"
+    role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
 
 

@@ -17,7 +17,7 @@ from harness.core.errors import UserError
 from harness.core.files import digest, replacing
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
-from harness.report.decisions import prompts_of
+from harness.report.decisions import as_shown, prompts_of
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import Answer, FrozenScenes
 
@@ -86,8 +86,9 @@ def _samples(run: Run) -> Iterator[log.EvalSample]:
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
             if sent and name in scenes:
-                asked = sent(scenes[name], answer.viewer, messages_of(answers, answer.heard))
-            yield _sample(run, answer, asked, target, {} if answer.role == "helper" else kept, facts)
+                heard = messages_of(answers, answer.heard)
+                asked = sent(as_shown(scenes[name], answer), answer.viewer, heard)
+            yield _sample(run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts)
 
 
 def _sample(

@@ -121,7 +121,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
                 },
                 "merge_s": latency.fusion_s,
                 "points": {
-                    c["name"]: {"window_s": c.get("window_s"), "consensus": c.get("consensus")}
+                    c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages")}
                     for c in run.manifest.conditions
                 },
             }

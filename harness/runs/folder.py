@@ -123,7 +123,7 @@ class Run:
 
     def agent(self, answer: Answer) -> dict[str, Any]:
         """Who gave an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
-        if answer.role != "helper" or not self.manifest.helpers:
+        if answer.role in ("ego", "merge") or not self.manifest.helpers:
             return self.manifest.agent(0)
         # A scene's viewers answer in the order in which the agents take them, the ego first.
         first = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
@@ -236,13 +236,13 @@ def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Epis
 
 
 def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
-    """Answers in the order of their decision points; of each the ego's, the helpers', the fusion calls'.
+    """Answers in the order of their decision points; of each the ego's, the helpers', blind ones', merges.
 
     Those of decision points to which no decision came are left out.
     """
     place = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     there = (answer for answer in answers if answer.scene in place)
-    return sorted(there, key=lambda answer: (place[answer.scene], answer.heard))
+    return sorted(there, key=lambda answer: (place[answer.scene], answer.heard, answer.role == "blind"))
 
 
 def dataset_of(run: Run) -> Dataset:

@@ -7,7 +7,8 @@ from msgspec import Struct, field
 from harness.core.config import Seconds
 from harness.core.statistics import Estimate
 
-Role = Literal["ego", "helper", "merge"]
+Role = Literal["ego", "helper", "merge", "blind"]
+BLIND = "~blind"  # at the end of an answer's key
 
 
 class Answer(Struct, frozen=True, kw_only=True):
@@ -17,7 +18,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         scene: id of the decision point.
         viewer: id of the vehicle that answered.
         heard: ids of the helpers whose messages were in the prompt of a fusion call.
-        role: `ego`, `helper`, or `merge` for the ego's fusion call.
+        role: `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing.
         raw: the completion, untouched but for lone surrogates, which no file can hold.
         finish_reason: `stop`, `length` or `error`.
         error: the engine's message; None if it answered.
@@ -69,13 +70,13 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def id(self) -> str:
-        """Of the request: scene, viewer and the senders heard."""
+        """Of the request: scene, viewer, the senders heard, and whether it was shown nothing."""
         return f"{self.scene}/{self.key}"
 
     @property
     def key(self) -> str:
         """Names the answer among those of its decision point."""
-        return "+".join((self.viewer, *self.heard))
+        return "+".join((self.viewer, *self.heard)) + (BLIND if self.role == "blind" else "")
 
 
 class Times(Struct, frozen=True, omit_defaults=True):

@@ -35,7 +35,7 @@ from harness.runs.metrics import (
 from harness.runs.records import Answer, Episode, Role, Score
 
 BASELINE = "single-local"
-ROLES: tuple[Role, ...] = ("ego", "helper", "merge")
+ROLES: tuple[Role, ...] = ("ego", "helper", "merge", "blind")
 
 
 def scores(

@@ -137,6 +137,10 @@ class CalibratedWorld:
         now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in INTENTS))  # noqa: B023
         return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
 
+    def blind(self, moments: Sequence[int], at: Ints) -> Intents:
+        """Nobody is asked blindly: no point of the study has it."""
+        raise NotImplementedError
+
     def fusion_call(self, moments: Sequence[int], codes: Ints) -> Callable[[Ints], FusionCall]:
         """Nobody calls: no point of the study has its model fuse."""
         return lambda at: lambda on_time: (np.empty((0, ACTIONS)), np.empty(0))

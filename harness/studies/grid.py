@@ -176,7 +176,8 @@ def run_cells(
     }
     cells = []
     for (i, j), of in specs.items():
-        folder, roles = out / "cells" / f"{i}-{j}", {"ego": egos[i - 1].name, "helper": helpers[j - 1].name}
+        folder, name = out / "cells" / f"{i}-{j}", helpers[j - 1].name
+        roles = {"ego": egos[i - 1].name, "helper": name, "blind": name}
         given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
         run = made(of, folder, progress, cache_file, more, opens, given)
         for answer in run.answers:

@@ -120,6 +120,17 @@ class Stored:
         leave_out(lacks)
         return self._asker.laid_out(moments)
 
+    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
+        """The same where helpers are shown nothing; what the run has not is asked, and kept in it."""
+        wanted = [moments[n] for n in at.tolist()]
+        if not self._asks and any(self._asker.lacks(wanted, blind=True)):
+            raise UserError(
+                f"--no-model: {printable(self.run.path)} lacks answers of helpers that are shown nothing, "
+                "which messages=blind needs; leave it out"
+            )
+        with self._writing():
+            return self._asker.blind(moments, at)
+
     def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
         if not self._asks:
@@ -180,7 +191,12 @@ class _Nearest:
         self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        intents = self._stored.intents(moments, self._leave_out)
+        return self._of(self._stored.intents(moments, self._leave_out))
+
+    def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
+        return self._of(self._stored.blind(moments, at))
+
+    def _of(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
 

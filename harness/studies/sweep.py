@@ -91,8 +91,8 @@ def run_sweep(
         panel: [
             play(source, panel, able, seeds, progress)
             for source in sources
-            # The proxy has no model that could answer a fusion call.
-            if (able := [s for s in points if isinstance(source, Stored) or not s.point.asks_again])
+            # The proxy has no model that could answer a fusion call, or blindly.
+            if (able := [s for s in points if isinstance(source, Stored) or not _asks(s.point)])
         ]
         for panel, points in panels.items()
     }
@@ -128,6 +128,10 @@ class Row:
     at: str
     success: str
     others: dict[str, str]
+
+
+def _asks(point: OperatingPoint) -> bool:
+    return point.asks_again or point.asks_blind
 
 
 def tables(summary: "pd.DataFrame") -> dict[str, list[Row]]:

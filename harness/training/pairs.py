@@ -80,7 +80,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
         answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
-        for one in answers.values():
+        for one in (each for each in answers.values() if each.role != "blind"):
             if one.viewer not in scene.record["graphs"]:
                 raise UserError(
                     f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(one.viewer)!r} in "

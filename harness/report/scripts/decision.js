@@ -43,14 +43,16 @@ function reply(m) {
 const acted = (d) => d.acts_at_s != null
   && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time");
 
-// Second answers of the ego are in the fused policy.
-const first = (answers) => answers.filter((a) => !a.viewer.includes("+"));
+// Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing.
+const sender = (answer) => answer.viewer.replace("~blind", "");
+const first = (answers, point) => answers.filter((a) =>
+  a.role === "ego" || a.role === (point.messages === "blind" ? "blind" : "helper"));
 
-function policyRows(told, chosen, actions) {
+function policyRows(told, chosen, actions, run) {
   const rows = [];
   const add = (who, what, p) => actions.forEach((action, n) => rows.push({ who, what, action, p: p[n] }));
-  for (const a of first(told.answers)) {
-    const weight = a.role === "ego" ? chosen.own_weight : chosen.messages.find((m) => m.from === a.viewer)?.weight;
+  for (const a of first(told.answers, run.points[chosen.condition])) {
+    const weight = a.role === "ego" ? chosen.own_weight : chosen.messages.find((m) => m.from === sender(a))?.weight;
     const what = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
     if (a.intent) add(`${a.viewer}, ${a.role}`, what, a.intent);
   }
@@ -62,9 +64,10 @@ function policyRows(told, chosen, actions) {
 function timelineRows(told, chosen, run) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
   let turn = 0;
-  for (const a of first(told.answers)) {
-    const times = run.inference_s[a.role], ready = 1000 * times[a.role === "helper" ? turn++ % times.length : 0];
-    const m = chosen.messages.find((m) => m.from === a.viewer), who = `${a.viewer}, ${a.role}`;
+  for (const a of first(told.answers, point)) {
+    const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
+    const ready = 1000 * times[a.role === "ego" ? 0 : turn++ % times.length];
+    const m = chosen.messages.find((m) => m.from === sender(a)), who = `${a.viewer}, ${a.role}`;
     if (a.role !== "ego" && !m) continue;
     if (ready) rows.push({ who, what: "inference", from: 0, to: ready });
     if (!m) continue;
@@ -217,7 +220,7 @@ class DecisionPage {
 
   async charts(policies, timeline) {
     const { told, chosen, run } = this, [id] = this.index.scenes[this.n];
-    const shares = policyRows(told, chosen, this.index.actions), times = timelineRows(told, chosen, run);
+    const shares = policyRows(told, chosen, this.index.actions, run), times = timelineRows(told, chosen, run);
     const window_s = run.points[chosen.condition].window_s, lines = new Set(times.map((row) => row.who)).size;
     await chart(policies, `policies-${id}`, { ...this.about.policies, height: 13 * shares.length }, { values: shares });
     await chart(timeline, `timeline-${id}`, { ...this.about.timeline, height: 22 * lines }, {

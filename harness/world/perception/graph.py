@@ -6,7 +6,7 @@ for every viewer, since helpers judge what the ego should do; a helper knows the
 from the last beacon that it heard, not from its sensors.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -37,6 +37,13 @@ def scene_graph(scenario: Scenario, state: WorldState, viewer_id: str) -> Graph:
     reported = {viewer.id, *(d.id for d in detections)}
     known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
     return _graph(scenario, state, viewer, detections, _sectors(road, known, viewer))
+
+
+def blinded(graph: Mapping[str, Any]) -> Graph:
+    """What its viewer would know without sensors: itself and the ego's beacon, and nothing of any sector."""
+    unseen = {"seen_share": 0.0, "occluded": True, "by": []}
+    sectors = [{**sector, **unseen} for sector in graph["sectors"]]
+    return {**graph, "nodes": [], "conflicts": [], "sectors": sectors}
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> Graph:

@@ -1,0 +1,205 @@
+"""The control `messages=blind`: what helpers say who are shown nothing."""
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluating import (
+    Scripted,
+    Walked,
+    course,
+    decisions,
+    live_spec_of,
+    run,
+    same_decisions,
+    same_scores,
+    says,
+    spec_of,
+    sure,
+    walked,
+)
+from run_on_disk import answers_of
+
+from harness.backends.base import Completion, Request
+from harness.cli.options import points
+from harness.coordination.operating_point import named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.evaluate import run as evaluation
+from harness.evaluate.asking import requests
+from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.spec import Spec
+from harness.runs import folder
+from harness.studies.stored import Stored
+
+BLIND = named_point("6g:messages=blind")
+CONDITIONS = points(["single-local", "6g:loss=0"], ["blind", "no-messages"])
+
+
+class Prior(Scripted):
+    """Its ego would keep its speed; its helpers say SLOWER whatever they see."""
+
+    def _say(self, request: Request) -> Completion:
+        text = says((0.3, 0.4, 0.3)) if request.role == "ego" else self.helper(request)
+        return Completion(request.id, text, None, None, "stop", None, 1)
+
+    def helper(self, request: Request) -> str:
+        return sure("SLOWER", "helper")
+
+
+class Perceiving(Prior):
+    """Its helpers say SLOWER where they see somebody, and else nothing in particular."""
+
+    def helper(self, request: Request) -> str:
+        assert request.view
+        return sure("SLOWER", "helper") if request.view["nodes"] else says((0.3, 0.4, 0.3), "helper")
+
+
+def success(told: Walked) -> dict[str, float | None]:
+    return {s.condition: s.value for s in told.scores
+            if (s.metric, s.interval) == ("success_rate", "episodes")}  # fmt: skip
+
+
+@pytest.mark.parametrize(("who", "kept"), [(Prior, 1.0), (Perceiving, 0.0)])
+def test_a_prior_keeps_its_gain_and_perception_loses_it(
+    who: type[Scripted], kept: float, small: Dataset
+) -> None:
+    """Whoever does not brake at the first step collides; the ego alone keeps its speed.
+
+    Three helpers that are sure of SLOWER turn it. A prior says the same with nothing to see, so its gain
+    stays under `blind` and is gone with no messages; helpers that judge by what they see lose it under both.
+    """
+    crash = {f"{n:05d}-0": {"IDLE": "collision", "FASTER": "collision"} for n in range(4)}
+    data = course(small, 1, crash)
+    told = walked(spec_of(data, points=points(["single-local", "6g"], ["blind"]), seeds=(0,)), who({}))
+    assert success(told) == {"single-local": 0.0, "6g": 1.0, "6g:messages=blind": kept}
+    silent = walked(spec_of(data, points=points(["6g"], ["no-messages"]), seeds=(0,)), who({}))
+    assert success(silent) == {"6g": 1.0, "6g:loss=1": 0.0}
+
+
+def test_a_blind_helper_knows_itself_and_the_beacon_and_sees_no_sector(small: Dataset) -> None:
+    scenes = small.scenes(small.courses())
+    spec = spec_of(small, "swarm-tiny", "v4")
+    asked = list(requests(spec, scenes, blind=True))
+    assert [r.id for r in asked] == [f"{s.id}/{v}~blind" for s in scenes for v in s.viewers[1:]]
+    own = {request.id: request for request in requests(spec, scenes)}
+    for request in asked:
+        sees = own[request.id.removesuffix("~blind")]
+        assert request.messages[0] == sees.messages[0]
+        head, _, rest = request.messages[1]["content"].partition("REGIONS you see: ")
+        assert head == sees.messages[1]["content"].partition("REGIONS")[0]
+        assert rest.split("\n")[:3] == [
+            "left 0%; right 0%; oncoming 0%", "OBJECTS id type ahead left speed lane light", "none"
+        ]  # fmt: skip
+        assert "none in sight" in rest
+
+
+@pytest.fixture(scope="module")
+def spec(small: Dataset) -> Spec:
+    return spec_of(small, points=CONDITIONS)
+
+
+@pytest.fixture(scope="module")
+def done(spec: Spec, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    return run(spec, tmp_path_factory.mktemp("blind") / "run")
+
+
+def test_each_helper_is_asked_once_where_a_blind_condition_decides(done: Evaluated, small: Dataset) -> None:
+    answers = answers_of(done.out)
+    came = {d.scene for d in decisions(done.out, "6g:loss=0,messages=blind")}
+    assert came < {d.scene for d in decisions(done.out)}, "other conditions come to others"
+    assert Counter(a.id for a in answers if a.role == "blind") == Counter(
+        f"{scene}/{viewer}~blind" for scene in came for viewer in small.scene(scene).viewers[1:]
+    )
+    rank = {"ego": 0, "helper": 1, "blind": 2}
+    order = [(a.scene, rank[a.role]) for a in answers]
+    assert order == sorted(order)
+    assert {s.metric for s in done.scores} > {"strict_rate_helper", "strict_rate_blind"}
+
+
+def test_other_conditions_are_the_same_without_it(done: Evaluated, small: Dataset, tmp_path: Path) -> None:
+    less = tuple(point for point in CONDITIONS if not point.asks_blind)
+    without = run(spec_of(small, points=less), tmp_path / "less")
+    assert not [a for a in answers_of(without.out) if a.role == "blind"]
+    for point in less:
+        assert decisions(without.out, point.name) == decisions(done.out, point.name)
+
+
+@pytest.mark.parametrize("after", [1, 3])
+def test_killed_among_the_blind_it_goes_on(
+    after: int, spec: Spec, done: Evaluated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    calls = 0
+
+    def more(count: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 2 * after:  # the second of each step announces the blind
+            raise Killed
+
+    with pytest.raises(Killed):
+        evaluate(spec, tmp_path / "run", lambda done: None, more=more)
+    run(spec, tmp_path / "run")
+    assert same_decisions(tmp_path / "run", done.out)
+    assert answers_of(tmp_path / "run") == answers_of(done.out)
+
+
+def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
+    done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
+    same = run(spec_of(small, f"replay:{done.out}", points=CONDITIONS), tmp_path / "same")
+    assert same_scores(same, done)
+    assert same_decisions(same.out, done.out)
+    less = tuple(point for point in CONDITIONS if not point.asks_blind)
+    without = run(spec_of(small, points=less), tmp_path / "less")
+    more = run(spec_of(small, f"replay:{without.out}", points=CONDITIONS), tmp_path / "more")
+    assert same_decisions(more.out, done.out)
+
+
+def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
+    done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
+    less = run(spec_of(small, points=CONDITIONS[:2]), tmp_path / "less").out
+    point = CONDITIONS[2]
+    assert point.asks_blind
+    with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
+        list(Stored(less, asks=False).walked(point, 4, (0, 1)))
+    asked: list[int] = []
+    [more] = Stored(less, more=asked.append).walked(point, 4, (0, 1))
+    assert sum(asked) > 0
+    [stored] = Stored(Path(shutil.copytree(done.out, tmp_path / "run")), asks=False).walked(point, 4, (0, 1))
+    assert np.array_equal(stored.ends["success_rate"], more.ends["success_rate"])
+    asked.clear()
+    list(Stored(less, more=asked.append).walked(point, 4, (0, 1)))
+    assert asked == []
+
+
+class Counting(Perceiving):
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        assert all(r.role == "helper" and r.view and not r.view["nodes"] for r in requests
+                   if r.id.endswith("~blind"))  # fmt: skip
+        return super().complete(requests)
+
+
+def test_the_closed_loop_has_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Counting({})
+    monkeypatch.setattr(evaluation, "_opened_all", lambda spec: [backend])
+    loop = live_spec_of(episodes=1, points=(named_point("6g:loss=0"), BLIND), seeds=(0,))
+    evaluate(loop, tmp_path / "run", lambda done: None)
+    answers = answers_of(tmp_path / "run")
+    blind = {a.scene for a in answers if a.role == "blind"}
+    assert blind == {d.scene for d in decisions(tmp_path / "run", BLIND.name)}
+    assert all(a.intent == (0.3, 0.4, 0.3) for a in answers if a.role == "blind")
+    assert folder.read(tmp_path / "run").scores
+
+
+def test_it_has_the_ego_hear_by_a_rule(small: Dataset) -> None:
+    with pytest.raises(UserError, match="messages is 'blind'; it must be own where consensus is ego-prompt"):
+        points(["6g:consensus=ego-prompt"], ["blind"])
+    assert not named_point("single-local:messages=blind").asks_blind
