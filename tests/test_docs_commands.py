@@ -33,6 +33,7 @@ CUT = {
     "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
     "harness twins": "--sample 1 --workers 1",  # of 12 episodes
+    "harness attribute": "--sample 2",  # of 40 decision points
     "harness campaign paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
     "harness campaign closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000

@@ -156,14 +156,14 @@ class Asker:
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN for one without a request, or whose answer failed."""
         if any(self.lacks(moments)):
-            self._owed(list(requests(self.spec, moments)))
+            self.answer(list(requests(self.spec, moments)))
         return self.laid_out(moments)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """The same where helpers are shown nothing; NaN for those of other moments than these."""
         wanted = [moments[n] for n in at.tolist()]
         if any(self.lacks(wanted, blind=True)):
-            self._owed(list(requests(self.spec, wanted, blind=True)))
+            self.answer(list(requests(self.spec, wanted, blind=True)))
         return self.laid_out(moments, blind=True)
 
     def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
@@ -198,7 +198,7 @@ class Asker:
         """The ego's answers to these sets of messages."""
         ids = [_fusion_id(*each) for each in _heard(moments, codes)]
         if not self.answers.keys() >= set(ids):
-            self._owed(self.fusion_requests(moments, codes))
+            self.answer(self.fusion_requests(moments, codes))
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
@@ -212,7 +212,8 @@ class Asker:
             asked.append(fusion_request(self.spec, scene, of_viewers, senders))
         return asked
 
-    def _owed(self, requests: Sequence[Request]) -> None:
+    def answer(self, requests: Sequence[Request]) -> None:
+        """Announce the requests and ask what is not there, but for answers that were given."""
         # Those kept from before a kill are among them, so that chunks begin where they did.
         asked = [request for request in requests if request.id not in self._given]
         self._more(len(asked))

@@ -97,7 +97,7 @@ def walk(
     world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
 ) -> Iterator[Sequence[Decided[Moment]]]:
     """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
-    memories: dict[str, _Memory] = {point.name: _Memory() for point in points}
+    memories: dict[str, Memory] = {point.name: Memory() for point in points}
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
@@ -108,7 +108,7 @@ def walk(
         for point, each in due.items():
             call = calls(each.at) if calls and point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, _heard(point, intents, blind, each), each.draws, fusion)
+            result = coordinate(point, heard(point, intents, blind, each), each.draws, fusion)
             decided.append(Decided(point, moments, each, result))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
@@ -116,7 +116,7 @@ def walk(
         world.step(decided)
 
 
-def _heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
+def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
     """What the vehicles of each decision intend; in a control, its helpers say something else.
 
     `blind`, what they say who are shown nothing. `shuffled`, what those of another layout do: the next layout
@@ -140,7 +140,7 @@ def _heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: 
     return replace(own, helpers=said.helpers, valid=valid, payload_bits=said.payload_bits)
 
 
-class _Memory:
+class Memory:
     """What a condition's consensus rule remembers of each episode and seed."""
 
     def __init__(self) -> None:

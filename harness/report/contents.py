@@ -9,6 +9,7 @@ from harness.runs import metrics
 from harness.runs.folder import Run
 
 EXAMPLES = 3  # of each status of answers
+MOVED = 5  # decision points whose answers moved most
 
 
 def size(runs: Runs) -> str:
@@ -52,6 +53,17 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
                 if len(of) < EXAMPLES:
                     of.append({"run": n, "answer": answer})
     return [{"status": status, "answers": of} for status, of in by_status.items()]
+
+
+def attributions(runs: Runs) -> list[dict[str, Any]]:
+    """Of each run whose decision points `harness attribute` drew: how many, and where most moved."""
+    found = []
+    for n, run in enumerate(runs.runs):
+        if a := run.attribution:
+            by_shift = sorted(a.left_out, key=lambda each: -(each.shift or 0.0))
+            scenes = list(dict.fromkeys(each.scene for each in by_shift))[:MOVED]
+            found.append({"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes})
+    return found
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:

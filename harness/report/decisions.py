@@ -83,6 +83,7 @@ class Decisions:
         self.ids = [scene for scene, _ in order]
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         self._ends = [_ends(run) for run in runs.runs]
+        self._left_out = [_left_out(run) for run in runs.runs]
         self._episodes = [_episodes(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self.index = {
@@ -198,7 +199,10 @@ class Decisions:
             shown = {**_shown(d), "end": str(self._ends[n][row])}
             decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
         ends = self._episodes[n][int(run.decisions.whole("episode")[rows.start])]
-        return {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
+        detail = {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
+        if left_out := self._left_out[n].get(name):
+            detail |= {"left_out": left_out}
+        return detail
 
 
 def _shown(d: Decision) -> dict[str, Any]:
@@ -212,6 +216,16 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
     role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
+
+
+def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """What was left out of each decision point that `harness attribute` drew, what moved most first."""
+    of: dict[str, list[dict[str, Any]]] = {}
+    if run.attribution:
+        for each in sorted(run.attribution.left_out, key=lambda each: -(each.shift or 0.0)):
+            plain = {**msgspec.to_builtins(each), "condition": run.attribution.condition}
+            of.setdefault(each.scene, []).append(plain)
+    return of
 
 
 def _episodes(run: Run) -> dict[int, list[dict[str, Any]]]:

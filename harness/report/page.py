@@ -99,6 +99,7 @@ def render(
         answers=contents.answers(runs),
         charts=charts,
         examples=contents.examples(runs),
+        attributions=contents.attributions(runs),
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),
         vega=library.packed(library.vega()),

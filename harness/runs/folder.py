@@ -26,6 +26,8 @@ from harness.core.files import write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
+from harness.runs import attribution
+from harness.runs.attribution import Attribution
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Manifest, Score, Variant
@@ -128,6 +130,12 @@ class Run:
         # A scene's viewers answer in the order in which the agents take them, the ego first.
         first = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
         return self.manifest.agent(first.index(answer.viewer))
+
+    @cached_property
+    def attribution(self) -> Attribution | None:
+        """`attribution.json`; None where `harness attribute` did not look."""
+        there = (self.path / attribution.FILE).is_file()
+        return self._read(attribution.FILE, attribution.load) if there else None
 
     def score(self, condition: str, metric: str) -> Score | None:
         """A metric's value in one condition; where it has several intervals, the one over episodes."""

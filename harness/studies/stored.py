@@ -10,7 +10,7 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from harness.backends.base import AnswerMode, Backend
+from harness.backends.base import AnswerMode, Backend, Request
 from harness.backends.cache import default_file
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
@@ -31,6 +31,7 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs.folder import dataset_of, read
+from harness.runs.records import Answer
 from harness.studies.play import Walked, walk_through
 
 MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
@@ -45,6 +46,7 @@ class Stored:
         vehicles: the most that any of its scenes has, the ego included.
         seeds: the run's own.
         points: the run's operating points, by name.
+        dataset: its episodes.
         same_episodes: every seed plays the run's.
         left_out: ids of the decision points without an answer at which walks were left out.
     """
@@ -75,8 +77,8 @@ class Stored:
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
-        self._dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
-        self.vehicles = max(len(scene.viewers) for scene in self._dataset.scenes(self._roots()))
+        self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
+        self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks = asks
         self.left_out: set[str] = set()
         self._asker = Asker(
@@ -85,13 +87,13 @@ class Stored:
         )  # fmt: skip
 
     def _roots(self) -> list[str]:
-        forest = self._dataset.forest
+        forest = self.dataset.forest
         return [forest.ids[n] for n in forest.root.tolist()]
 
     def manifest(self) -> dict[str, Any]:
         """The run, the digest of its dataset, and where its times come from."""
         return {
-            "name": self.name, "run": str(self.run.path), "dataset_sha256": self._dataset.sha256,
+            "name": self.name, "run": str(self.run.path), "dataset_sha256": self.dataset.sha256,
             "latency": msgspec.to_builtins(self._asker.latency),
             "decision_points_without_answer": sorted(self.left_out),
         }  # fmt: skip
@@ -103,19 +105,34 @@ class Stored:
             UserError: the point has the run's model fuse, and it cannot.
         """
         replace(self._asker.spec, points=(point,))  # which checks that they go together
-        world = FrozenWorld(self._dataset, [point], seeds)
+        world = FrozenWorld(self.dataset, [point], seeds)
         ask = _Nearest(self, vehicles - 1, partial(world.leave_out, point))
         columns, places = walk_through(world, point, ask, seeds, world.numbers)
         yield Walked(world.numbers, world.ends(point), columns, places)
 
+    @property
+    def spec(self) -> Spec:
+        """The evaluation that made the run, with all that decides its answers; it has no conditions."""
+        return self._asker.spec
+
+    def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
+        """All answers by request id, these among them; what is not there is asked, and kept in the run."""
+        with self._writing():
+            self._asker.answer(requests)
+        return self._asker.answers
+
+    def __call__(self, moments: Sequence[Scene]) -> Intents:
+        """What every vehicle intends. Where the run has no answer its model is asked."""
+        with self._writing():
+            return self._asker(moments)
+
     def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """What every vehicle intends. Where the run has no answer its model is asked, or it is left out."""
+        """What every vehicle intends; where its model is not asked, walks without an answer are left out."""
         lacks = np.array(self._asker.lacks(moments))
         if not lacks.any():
             return self._asker.laid_out(moments)
         if self._asks:
-            with self._writing():
-                return self._asker(moments)
+            return self(moments)
         self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
         leave_out(lacks)
         return self._asker.laid_out(moments)
@@ -150,11 +167,10 @@ class Stored:
             raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
 
     def _spec(self) -> Spec:
-        """The evaluation that made the run, with all that decides its answers."""
         manifest = self.run.manifest
         ego, *helpers = map(self._agent, (manifest.agent(0), *manifest.helpers))
         return Spec(
-            ego, FrozenSource(self._dataset), (), manifest.seeds, tuple(helpers),
+            ego, FrozenSource(self.dataset), (), manifest.seeds, tuple(helpers),
             batch_size=manifest.batch_size, dtype=manifest.dtype,
             temperature=manifest.temperature, sampling_seed=manifest.sampling_seed,
         )  # fmt: skip

@@ -13,7 +13,26 @@ function highlighted(raw, spans) {
 
 const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${p[n].toFixed(2)}`).join(", ") : "none");
 
-function answerSection(answer, detail, actions, meanings) {
+const sender = (answer) => answer.viewer.replace("~blind", "");
+const who = (answer) => `${sender(answer)}, ${answer.role === "blind" ? "blind helper" : answer.role}`;
+
+const signed = (value) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`;
+
+// What moved an answer or a policy, a bar for each thing left out; those that moved it most come first.
+function moved(leftOut, said) {
+  if (!leftOut?.length) return null;
+  const row = ({ item, kind, action, instead, change, shift }) => [
+    h("span", {}, `without ${item}: `,
+      shift == null ? "no answer" : `${signed(change)} ${action}`,
+      instead && instead !== action ? h("strong", {}, ` → ${instead}`) : null),
+    h("span", { class: "track", title: `total variation ${number(shift, 2)}` },
+      h("i", { style: `width: ${100 * (shift ?? 0)}%` })),
+    h("small", {}, kind),
+  ];
+  return [h("small", {}, said), h("div", { class: "moved" }, leftOut.map(row))];
+}
+
+function answerSection(answer, detail, actions, meanings, leftOut) {
   const facts = [
     answer.detail,
     answer.finish_reason && answer.finish_reason !== "stop" ? `finish reason ${answer.finish_reason}` : null,
@@ -28,7 +47,7 @@ function answerSection(answer, detail, actions, meanings) {
   const sent = answer.prompt == null ? null : detail.prompts[answer.prompt];
   const message = Object.entries(answer.message ?? {});
   return h("section", { class: "answer" },
-    h("h4", {}, [answer.viewer, answer.role, answer.agent].filter(Boolean).join(", "), [answer.status, ...(answer.repairs ?? [])].map((word) =>
+    h("h4", {}, [who(answer), answer.agent].filter(Boolean).join(", "), [answer.status, ...(answer.repairs ?? [])].map((word) =>
       [" ", h("span", { class: "tag", title: meanings[word] }, word)])),
     h("p", { class: "quiet" }, facts),
     h("div", { class: "pair" },
@@ -39,7 +58,8 @@ function answerSection(answer, detail, actions, meanings) {
         h("small", {}, "as read"), h("p", {}, distribution(actions, answer.intent)),
         answer.mass != null && Math.abs(answer.mass - 1) > 1e-3
           ? h("p", { class: "quiet" }, `the model's numbers sum to ${answer.mass.toFixed(3)}`) : null,
-        message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null)),
+        message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null,
+        moved(leftOut, "what moved it: one object left out of the prompt at a time"))),
     sent
       ? h("details", {},
         h("summary", {}, `prompt, ${sent.length} messages`),

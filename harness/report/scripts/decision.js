@@ -44,7 +44,6 @@ const acted = (d) => d.acts_at_s != null
   && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time");
 
 // Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing.
-const sender = (answer) => answer.viewer.replace("~blind", "");
 const first = (answers, point) => answers.filter((a) =>
   a.role === "ego" || a.role === (point.messages === "blind" ? "blind" : "helper"));
 
@@ -54,7 +53,7 @@ function policyRows(told, chosen, actions, run) {
   for (const a of first(told.answers, run.points[chosen.condition])) {
     const weight = a.role === "ego" ? chosen.own_weight : chosen.messages.find((m) => m.from === sender(a))?.weight;
     const what = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
-    if (a.intent) add(`${a.viewer}, ${a.role}`, what, a.intent);
+    if (a.intent) add(who(a), what, a.intent);
   }
   add(`fused, ${chosen.condition}`, "after fusion", chosen.fused);
   return rows;
@@ -67,13 +66,13 @@ function timelineRows(told, chosen, run) {
   for (const a of first(told.answers, point)) {
     const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
     const ready = 1000 * times[a.role === "ego" ? 0 : turn++ % times.length];
-    const m = chosen.messages.find((m) => m.from === sender(a)), who = `${a.viewer}, ${a.role}`;
+    const m = chosen.messages.find((m) => m.from === sender(a)), name = who(a);
     if (a.role !== "ego" && !m) continue;
-    if (ready) rows.push({ who, what: "inference", from: 0, to: ready });
+    if (ready) rows.push({ who: name, what: "inference", from: 0, to: ready });
     if (!m) continue;
     const to = m.delivered ? m.arrival_ms : Math.min(latency_ms, 1000 * (point.window_s ?? 0));
     const what = m.on_time ? "reply on time" : m.delivered ? "reply late" : "reply lost";
-    rows.push({ who, what, from: Math.min(ready, to), to });
+    rows.push({ who: name, what, from: Math.min(ready, to), to });
   }
   // ego-prompt infers once more when the exchange is over; a rule takes no time.
   const again = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time);
@@ -126,11 +125,13 @@ class DecisionPage {
           h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
         h("h2", {}, "What was decided"),
         this.told ? this.decided() : null,
+        this.messages(),
         this.about.names.length > 1 ? this.inEveryRun() : null,
         h("h3", {}, "Latency, from seeing to acting"), timeline,
         h("h2", {}, "Prompts and answers"),
         (this.told?.answers ?? []).map((answer) =>
-          answerSection(answer, this.detail, this.index.actions, this.about.meanings)),
+          answerSection(answer, this.detail, this.index.actions, this.about.meanings,
+            this.told.left_out?.filter((each) => each.role === answer.role && each.viewer === answer.viewer))),
       );
       if (this.chosen) await this.charts(policies, timeline);
     }
@@ -203,6 +204,12 @@ class DecisionPage {
       [d.action, " ", mark(d.end, this.index.live), acted(d)],
       `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", outlasts the window" : ""}`,
     ]));
+  }
+
+  messages() {
+    const leftOut = this.told?.left_out?.filter((each) => each.role === "fusion") ?? [], [one] = leftOut;
+    return one && moved(leftOut,
+      `what moved it: one message left out at a time, under ${one.condition} with seed ${one.seed}`);
   }
 
   inEveryRun() {

@@ -6,7 +6,7 @@ for every viewer, since helpers judge what the ego should do; a helper knows the
 from the last beacon that it heard, not from its sensors.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -29,10 +29,13 @@ ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object d
 Graph = dict[str, Any]
 
 
-def scene_graph(scenario: Scenario, state: WorldState, viewer_id: str) -> Graph:
-    """What the sensors of one vehicle know."""
+def scene_graph(
+    scenario: Scenario, state: WorldState, viewer_id: str, left_out: Collection[str] = ()
+) -> Graph:
+    """What the sensors of one vehicle know; some may be left out, as if no sensor reported them."""
     road, viewer = scenario.road(), state.vehicle(viewer_id)
-    detections = detect(state, viewer, sweep(state, viewer), scenario.parameters.light)
+    detected = detect(state, viewer, sweep(state, viewer), scenario.parameters.light)
+    detections = [d for d in detected if d.id not in left_out]
     # What no sensor reports must not show by what it hides.
     reported = {viewer.id, *(d.id for d in detections)}
     known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))

@@ -1,0 +1,72 @@
+"""`harness attribute`: what moved a run's answers and decisions."""
+
+from pathlib import Path
+from textwrap import fill
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import WIDTH, echo_json, table
+from harness.cli.progress import bar
+from harness.core.errors import printable
+from harness.core.figures import as_mapping, shown
+
+MOST = 100_000
+USUAL = "6g"
+HEADS = ("left out", "of", "shift [95 %]", "flips % [95 %]", "fail%", "n")
+
+
+def command(
+    run: Path = typer.Argument(help="Folder of a finished run of `harness eval`.", metavar="RUN"),
+    sample: int = typer.Option(40, help="How many decision points to draw, at most."),
+    sample_seed: int = typer.Option(0, help="Seed of the draw."),
+    condition: str | None = typer.Option(
+        None, help="Operating point whose decision points are drawn. Default: 6g, else the run's last."
+    ),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Leave out one object or message at a time, and see what answers and decisions become.
+
+    The run's model is asked what the run has not, once. `harness report` then shows it at each decision.
+    """
+    from harness.studies.attribution import attribute, headline, rows, rule, write
+    from harness.studies.stored import Stored
+
+    options.in_range("--sample", sample, 1, MOST)
+    with bar("asking without", quiet=as_json or quiet) as progress:
+        stored = Stored(run, more=progress.more, done=progress)
+        chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
+        found = attribute(stored, chosen, sample, sample_seed)
+    made, file = rows(found), write(found, run)
+    if as_json:
+        names = ("shift", "flips", "failed")
+        echo_json({
+            "run": str(run), "condition": found.condition, "decision_points": found.decision_points,
+            "of": found.of, "sample_seed": found.sample_seed,
+            "rows": [
+                {"role": row.role, "kind": row.kind, **{n: as_mapping(getattr(row, n)) for n in names}}
+                for row in made
+            ],
+        })  # fmt: skip
+    elif not quiet:
+        typer.echo(f"{printable(stored.name)} · {printable(stored.run.source)}")
+        typer.echo(fill(headline(made), WIDTH))
+        cells = (
+            (
+                r.kind,
+                r.role,
+                shown(r.shift, 1, 2),
+                shown(r.flips),
+                f"{100 * r.failed.value:.1f}",
+                str(r.shift.n),
+            )
+            for r in made
+        )
+        table(HEADS, cells, tight=True)
+        typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
+        typer.echo(
+            "of: whose prompt lists it; fusion: a message in time; shift: total variation of\n"
+            "answer or policy; flips: another action is likeliest; fail%: no answer then"
+        )
+        typer.echo(f"wrote {printable(file)}")

@@ -1,0 +1,254 @@
+"""`harness attribute`: what moved a run's answers and decisions, by leaving out one thing at a time.
+
+An object is left out as if no sensor of the viewer had reported it: its line, its conflict, what it hides.
+The viewer's model is asked again. A message is left out as if it had been lost: the consensus rule fuses the
+others, which is exact and asks nobody; a fusion call is made again.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from harness.backends.base import Request
+from harness.coordination.coordinate import Coordination, Fusion, fuse
+from harness.coordination.operating_point import OperatingPoint
+from harness.core import noise
+from harness.core.arrays import Ints
+from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import shown as figure
+from harness.core.files import write_whole
+from harness.core.statistics import Estimate, rate_interval
+from harness.dataset.load import Scene
+from harness.evaluate.asking import requests
+from harness.evaluate.frozen_world import FrozenWorld
+from harness.evaluate.fusion import codes_of
+from harness.evaluate.walk import Decided, Memory, heard, walk
+from harness.prompts.versions import shown as listing
+from harness.runs.attribution import FILE, Attribution, LeftOut
+from harness.studies.stored import Stored
+from harness.studies.twins.scoring import distance
+from harness.world.perception.graph import scene_graph
+
+HIDDEN, SEEN, OTHER = "hidden conflict vehicle", "seen conflict vehicle", "other object"
+SIGHT, NO_SIGHT = "helper with sight", "helper without sight"
+KINDS = (
+    *(("ego", kind) for kind in (SEEN, OTHER)),
+    *(("helper", kind) for kind in (HIDDEN, SEEN, OTHER)),
+    *(("fusion", kind) for kind in (SIGHT, NO_SIGHT)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """How much one kind of thing moves.
+
+    Attributes:
+        role: out of whose prompt it was left, or `fusion`.
+        kind: what it is.
+        shift: mean total variation.
+        flips: share whose likeliest action changed.
+        failed: share whose answer without it failed, which the other two leave out.
+    """
+
+    role: str
+    kind: str
+    shift: Estimate
+    flips: Estimate
+    failed: Estimate
+
+
+def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribution:
+    """Leave out every listed object and every message heard at some decision points of a run, in turn.
+
+    Args:
+        stored: the run, whose model is asked.
+        condition: name of the operating point whose decision points are drawn.
+        sample: how many, at most.
+        seed: of the draw.
+
+    Raises:
+        UserError: the run has no such condition, or its model is not available or cannot be asked otherwise.
+    """
+    for agent in stored.spec.agents:
+        name = f"{printable(stored.run.path)}: {printable(agent.card.name)}"
+        if not agent.can.closed_loop:
+            raise UserError(f"{name} has no answers to other questions; give the run that it replays")
+        if agent.card.privileged:
+            raise UserError(f"{name} reads the truth and no prompt; give a run of local-view or of a model")
+    if condition not in stored.points:
+        raise unknown("condition", condition, stored.points)
+    drawn, of = draw(stored, condition, sample, seed)
+    scenes = stored.dataset.scenes(list(drawn))
+    left_out = [*objects(stored, scenes), *messages(stored, stored.points[condition], drawn)]
+    place = {scene: n for n, scene in enumerate(drawn)}
+    left_out.sort(key=lambda each: (each.episode, place[each.scene]))
+    return Attribution(
+        condition=condition, decision_points=len(drawn), of=of, sample_seed=seed, left_out=tuple(left_out)
+    )
+
+
+def draw(stored: Stored, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
+    """Decision points, each with the channel seed of one of its decisions, and of how many they are drawn.
+
+    Each that the condition came to is as likely as any other, and so is each seed. A larger sample has the
+    smaller one in it.
+    """
+    run = stored.run
+    here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
+    seeds, came = run.decisions.whole("seed"), dict[str, list[int]]()
+    for scene, rows in run.decisions.scenes.items():
+        if of := seeds[rows.start : rows.stop][here[rows.start : rows.stop]].tolist():
+            came[scene] = of
+
+    def chance(*key: object) -> float:
+        return float(noise.uniforms((1,), "attribution", seed, *key)[0])
+
+    chosen = sorted(came, key=chance)[:sample]
+    return {scene: min(came[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(came)
+
+
+def objects(stored: Stored, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
+    """Every listed object left out of every prompt about these decision points in turn."""
+    asked = [each for scene in scenes for each in _questions(stored, scene)]
+    answers = stored.answered([request for *_, request in asked])
+    for scene, viewer, item, request in asked:
+        if p := answers[f"{scene.id}/{viewer}"].intent:
+            yield _left_out(
+                scene, stored.dataset.actions, p, answers[request.id].intent,
+                viewer=viewer, role=request.role, item=item, kind=_kind(scene, viewer, item),
+            )  # fmt: skip
+
+
+def _questions(stored: Stored, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
+    """The decision point, who is asked, what is left out, and the question."""
+    spec, graphs = stored.spec, scene.record["graphs"]
+    listed: dict[str, list[str]] = {}
+    for place, viewer in enumerate(spec.viewers(scene)):
+        agent, graph = spec.agents[spec.agent(place)], graphs[viewer]
+        reads = listing(graph, agent.prompt.max_objects) if agent.can.language_model else graph["nodes"]
+        listed[viewer] = [node["id"] for node in reads]
+    for item in dict.fromkeys(chain.from_iterable(listed.values())):
+        less = {v: scene_graph(spec.scenario, scene.state, v, [item]) for v in listed if item in listed[v]}
+        name = f"{scene.id}~without-{item}"
+        for request in requests(spec, [Scene({**scene.record, "graphs": graphs | less, "scene": name})]):
+            viewer = request.id.rpartition("/")[2]
+            if viewer in less:
+                yield scene, viewer, item, request
+
+
+def _kind(scene: Scene, viewer: str, item: str) -> str:
+    """Whether its viewer sees an object in conflict with the ego, and if so, whether the ego sees it too."""
+    graphs = scene.record["graphs"]
+    if item not in {conflict["with"] for conflict in graphs[viewer]["conflicts"]}:
+        return OTHER
+    return SEEN if item in {node["id"] for node in graphs[scene.viewers[0]]["nodes"]} else HIDDEN
+
+
+def messages(stored: Stored, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
+    """Every message that was in time left out in turn; `drawn` has a channel seed of each decision point."""
+    memory = Memory()
+    for [part] in walk(FrozenWorld(stored.dataset, [point], stored.seeds), [point], stored):
+        yield from _messages(stored, part, memory, drawn)
+        memory.keep(part.due, part.result.state)
+
+
+def _messages(
+    stored: Stored, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
+) -> Iterator[LeftOut]:
+    point, due, moments, state = part.point, part.due, part.moments, memory.recall(part.due)
+    chosen = [drawn.get(moments[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)]
+    decisions, helpers = np.nonzero(part.result.on_time & np.array(chosen)[:, None])
+    if not len(decisions):
+        return
+    blind = stored.blind(moments, np.unique(due.at)) if point.asks_blind else None
+    said = heard(point, stored(moments), blind, due).take(decisions)
+    whole, at = _taken(part.result, decisions), due.at[decisions]
+    rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
+    call = None
+    if point.asks_again:
+        call = stored.fusion_call(moments, np.unique(codes_of(rest, at)[rest.any(axis=1)]))(at)
+    fusion = Fusion(call, None if state is None else state[decisions])
+    less = fuse(point, replace(whole, on_time=rest), said, fusion)
+    for n, helper in enumerate(helpers.tolist()):
+        scene = moments[at[n]]
+        sender = scene.viewers[1 + helper]
+        items = (node["id"] for node in scene.record["graphs"][sender]["nodes"])
+        sight = any(_kind(scene, sender, item) == HIDDEN for item in items)
+        q = None if less.fusion_failed[n] else less.fused[n].tolist()
+        if not whole.fusion_failed[n]:
+            yield _left_out(
+                scene, stored.dataset.actions, whole.fused[n].tolist(), q, seed=int(due.seed[decisions[n]]),
+                viewer=scene.viewers[0], role="fusion", item=sender, kind=SIGHT if sight else NO_SIGHT,
+            )  # fmt: skip
+
+
+def _taken(result: Coordination, at: Ints) -> Coordination:
+    return replace(result, **{field.name: getattr(result, field.name)[at] for field in fields(result)})
+
+
+def _left_out(
+    scene: Scene, actions: Sequence[str], p: Sequence[float], q: Sequence[float] | None, **what: Any
+) -> LeftOut:
+    best = int(np.argmax(p))
+    return LeftOut(
+        scene=scene.id, episode=int(scene.record["episode"]), **{"seed": None, **what}, action=actions[best],
+        instead=actions[int(np.argmax(q))] if q else None, change=q[best] - p[best] if q else None,
+        shift=distance(p, q),
+    )  # fmt: skip
+
+
+def rows(found: Attribution) -> list[Row]:
+    """A row for each kind of thing that was left out; intervals are over episodes."""
+    return [
+        _row(role, kind, of)
+        for role, kind in KINDS
+        if (of := [each for each in found.left_out if (each.role, each.kind) == (role, kind)])
+    ]
+
+
+def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
+    episodes = np.array([each.episode for each in left_out])
+    shift = np.array([np.nan if each.shift is None else each.shift for each in left_out])
+    flips = np.array([float(each.instead != each.action) for each in left_out])
+    failed = np.isnan(shift)
+    return Row(
+        role, kind, rate_interval(shift, episodes),  # a distance is from 0 to 1, too
+        rate_interval(np.where(failed, np.nan, flips), episodes),
+        rate_interval(failed.astype(float), episodes),
+    )  # fmt: skip
+
+
+def headline(table: Sequence[Row]) -> str:
+    """What moved most, in a sentence."""
+    known = [row for row in table if row.shift.n]
+    if not known:
+        return "Nothing was left out: no prompt of the sample lists an object, and no message was in time."
+    most = max(known, key=lambda row: row.shift.value)
+    what = {
+        "ego": f"{most.kind} in the ego's prompt",
+        "helper": f"{most.kind} in a helper's prompt",
+        "fusion": f"message of a {most.kind} of a {HIDDEN}",
+    }[most.role]
+    return (
+        f"What moves most is the {what}: without it {figure(most.shift, 1, 2)} of the probability is "
+        f"elsewhere, and {figure(most.flips)} % of likeliest actions are others (n = {most.shift.n})."
+    )
+
+
+def rule(found: Attribution) -> str:
+    """How the decision points were chosen."""
+    return (
+        f"{found.decision_points} of the {found.of} decision points of {found.condition}, drawn with sample "
+        f"seed {found.sample_seed}, each as likely as any other"
+    )
+
+
+def write(found: Attribution, run: Path) -> Path:
+    """Write the file beside a run's tables."""
+    write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n")
+    return run / FILE
