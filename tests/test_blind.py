@@ -32,6 +32,8 @@ from harness.evaluate import run as evaluation
 from harness.evaluate.asking import requests
 from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
+from harness.report.decisions import Decisions
+from harness.report.runs import gather
 from harness.runs import folder
 from harness.studies.stored import Stored
 
@@ -199,7 +201,40 @@ def test_the_closed_loop_has_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert folder.read(tmp_path / "run").scores
 
 
-def test_it_has_the_ego_hear_by_a_rule(small: Dataset) -> None:
-    with pytest.raises(UserError, match="messages is 'blind'; it must be own where consensus is ego-prompt"):
-        points(["6g:consensus=ego-prompt"], ["blind"])
+class Fusing(Prior):
+    """Its blind helpers keep the speed; with messages its ego does as they say."""
+
+    def _say(self, request: Request) -> Completion:
+        text = says((0.3, 0.4, 0.3))
+        if "+" in request.id:
+            told = request.messages[1]["content"].partition("MESSAGES")[2]
+            assert "~" not in told, "a model is not told who is blind"
+            text = sure("SLOWER" if "1.00 0.00 0.00" in told else "FASTER")
+        elif request.role == "helper":
+            text = sure("IDLE" if request.id.endswith("~blind") else "SLOWER", "helper")
+        return Completion(request.id, text, None, None, "stop", None, 1)
+
+
+def test_a_fusion_call_has_the_blind_helpers_messages(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = points(["6g:consensus=ego-prompt,loss=0"], ["blind"])
+    with monkeypatch.context() as patched:
+        patched.setattr(evaluation, "open_backend", lambda *_, **__: Fusing({}))
+        done = run(spec_of(small, "swarm-tiny", points=both, latency="paper"), tmp_path / "run")
+    own, blind = ({d.action for d in decisions(done.out, point.name)} for point in both)
+    assert (own, blind) == ({"SLOWER"}, {"FASTER"})
+    merges = [a for a in answers_of(done.out) if a.role == "merge"]
+    assert {len({sender.endswith("~blind") for sender in a.heard}) for a in merges} == {1}
+    assert len({a.id for a in merges}) == len(merges)
+    replayed = spec_of(small, f"replay:{done.out}", points=both)
+    assert same_decisions(run(replayed, tmp_path / "replay").out, done.out)
+    shown = Decisions(gather([done.out]))
+    details = [answer for of in shown.blocks() for d in of for answer in d["runs"][0]["answers"]]
+    assert all(answer["prompt"] is not None for answer in details), "each as it was sent"
+
+
+def test_only_a_point_with_a_channel_asks_the_blind() -> None:
     assert not named_point("single-local:messages=blind").asks_blind
+    with pytest.raises(UserError, match="messages is 'shuffled'; it must be own or blind where consensus is"):
+        points(["6g:consensus=ego-prompt"], ["shuffled-messages"])

@@ -93,8 +93,8 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.density_coupled and self.loss is not None:
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
-        if self.messages != "own" and self.consensus == EGO_PROMPT:
-            raise self._wrong("messages", f"own where consensus is {EGO_PROMPT}")
+        if self.messages == "shuffled" and self.consensus == EGO_PROMPT:
+            raise self._wrong("messages", f"own or blind where consensus is {EGO_PROMPT}")
         self.channel()
 
     @classmethod

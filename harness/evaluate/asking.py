@@ -21,6 +21,7 @@ from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
 from harness.runs.records import BLIND, Answer, Latency
+from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
@@ -47,7 +48,7 @@ def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterat
 
 
 def _id(scene: Scene, viewer: str, blind: bool) -> str:
-    return f"{scene.id}/{viewer}{BLIND if blind else ''}"
+    return f"{scene.id}/{viewer}{BLIND * blind}"
 
 
 def _request(
@@ -66,7 +67,7 @@ def _request(
 def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
-    """The fusion call with these helpers' messages; `answers` by viewer."""
+    """The fusion call with these helpers' messages; `answers` by key, as `senders` has them."""
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
     messages = spec.ego.prompt.render(graph, spec.actions, heard, spec.scenario.prompt_words)
     return _request(spec, 0, _fusion_id(scene, senders), "ego", messages)
@@ -81,7 +82,8 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     # A lone surrogate cannot be written to a file; nothing else of the text is touched.
     raw = completion.text.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
-    viewer, *heard = viewers.removesuffix(BLIND).split("+")
+    viewer, *heard = viewers.split("+")
+    role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
     said = parse(
         # A read-out is a bare distribution, a helper's too.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
@@ -89,8 +91,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         finish_reason=completion.finish_reason, error=completion.error,
     )  # fmt: skip
     return Answer(
-        scene=scene, viewer=viewer, heard=tuple(heard),
-        role="merge" if heard else "blind" if viewers.endswith(BLIND) else request.role, raw=raw,
+        scene=scene, viewer=viewer.removesuffix(BLIND), heard=tuple(heard), role=role, raw=raw,
         finish_reason=completion.finish_reason, error=completion.error,
         prompt_tokens=completion.prompt_tokens, completion_tokens=completion.completion_tokens,
         seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
@@ -194,22 +195,24 @@ class Asker:
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)
         return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, inference_s(self.latency, answers))
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
-        """The ego's answers to these sets of messages."""
-        ids = [_fusion_id(*each) for each in _heard(moments, codes)]
+    def fusion_call(
+        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
+    ) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages, of helpers that are shown nothing if `blind`."""
+        ids = [_fusion_id(*each) for each in _heard(moments, codes, blind)]
         if not self.answers.keys() >= set(ids):
-            self.answer(self.fusion_requests(moments, codes))
+            self.answer(self.fusion_requests(moments, codes, blind))
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
 
-    def fusion_requests(self, moments: Sequence[Scene], codes: Ints) -> list[Request]:
+    def fusion_requests(self, moments: Sequence[Scene], codes: Ints, blind: bool = False) -> list[Request]:
         """The requests of the fusion calls with these sets of messages."""
         asked = []
-        for scene, senders in _heard(moments, codes):
-            of_viewers = {v: a for v in scene.viewers if (a := self.answers.get(f"{scene.id}/{v}"))}
-            asked.append(fusion_request(self.spec, scene, of_viewers, senders))
+        for scene, senders in _heard(moments, codes, blind):
+            sent = {key: a for key in senders if (a := self.answers.get(f"{scene.id}/{key}"))}
+            asked.append(fusion_request(self.spec, scene, sent, senders))
         return asked
 
     def answer(self, requests: Sequence[Request]) -> None:
@@ -220,12 +223,12 @@ class Asker:
         self.ask(asked)
 
 
-def _heard(moments: Sequence[Scene], codes: Ints) -> Iterator[tuple[Scene, list[str]]]:
-    """The scene of each set of messages, and its senders."""
+def _heard(moments: Sequence[Scene], codes: Ints, blind: bool) -> Iterator[tuple[Scene, list[str]]]:
+    """The scene of each set of messages, and the keys of its senders' answers."""
     helpers = max(len(scene.viewers) for scene in moments) - 1
     for code in codes.tolist():
         moment, heard = heard_in(code, helpers)
-        yield moments[moment], [moments[moment].viewers[1 + h] for h in heard]
+        yield moments[moment], [moments[moment].viewers[1 + h] + BLIND * blind for h in heard]
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.runs.records import Answer
+from harness.runs.records import BLIND, Answer
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def heard_in(code: int, helpers: int) -> tuple[int, list[int]]:
 
 
 def messages_of(answers: Mapping[str, Answer], senders: Sequence[str]) -> list[dict[str, Any]]:
-    """What these helpers sent, as a prompt takes it, from the answers of a moment by viewer."""
+    """What these helpers sent, as a prompt takes it, from the answers of a moment by key."""
     return [
-        {"sender": sender, "intent": list(said.intent), **said.message}
+        {"sender": sender.removesuffix(BLIND), "intent": list(said.intent), **said.message}
         for sender in senders
         if (said := answers.get(sender)) and said.intent and said.message
     ]

@@ -88,8 +88,13 @@ class Ask(Protocol[AskedMoment]):
         """The same where helpers are shown nothing, (n, ...); it has to be known at these places alone."""
         ...
 
-    def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints) -> Callable[[Ints], FusionCall]:
-        """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,)."""
+    def fusion_call(
+        self, moments: Sequence[AskedMoment], codes: Ints, blind: bool = False
+    ) -> Callable[[Ints], FusionCall]:
+        """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,).
+
+        The messages are those of helpers that are shown nothing, if `blind`.
+        """
         ...
 
 
@@ -101,12 +106,12 @@ def walk(
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
-        calls = _fusion_calls(due, moments, intents, ask)
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
+        calls = _fusion_calls(due, moments, intents, blind, ask)
         decided = []
         for point, each in due.items():
-            call = calls(each.at) if calls and point.asks_again else None
+            call = calls[point.asks_blind](each.at) if point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
             result = coordinate(point, heard(point, intents, blind, each), each.draws, fusion)
             decided.append(Decided(point, moments, each, result))
@@ -159,20 +164,28 @@ class Memory:
 
 
 def _fusion_calls(
-    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, ask: Ask[Moment]
-) -> Callable[[Ints], FusionCall] | None:  # fmt: skip
-    """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
-    if not any(point.asks_again for point in due):
-        return None
-    return ask.fusion_call(moments, heard_codes(due, intents))
+    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, blind: Intents | None,
+    ask: Ask[Moment],
+) -> dict[bool, Callable[[Ints], FusionCall]]:  # fmt: skip
+    """One fusion call for each set of messages that any condition hears; who is heard depends on none.
+
+    Those with blind helpers' messages are under True.
+    """
+    calls = {}
+    for of in sorted({point.asks_blind for point in due if point.asks_again}):
+        alike = {point: each for point, each in due.items() if point.asks_blind == of}
+        calls[of] = ask.fusion_call(moments, heard_codes(alike, intents, blind), of)
+    return calls
 
 
-def heard_codes(due: Mapping[OperatingPoint, Due], intents: Intents) -> Ints:
+def heard_codes(
+    due: Mapping[OperatingPoint, Due], intents: Intents, blind: Intents | None = None
+) -> Ints:  # fmt: skip
     """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
     for point, each in due.items():
         if point.asks_again:
-            on_time = exchange(point, intents.take(each.at), each.draws).on_time
+            on_time = exchange(point, heard(point, intents, blind, each), each.draws).on_time
             codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 

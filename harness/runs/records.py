@@ -17,7 +17,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     Attributes:
         scene: id of the decision point.
         viewer: id of the vehicle that answered.
-        heard: ids of the helpers whose messages were in the prompt of a fusion call.
+        heard: keys of the helpers' answers whose messages were in the prompt of a fusion call.
         role: `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing.
         raw: the completion, untouched but for lone surrogates, which no file can hold.
         finish_reason: `stop`, `length` or `error`.

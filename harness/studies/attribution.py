@@ -171,7 +171,8 @@ def _messages(
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.asks_again:
-        call = stored.fusion_call(moments, np.unique(codes_of(rest, at)[rest.any(axis=1)]))(at)
+        codes = np.unique(codes_of(rest, at)[rest.any(axis=1)])
+        call = stored.fusion_call(moments, codes, point.asks_blind)(at)
     fusion = Fusion(call, None if state is None else state[decisions])
     less = fuse(point, replace(whole, on_time=rest), said, fusion)
     for n, helper in enumerate(helpers.tolist()):

@@ -141,7 +141,9 @@ class CalibratedWorld:
         """Nobody is asked blindly: no point of the study has it."""
         raise NotImplementedError
 
-    def fusion_call(self, moments: Sequence[int], codes: Ints) -> Callable[[Ints], FusionCall]:
+    def fusion_call(
+        self, moments: Sequence[int], codes: Ints, blind: bool = False
+    ) -> Callable[[Ints], FusionCall]:
         """Nobody calls: no point of the study has its model fuse."""
         return lambda at: lambda on_time: (np.empty((0, ACTIONS)), np.empty(0))
 

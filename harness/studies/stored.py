@@ -148,7 +148,9 @@ class Stored:
         with self._writing():
             return self._asker.blind(moments, at)
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
+    def fusion_call(
+        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
+    ) -> Callable[[Ints], FusionCall]:
         """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
         if not self._asks:
             raise UserError(
@@ -156,7 +158,7 @@ class Stored:
                 "consensus ego-prompt needs; leave it out"
             )
         with self._writing():
-            return self._asker.fusion_call(moments, codes)
+            return self._asker.fusion_call(moments, codes, blind)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -216,5 +218,7 @@ class _Nearest:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
 
-    def fusion_call(self, moments: Sequence[Scene], codes: Ints) -> Callable[[Ints], FusionCall]:
-        return self._stored.fusion_call(moments, codes)
+    def fusion_call(
+        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
+    ) -> Callable[[Ints], FusionCall]:
+        return self._stored.fusion_call(moments, codes, blind)

@@ -18,7 +18,7 @@ from harness.evaluate.fusion import messages_of
 from harness.prompts import readout
 from harness.prompts.versions import as_it_was
 from harness.runs.folder import Run, check_scenes, dataset_of
-from harness.runs.records import FrozenScenes
+from harness.runs.records import BLIND, FrozenScenes
 from harness.training.answers import answer
 from harness.training.examples import question
 from harness.training.lessons import Lessons, label
@@ -80,7 +80,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
         answers = {one.key: one for one in run.answers_by_scene.get(scene.id, ())}
-        for one in (each for each in answers.values() if each.role != "blind"):
+        for one in (each for each in answers.values() if BLIND not in each.key):
             if one.viewer not in scene.record["graphs"]:
                 raise UserError(
                     f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(one.viewer)!r} in "

@@ -14,7 +14,8 @@ function highlighted(raw, spans) {
 const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${p[n].toFixed(2)}`).join(", ") : "none");
 
 const sender = (answer) => answer.viewer.replace("~blind", "");
-const who = (answer) => `${sender(answer)}, ${answer.role === "blind" ? "blind helper" : answer.role}`;
+const who = (answer) =>
+  answer.role === "blind" ? `${sender(answer)}, blind helper` : `${answer.viewer}, ${answer.role}`;
 
 const signed = (value) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`;
 
