@@ -129,7 +129,8 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     it is and how long it takes stay.
     """
     own = intents.take(due.at)
-    if point.asks_blind and blind:
+    if point.asks_blind:
+        assert blind is not None
         said = blind.take(due.at)
         return replace(own, helpers=said.helpers, valid=said.valid, payload_bits=said.payload_bits)
     if point.messages != "shuffled":
