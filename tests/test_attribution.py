@@ -24,7 +24,7 @@ from harness.prompts.versions import shown as listed
 from harness.report.decisions import Decisions
 from harness.report.runs import gather
 from harness.runs import folder
-from harness.runs.attribution import LeftOut
+from harness.runs.attribution import Attribution, LeftOut
 from harness.runs.records import Decision
 from harness.studies import attribution, stored
 from harness.studies.attribution import attribute, draw, headline, rows
@@ -150,7 +150,7 @@ def by_hand(each: LeftOut, d: Decision, own: dict[str, Sequence[float]]) -> Any:
     return (np.array(d.fused) - weight * np.array(own[each.item])) / (1 - weight)
 
 
-def of_decisions(path: Path, name: str, found: attribution.Attribution) -> Iterator[Any]:
+def of_decisions(path: Path, name: str, found: Attribution) -> Iterator[Any]:
     """What was left out of fusion, the decision, and the answers of its decision point."""
     made = {(d.scene, d.seed): d for d in decisions(path, name)}
     answers = folder.read(path).answers_by_scene

@@ -63,7 +63,7 @@ def command(
             )
             for r in made
         )
-        table(HEADS, cells, tight=True)
+        table(HEADS, cells)
         typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
         typer.echo(
             "of: whose prompt lists it; fusion: a message in time; shift: total variation of\n"
