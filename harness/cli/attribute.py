@@ -26,7 +26,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Leave out one object or message at a time, and see what answers and decisions become.
+    """Show what moved answers, leaving out one object or message each.
 
     The run's model is asked what the run has not, once. `harness report` then shows it at each decision.
     """
