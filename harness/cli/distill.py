@@ -45,7 +45,7 @@ def command(
             f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train seeds "
             f"alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
-    learnt = {of: tuple(v for v in versions if prompts.fits(v.version, of.prompt)) for of in driven}
+    learnt = {of: tuple(v for v in versions if not prompts.unfit(v, of)) for of in driven}
     for of, some in learnt.items():
         if not some:
             raise UserError(

@@ -10,8 +10,10 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import console, echo_json
 from harness.cli.progress import bar
-from harness.core import resources
+from harness.cli.scenario import ready_to_drive
+from harness.core import extras, resources
 from harness.core.errors import UserError, printable, unknown
+from harness.core.seeds import FIRST
 
 if TYPE_CHECKING:
     from harness.dataset.load import Scene
@@ -82,6 +84,34 @@ def show(
 
 
 @app.command()
+def examples(
+    version: Version,
+    scenario: Annotated[str, typer.Option(help="Scenario that they are from.")],
+    count: Annotated[int, typer.Option(help="How many for each role, each of a layout of its own.")] = 2,
+    first_seed: Annotated[int, typer.Option(help="Layout seed of the first.")] = FIRST["train"],
+) -> None:
+    """Give a draft examples: earlier turns of the chat, from train seeds, answered as the trees ask for."""
+    from harness.prompts import examples as files
+    from harness.prompts import versions as prompts
+
+    extras.need("harness prompt examples", "highway_env")
+    draft, of = prompts.load(version), ready_to_drive(scenario, count, first_seed, 1, "--count")
+    file = prompts.folder(version) / files.EXAMPLES
+    if draft.released:
+        raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
+    if draft.examples:
+        raise UserError(f"{printable(file)} is there already; delete it to draw others")
+    if reason := prompts.unfit(draft, of):
+        raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
+    from harness.training import shown
+
+    with bar("drawing layouts", count) as progress:
+        drawn = shown.examples(draft, of, count, first_seed, progress)
+    files.write(drawn, file.parent)
+    typer.echo(f"wrote {printable(file)}: {drawn}")
+
+
+@app.command()
 def check(
     version: Version,
     dataset: options.Dataset = resources.DATASET,
@@ -94,12 +124,15 @@ def check(
     """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
+    from harness.evaluate.agent import example_actions
     from harness.prompts import versions as prompts
     from harness.prompts.densest import densest_messages
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     scenes = data.scenes(data.courses())
     count = counter(tokenizer)
+    for role in prompts.ROLES:
+        example_actions(prompt, role, data.actions)
     least, most = prompt.token_budget
     sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION)}
     outside: list[dict[str, Any]] = []

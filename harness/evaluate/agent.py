@@ -1,6 +1,6 @@
 """An agent: the model that answers for a vehicle, and how it is asked."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
@@ -8,6 +8,7 @@ from harness.backends.base import AnswerMode, Role
 from harness.backends.cards import Card
 from harness.backends.registry import Capabilities, capabilities
 from harness.core.errors import UserError, printable, unknown
+from harness.parsing.parse import Status, parse
 from harness.prompts import readout
 from harness.prompts.versions import Prompt
 
@@ -69,7 +70,7 @@ class Agent:
     ) -> tuple[Mapping[str, str], ...]:
         """The chat messages about a scene graph."""
         rendered = self.prompt.render(graph, actions, words=words)
-        return readout.asked(rendered, actions) if self.answer == "readout" else rendered
+        return in_mode(self.answer, self.prompt, rendered, graph["role"], actions)
 
     def settings(self) -> dict[str, Any]:
         """All that decides its answers, as plain values."""
@@ -79,3 +80,31 @@ class Agent:
             "thinking": self.thinking,
             "answer": self.answer,
         }
+
+
+def in_mode(
+    answer: str, prompt: Prompt, messages: Sequence[Mapping[str, str]], role: str, actions: Sequence[str]
+) -> tuple[Mapping[str, str], ...]:
+    """A prompt's chat as an answer mode asks it: in a read-out the examples answer by a letter, too."""
+    if answer != "readout":
+        return tuple(messages)
+    return readout.asked(messages, actions, example_actions(prompt, role, actions))
+
+
+def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
+    """The action that each example of a role is likeliest to take.
+
+    Raises:
+        UserError: the parser would have to mend an example's answer.
+    """
+    found = []
+    for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
+        first = role in prompt.reasons_first
+        said = parse(example.answer, role=role, actions=actions, reasons_first=first)
+        if said.status is not Status.STRICT or said.intent is None:
+            raise UserError(
+                f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "
+                f"model should state it ({said.status}: {said.detail}); mend it"
+            )
+        found.append(actions[said.intent.index(max(said.intent))])
+    return found

@@ -41,6 +41,12 @@ class FrozenSource:
         """The dataset's."""
         return self.dataset.scenario
 
+    @property
+    def layout_seeds(self) -> Sequence[int]:
+        """Of the selected episodes."""
+        seeds: list[int] = self.dataset.forest.seeds.tolist()
+        return seeds
+
     def record(self) -> FrozenScenes:
         """The dataset, pinned by its digest."""
         p = self.scenario.parameters

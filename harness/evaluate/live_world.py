@@ -60,6 +60,11 @@ class LiveSource:
         """The scenario's."""
         return self.scenario.actions
 
+    @property
+    def layout_seeds(self) -> Sequence[int]:
+        """Of the episodes that are driven."""
+        return [self.first_seed + number for number in self.numbers]
+
     def record(self) -> ClosedLoop:
         """The scenario, and which of its layouts."""
         parameters = self.scenario.parameters.stated()

@@ -2,7 +2,7 @@
 
 import platform
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,9 +16,9 @@ from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
-from harness.evaluate.agent import Agent
+from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.latency import MEASURED, NAMES, declared
-from harness.prompts.versions import fits
+from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
@@ -53,6 +53,11 @@ class Source(Protocol):
     @property
     def scenario(self) -> Scenario:
         """The scenario of its episodes."""
+        ...
+
+    @property
+    def layout_seeds(self) -> Iterable[int]:
+        """Of the episodes that are walked."""
         ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
@@ -157,11 +162,9 @@ class Spec:
 
     def _check(self, agent: Agent) -> None:
         name, version = printable(agent.card.name), agent.prompt.version
-        if not fits(version, self.scenario.prompt):
-            raise UserError(
-                f"--prompt {version} speaks of a crossing, which {self.scenario.name} is not; "
-                f"give {self.scenario.prompt}, or one of your own"
-            )
+        if reason := unfit(agent.prompt, self.scenario):
+            raise UserError(f"--prompt {version} {reason}; give {self.scenario.prompt}, or one of your own")
+        self._check_examples(agent.prompt)
         if self.source.kind == "closed-loop" and not agent.can.closed_loop:
             raise UserError(
                 f"--model {name}: a replay has answers to frozen scenes alone; give the model that it replays"
@@ -178,6 +181,18 @@ class Spec:
                 f"{shown}: the card of {name} declares no inference time; "
                 "use paper or measured, or add inference_s to the card"
             )
+
+    def _check_examples(self, prompt: Prompt) -> None:
+        """Refuse to ask about layouts that the prompt shows, and to show what the parser would not take."""
+        if prompt.examples is None:
+            return
+        if known := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
+            raise UserError(
+                f"--prompt {prompt.version} has an example of layout seed {known[0]}, which is evaluated; "
+                "leave that episode out, or draw the examples anew: `harness prompt examples --first-seed`"
+            )
+        for role in ROLES:
+            example_actions(prompt, role, self.actions)
 
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from harness.core.errors import printable
 from harness.dataset.load import Scene
 from harness.prompts.densest import densest_messages
+from harness.prompts.examples import Examples
 from harness.prompts.versions import Prompt
 from harness.world.scenario import Scenario
 
@@ -19,6 +20,7 @@ CONTEXT = 8  # words that are shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
     "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts", "token_budget",
+    "examples",
 )  # fmt: skip
 
 
@@ -77,7 +79,7 @@ class Sent:
         role: `ego`, `helper`, or `fusion` for the ego with messages.
         words: A's and B's.
         tokens: A's and B's; None where nobody counts them.
-        parts: what differs in the system's message and in the user's.
+        parts: what differs in the system's message, in the examples where there are any, and in the user's.
     """
 
     viewer: str
@@ -98,8 +100,11 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
     """The ego's version with the helper's part of another."""
+    mine, others = (prompt.examples or Examples("") for prompt in (ego, helper))
+    both = Examples(mine.scenario or others.scenario, mine.ego, others.helper)
     return replace(
         ego,
+        examples=both if both.seeds else None,
         texts={**ego.texts, "helper": helper.texts["helper"]},
         max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
         helper_answer=helper.helper_answer,
@@ -110,7 +115,9 @@ def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
 def _settings(prompt: Prompt) -> Iterator[tuple[str, Any]]:
     for name in SETTINGS:
         value = getattr(prompt, name)
-        if isinstance(value, Mapping):
+        if isinstance(value, Examples):
+            yield name, str(value)
+        elif isinstance(value, Mapping):
             yield from ((f"{name}.{key}", each) for key, each in sorted(value.items()))
         else:
             yield name, value
@@ -144,10 +151,17 @@ def sent(
             for message in densest_messages(senders, scenario.actions)
         ]
         old, new = (p.render(graph, scenario.actions, heard, scenario.prompt_words) for p in (a, b))
-        parts = {m["role"]: words(m["content"], n["content"]) for m, n in zip(old, new, strict=True)}
+        pairs = zip(_parts(old).items(), _parts(new).values(), strict=True)
+        parts = {part: words(one, other) for (part, one), other in pairs if one or other}
         lengths = _size(old), _size(new)
         result.append(Sent(viewer, role, lengths, (count(old), count(new)) if count else None, parts))
     return result
+
+
+def _parts(messages: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """The system's message, the turns of examples one after the other, and the user's."""
+    system, *turns, user = (message["content"] for message in messages)
+    return {"system": system, "examples": "\n".join(turns), "user": user}
 
 
 def _size(messages: Iterable[Mapping[str, str]]) -> int:

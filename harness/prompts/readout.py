@@ -21,11 +21,30 @@ def letters(actions: Sequence[str]) -> str:
     return LETTERS[: len(actions)]
 
 
-def asked(messages: Sequence[Mapping[str, str]], actions: Sequence[str]) -> tuple[Mapping[str, str], ...]:
-    """The same chat, whose last message asks for one letter in the end."""
+def question(actions: Sequence[str]) -> str:
+    """The line that asks for a letter."""
     options = ", ".join(f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True))
-    *head, last = messages
-    return (*head, {**last, "content": f"{last['content']}\nAnswer with one letter: {options}."})
+    return f"Answer with one letter: {options}."
+
+
+def asked(
+    messages: Sequence[Mapping[str, str]], actions: Sequence[str], answered: Sequence[str] = ()
+) -> tuple[Mapping[str, str], ...]:
+    """The same chat, each of whose questions asks for one letter in the end.
+
+    Args:
+        messages: the chat.
+        actions: what the letters stand for.
+        answered: the action that each earlier answer is likeliest to take, which it then says by its letter.
+    """
+    letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
+
+    def said(message: Mapping[str, str]) -> str:
+        if message["role"] == "assistant":
+            return letter[next(earlier)]
+        return message["content"] + (f"\n{question(actions)}" if message["role"] == "user" else "")
+
+    return tuple({**message, "content": said(message)} for message in messages)
 
 
 def stated(actions: Sequence[str], shares: Sequence[float]) -> str:

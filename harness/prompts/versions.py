@@ -1,10 +1,11 @@
 """Prompt versions: templates that turn a scene graph into chat messages.
 
 A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
-`user`) and `prompt.toml`. Released versions are pinned by digest in `prompts/released.toml`: a changed text
-is a new version.
+`user`) and `prompt.toml`; it may have examples, `examples.json`. Released versions are pinned by digest in
+`prompts/released.toml`: a changed text is a new version.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -24,6 +25,9 @@ from harness.core.config import Count, convert, loads
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, sha256_bytes, text_of, write_whole
 from harness.core.resources import entries, find
+from harness.prompts.examples import EXAMPLES, Examples
+from harness.prompts.examples import read as read_examples
+from harness.world.scenario import Scenario
 
 Graph = Mapping[str, Any]
 ROLES = ("ego", "helper")
@@ -101,6 +105,7 @@ class Prompt:
         max_conflicts: how many conflicts the variable `conflicts` has, the soonest first; None for all.
         reasons_first: roles asked for reasons before the answer, which are then no fault of the answer.
         texts: template text by role.
+        examples: earlier turns of the chat, from one scenario; None without any.
     """
 
     version: str
@@ -116,6 +121,7 @@ class Prompt:
     texts: Mapping[str, str]
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
     max_conflicts: Count | None = None
+    examples: Examples | None = None
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -156,6 +162,8 @@ class Prompt:
     ) -> tuple[dict[str, str], ...]:
         """Chat messages for one viewer's scene graph; exactly what a model is sent.
 
+        The examples stand as earlier turns behind the system's message.
+
         Args:
             graph: the viewer's scene graph; its `role` chooses the template.
             actions: meta-action names.
@@ -163,6 +171,37 @@ class Prompt:
                 `recommended_maneuver`, `confidence`.
             words: what the scenario says of itself, by name.
         """
+        system, user = self._said(graph, actions, messages, words, "system", "user")
+        turns = self._turns(graph["role"], actions, words)
+        return ({"role": "system", "content": system}, *turns, {"role": "user", "content": user})
+
+    def _turns(
+        self, role: str, actions: tuple[str, ...], words: Mapping[str, str]
+    ) -> tuple[dict[str, str], ...]:
+        """A role's examples as turns of the chat; the same for every question."""
+        if self.examples is None:
+            return ()
+        key = role, actions, *words.items()
+        if key not in self._kept_turns:
+            self._kept_turns[key] = tuple(
+                {"role": part, "content": text}
+                for example in self.examples.of(role)
+                for part, text in (
+                    ("user", *self._said(example.graph, actions, (), words, "user")),
+                    ("assistant", example.answer),
+                )
+            )
+        return self._kept_turns[key]
+
+    @cached_property
+    def _kept_turns(self) -> dict[Any, tuple[dict[str, str], ...]]:
+        return {}
+
+    def _said(
+        self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
+        words: Mapping[str, str], *blocks: str,
+    ) -> list[str]:  # fmt: skip
+        """What a template's blocks say of a scene graph."""
         objects = shown(graph, self.max_objects - bool(messages))
         variables = {
             "graph": graph,
@@ -176,10 +215,7 @@ class Prompt:
         template = self._templates[graph["role"]]
         try:
             shared = _context(self._contexts[graph["role"]], variables)
-            return tuple(
-                {"role": part, "content": "".join(template.blocks[part](shared))}
-                for part in ("system", "user")
-            )
+            return ["".join(template.blocks[block](shared)) for block in blocks]
         except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
@@ -223,9 +259,13 @@ def names(where: Path | None = None) -> list[str]:
     return sorted({file.parent.name for file in files})
 
 
-def fits(version: str, default: str) -> bool:
-    """Whether a version may speak to a scenario that has this `default`: of a crossing where there is one."""
-    return version not in OF_A_CROSSING or default in OF_A_CROSSING
+def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
+    """Why a version may not speak to a scenario; None if it may."""
+    if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
+        return f"speaks of a crossing, which {scenario.name} is not"
+    if prompt.examples and prompt.examples.scenario != scenario.name:
+        return f"has examples of {printable(prompt.examples.scenario)}, which {scenario.name} is not"
+    return None
 
 
 def load(version: str, where: Path | None = None) -> Prompt:
@@ -237,7 +277,8 @@ def load(version: str, where: Path | None = None) -> Prompt:
     if version not in names(where):
         raise unknown("prompt", version, names(where))
     base = _base(version, where)
-    texts = {name: _text(base / version / name) for name in FILES}
+    optional = [EXAMPLES] if os.path.lexists(base / version / EXAMPLES) else []
+    texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
     what = f"prompt {version} prompt.toml"
     table = loads(texts["prompt.toml"], what)
     sha256 = digest(texts)
@@ -247,11 +288,12 @@ def load(version: str, where: Path | None = None) -> Prompt:
             f"prompt {version} was released and its text has changed; restore it, or copy it to a new "
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
-    templates = {role: texts[f"{role}.j2"] for role in ROLES}
     table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **table}
+    shown = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
     return convert(
-        table, Prompt, what, version=version, sha256=sha256, released=version in released, texts=templates
-    )
+        table, Prompt, what, version=version, sha256=sha256, released=version in released,
+        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(shown), None),
+    )  # fmt: skip
 
 
 def as_it_was(version: str, sha256: str) -> Prompt | None:
@@ -274,14 +316,19 @@ def lock(version: str, where: Path | None = None) -> str:
     return prompt.sha256
 
 
+def folder(version: str) -> Path:
+    """Where a version's files lie."""
+    return _base(version, None) / version
+
+
 def _base(version: str, where: Path | None) -> Path:
     """The folder of versions that has one."""
     return where or find("prompts", version).parent
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Digest of a version's files."""
-    return sha256_bytes("\0".join(f"{name}\0{texts[name]}" for name in FILES).encode())
+    """Digest of a version's files, in the order of `FILES`, its examples last."""
+    return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 
 
 def _text(file: Path) -> str:

@@ -8,10 +8,11 @@ import numpy as np
 
 from harness.core.files import digest
 from harness.dataset.load import Scene
+from harness.evaluate.agent import in_mode
 from harness.evaluate.fusion import messages_of
 from harness.parsing.parse import spans
 from harness.parsing.status import Status
-from harness.prompts import readout, versions
+from harness.prompts import versions
 from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.runs import Runs
@@ -48,8 +49,9 @@ def prompts_of(run: Run) -> Sent | None:
         words = scenarios.get(scene.state.scenario).prompt_words
         agent = manifest.agent(scene.viewers.index(viewer))
         prompt = prompts[agent["prompt"]["version"]]
-        messages = prompt.render(scene.record["graphs"][viewer], run.actions, heard, words)
-        return readout.asked(messages, run.actions) if agent["answer"] == "readout" else messages
+        graph = scene.record["graphs"][viewer]
+        messages = prompt.render(graph, run.actions, heard, words)
+        return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
 
     return sent
 

@@ -9,6 +9,7 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.dataset.load import Scene
+from harness.evaluate.agent import in_mode
 from harness.prompts.versions import Prompt
 from harness.training.answers import message
 from harness.training.lessons import Lessons
@@ -41,6 +42,11 @@ class Question:
     def actions(self) -> tuple[str, ...]:
         """What the answer chooses from."""
         return self.scenario.actions
+
+    @property
+    def read_out(self) -> tuple[Mapping[str, str], ...]:
+        """The chat messages that ask for a letter."""
+        return in_mode("readout", self.prompt, self.messages, self.graph["role"], self.actions)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:

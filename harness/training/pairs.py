@@ -14,6 +14,7 @@ import numpy as np
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
+from harness.evaluate.agent import in_mode
 from harness.evaluate.fusion import messages_of
 from harness.prompts import readout
 from harness.prompts.versions import as_it_was
@@ -89,10 +90,10 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
             agent = run.agent(one)
             prompt = prompts[agent["prompt"]["version"]]
             q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
-            messages, said = q.messages, answer(prompt, q.graph, q.label, q.actions)
+            messages = in_mode(agent["answer"], prompt, q.messages, q.graph["role"], q.actions)
+            said = answer(prompt, q.graph, q.label, q.actions)
             if agent["answer"] == "readout":
                 said = readout.letters(q.actions)[int(q.label.argmax())]
-                messages = readout.asked(messages, q.actions)
             seed = int(scene.record["episode_seed"])
             yield {
                 "prompt": messages, "completion": [{"role": "assistant", "content": said}],

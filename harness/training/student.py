@@ -47,7 +47,7 @@ class Student:
         for q in questions:
             letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=q.label)]
             said = f"{letter}: {evidence(q.graph)}{END}"
-            samples.append(self._sample(readout.asked(q.messages, q.actions), said, q.label))
+            samples.append(self._sample(q.read_out, said, q.label))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
@@ -171,7 +171,7 @@ class Student:
         file = self.work / "tokenizer.json"
         if not file.is_file():
             some = self.some(self.questions, 5000)
-            texts = ["".join(chat(readout.asked(q.messages, q.actions))) for q in some]
+            texts = ["".join(chat(q.read_out)) for q in some]
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts).save(str(file))
         return Tokenizer.from_file(str(file))

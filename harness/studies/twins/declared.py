@@ -191,7 +191,12 @@ def _in_feet(key: str, value: Any) -> Any:
 
 
 def _says_units(spec: Spec, role: str) -> bool:
-    """Whether a template has both units, and no number of its own with one, but for the target speeds."""
+    """Whether a template has both units, and no number of its own with one, but for the target speeds.
+
+    The numbers of examples are metres and stay so.
+    """
+    if spec.ego.prompt.examples:
+        return False
     fixed = PLACEHOLDER.sub("", spec.ego.prompt.texts[role]).replace(f"{_speeds(spec, 1.0)} m/s", "m/s")
     return all(re.search(unit, fixed) for unit in ("m/s", r"\bm\b(?!/)")) and not re.search(
         r"\d\s*m\b", fixed
@@ -271,8 +276,14 @@ def _closing(text: str, start: int) -> int:
 def permuted_letters(spec: Spec, request: Request) -> Request:
     """Each letter of a read-out stands for the next action, the first for the last."""
     moved = (*request.actions[-1:], *request.actions[:-1])
-    old, new = (readout.asked([{"content": ""}], of)[0]["content"] for of in (request.actions, moved))
-    return replace(_reworded(request, lambda text: text.replace(old, new)), actions=moved)
+    old, new = (readout.question(of) for of in (request.actions, moved))
+    letters = readout.letters(moved)
+    letter = dict(zip(letters, letters[1:] + letters[:1], strict=True))
+    return replace(
+        # An example's answer is a letter alone.
+        _reworded(request, lambda text: letter.get(text) or text.replace(old, new)),
+        actions=moved,
+    )
 
 
 def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
