@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
 FinishReason = Literal["stop", "length", "error"]
+AGAIN = "#2"  # behind the id of a repair turn's request
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class Request:
     """One question to a small language model.
 
     Attributes:
-        id: unique in a run, `<scene>/<viewer>`.
+        id: unique in a run, `<scene>/<viewer>`; `AGAIN` stands behind that of a repair turn.
         role: which prompt of the version was rendered, and which schema the answer has.
-        messages: chat messages, `{"role": "system" | "user", "content": text}`.
+        messages: chat messages, `{"role": "system" | "user" | "assistant", "content": text}`.
         actions: meta-action names, in the environment's order.
         max_tokens: most tokens the answer may have.
         form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from harness.backends.base import Backend, Completion, Request
+from harness.backends.base import AGAIN, Backend, Completion, Request
 from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card
 from harness.backends.registry import find, open_backend
@@ -15,7 +15,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest, sha256_file
 from harness.runs.folder import Run, read
-from harness.runs.records import BLIND, Answer, Latency
+from harness.runs.records import BLIND, Answer, FirstTurn, Latency
 
 
 def open(card: Card, **_: Any) -> "Replay":
@@ -48,7 +48,7 @@ class Replay:
         self._models: dict[str, Backend] = {}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        known = [self._answers.get(request.id) for request in requests]
+        known = [self._known(request) for request in requests]
         lacking: dict[str, list[Request]] = {}
         for request, answer in zip(requests, known, strict=True):
             if answer is None:
@@ -61,6 +61,11 @@ class Replay:
             for request, answer in zip(requests, known, strict=True)
         ]
 
+    def _known(self, request: Request) -> Answer | None:
+        """The answer that the run has to a request; of a repair turn, where it has one."""
+        answer = self._answers.get(request.id.removesuffix(AGAIN))
+        return answer if answer and (answer.first or not request.id.endswith(AGAIN)) else None
+
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """The model that answered in a role. Raises UserError where it cannot be asked what the run lacks."""
         manifest, shown = self._run.manifest, printable(self._run.path)
@@ -68,8 +73,9 @@ class Replay:
         for request in requests:
             # A run has an answer wherever an episode begins, if it has the episode; blind ones it may lack.
             begins = _step(request.id) == "0" and not request.id.endswith(BLIND)
-            other = begins or _episode(request.id) not in self._episodes
-            if other or "+" in request.id or (role == "helper" and len(manifest.helpers) > 1):
+            again = request.id.endswith(AGAIN)  # after an answer that is read otherwise than it was
+            other = begins or _episode(request.id) not in self._episodes or "+" in request.id
+            if (other and not again) or (role == "helper" and len(manifest.helpers) > 1):
                 raise UserError(
                     f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
                     + (", whose conditions delivered the same messages" if "+" in request.id else "")
@@ -108,17 +114,19 @@ class Replay:
     def _completion(self, request: Request, answer: Answer) -> Completion:
         agent = self._run.agent(answer)
         self._check(request, agent)
-        if answer.prompt_sha256 != digest(request.messages):
+        again = request.id.endswith(AGAIN)
+        if answer.prompt_sha256 != digest(request.messages[: -2 if again else None]):
             raise UserError(
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "
                 "replay it with that run's --prompt and --dataset"
             )
-        return Completion(
+        whole = Completion(
             request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,
             answer.finish_reason, answer.seconds, answer.batch_size, answer.error,  # type: ignore[arg-type]
             answer.label_mass, answer.retries, answer.cached, answer.slow_s, answer.first_token_s,
             answer.token_s,
         )  # fmt: skip
+        return _turn(whole, answer.first, again) if answer.first else whole
 
     def latency(self) -> Latency:
         return self._run.manifest.latency
@@ -129,6 +137,22 @@ class Replay:
             "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
         }  # fmt: skip
+
+
+def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:
+    """One of the two turns of an answer: the second, or the first."""
+    took = ("prompt_tokens", "completion_tokens", "seconds", "slow_s")
+    of_first = {name: getattr(first, name) for name in took}
+    if not again:
+        return replace(
+            whole, text=first.raw, finish_reason=first.finish_reason,  # type: ignore[arg-type]
+            error=None, retries=0, **of_first,
+        )  # fmt: skip
+    both = {name: getattr(whole, name) for name in took}
+    rest: dict[str, Any] = {
+        n: None if both[n] is None or of_first[n] is None else both[n] - of_first[n] for n in took
+    }
+    return replace(whole, **rest)
 
 
 def _episode(scene: str) -> str:

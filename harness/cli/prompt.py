@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from harness.prompts.difference import TextChange
 
 FUSION = "fusion"  # the ego's call with messages
+REPAIR = "repair"  # any of them with the turn that follows an answer that cannot be read
 NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
 COLOURS = {"same": "", "removed": "red", "added": "green"}
 
@@ -120,32 +121,39 @@ def check(
 ) -> None:
     """Render every prompt of every scene and count tokens. Exit code 1 if one is outside the budget.
 
-    The ego's fusion call is rendered with the messages of one helper, of two, and of all.
+    The ego's fusion call is rendered with the messages of one helper, of two, and of all. A repair turn is
+    counted with the longest answer that a role may give.
     """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
     from harness.evaluate.agent import example_actions
     from harness.prompts import versions as prompts
-    from harness.prompts.densest import densest_messages
+    from harness.prompts.densest import densest_messages, densest_repair
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
+    words = data.scenario.prompt_words
     scenes = data.scenes(data.courses())
     count = counter(tokenizer)
     for role in prompts.ROLES:
         example_actions(prompt, role, data.actions)
     least, most = prompt.token_budget
-    sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION)}
+    sizes: dict[str, list[int]] = {role: [] for role in (*prompts.ROLES, FUSION, REPAIR)}
+    turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}
+    added = {role: count(turn) for role, turn in turns.items()} if count else {}
     outside: list[dict[str, Any]] = []
 
     def render(scene: "Scene", viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
         graph = scene.record["graphs"][viewer]
-        rendered = prompt.render(graph, data.actions, messages, data.scenario.prompt_words)
-        if count:
-            n = count(rendered)
-            sizes[FUSION if messages else graph["role"]].append(n)
-            if not least <= n <= most:
-                at = {"scene": scene.id, "viewer": viewer, "messages": len(messages), "tokens": n}
-                outside.append(at)
+        role, rendered = graph["role"], prompt.render(graph, data.actions, messages, words)
+        if not count:
+            return
+        n = count(rendered)
+        calls = {FUSION if messages else role: n, **({REPAIR: n + added[role]} if role in added else {})}
+        for call, tokens in calls.items():
+            sizes[call].append(tokens)
+            if not least <= tokens <= most:
+                at = {"scene": scene.id, "viewer": viewer, "messages": len(messages), "call": call}
+                outside.append({**at, "tokens": tokens})
 
     with bar("scenes", len(scenes), as_json) as progress:
         for scene in scenes:
@@ -173,7 +181,8 @@ def check(
             typer.echo(f"outside the budget: {len(outside)} of {total} prompts; the first are")
         for o in outside[:10]:
             heard = f" with messages of {o['messages']}" if o["messages"] else ""
-            typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}: {o['tokens']} tokens")
+            repair = " with a repair turn" if o["call"] == REPAIR else ""
+            typer.echo(f"scene {o['scene']} viewer {o['viewer']}{heard}{repair}: {o['tokens']} tokens")
     if outside:
         raise typer.Exit(1)
 

@@ -220,3 +220,7 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterat
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
             yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}"
+        for when in ("at_first", "after_repair"):
+            if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
+                share = Column("", turn.metric, 100, interval=True).cell(turn)
+                yield f"{role} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}"

@@ -16,6 +16,7 @@ from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
+from harness.evaluate import repair
 from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.spec import Spec
@@ -147,12 +148,25 @@ class Asker:
         for start in range(0, len(asked), size):
             chunk = asked[start : start + size]
             if any(request.id not in self.answers for request in chunk):
-                completions = self._backend().complete(chunk)
-                answers = [answer_of(r, c) for r, c in zip(chunk, completions, strict=True)]
+                answers = self._answered(chunk)
                 self.answers |= {answer.id: answer for answer in answers}
                 if self._kept:
                     _keep(self._kept, answers)
             self._progress(len(chunk))
+
+    def _answered(self, chunk: Sequence[Request]) -> list[Answer]:
+        """An answer each, those that cannot be read after a repair turn if the prompt has one."""
+        backend, words = self._backend(), self.spec.scenario.prompt_words
+        answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
+        owed = {}
+        for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
+            prompt = self.spec.agents[request.agent].prompt
+            if repair.wanted(request, answer, prompt):
+                owed[place] = repair.asked(request, answer, prompt, words)
+        completions = backend.complete(list(owed.values())) if owed else []
+        for place, completion in zip(owed, completions, strict=True):
+            answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
+        return answers
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN for one without a request, or whose answer failed."""

@@ -99,17 +99,18 @@ def as_declared(latency: Latency) -> str:
 def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) -> Floats:
     """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked.
 
-    What an answer is declared to be slower than its card comes on top.
+    A repair turn is one more. What an answer is declared to be slower than its card comes on top.
     """
+    turns = np.array([[a.turns if a else np.nan for a in row] for row in answers])
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
     of_helpers = latency.helpers_s or (latency.helper_s,)
     by_place = [latency.ego_s, *islice(cycle(of_helpers), slow.shape[1] - 1)]
-    return np.asarray(slow + np.array(by_place))
+    return np.asarray(slow + turns * np.array(by_place))
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
     """Seconds of each fusion call, (K,), as `inference_s` has those of the first answers."""
-    return np.array([latency.fusion_s + a.slow_s for a in answers])
+    return np.array([latency.fusion_s * a.turns + a.slow_s for a in answers])
 
 
 def times(answers: Iterable[Answer]) -> dict[str, Times]:

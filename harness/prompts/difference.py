@@ -20,7 +20,7 @@ CONTEXT = 8  # words that are shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
     "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts", "token_budget",
-    "examples",
+    "examples", "repair_turn",
 )  # fmt: skip
 
 

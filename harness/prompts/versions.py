@@ -1,8 +1,8 @@
 """Prompt versions: templates that turn a scene graph into chat messages.
 
 A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
-`user`) and `prompt.toml`; it may have examples, `examples.json`. Released versions are pinned by digest in
-`prompts/released.toml`: a changed text is a new version.
+`user`, and `repair` for a repair turn) and `prompt.toml`; it may have examples, `examples.json`. Released
+versions are pinned by digest in `prompts/released.toml`: a changed text is a new version.
 """
 
 import os
@@ -153,6 +153,19 @@ class Prompt:
         """What every prompt of a role begins with: Jinja's own functions and the template's blocks."""
         return {role: template.new_context() for role, template in self._templates.items()}
 
+    @cached_property
+    def repair_turn(self) -> tuple[str, ...]:
+        """Roles whose template has a block `repair`: an answer that cannot be read is asked for once more."""
+        return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
+
+    def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
+        """What a viewer is told whose answer cannot be read, for the reason `error`."""
+        variables = {"error": error, "actions": actions, "words": words}
+        [text] = self._rendered(
+            role, variables, ("repair",), "its block repair may use error, actions, words"
+        )
+        return text
+
     def render(
         self,
         graph: Graph,
@@ -212,15 +225,24 @@ class Prompt:
             "messages": messages,
             "words": words,
         }
-        template = self._templates[graph["role"]]
+        needs = (
+            "it needs the blocks system and user, and may use graph, actions, objects, more, conflicts, "
+            "messages, words"
+        )
+        return self._rendered(graph["role"], variables, blocks, needs)
+
+    def _rendered(
+        self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str
+    ) -> list[str]:
+        """What a role's blocks say. Raises UserError, which ends with what they need."""
         try:
-            shared = _context(self._contexts[graph["role"]], variables)
+            template, shared = self._templates[role], _context(self._contexts[role], variables)
             return ["".join(template.blocks[block](shared)) for block in blocks]
+        except UserError:
+            raise
         except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
-                f"prompt {self.version} {graph['role']}.j2 does not render: {printable(error)}; "
-                "it needs the blocks system and user, and may use graph, actions, objects, more, "
-                "conflicts, messages, words"
+                f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"
             ) from None
 
 

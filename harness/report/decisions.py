@@ -31,6 +31,7 @@ GOOD, SLOW, BAD, BLAMELESS, ABSENT = "s", "d", "u", "n", "-"
 KEPT = (
     "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
     "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
+    "first_raw", "first_status",
 )  # fmt: skip
 # The same for all decisions of a scene, or known from its outcomes.
 LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")

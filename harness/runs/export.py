@@ -13,7 +13,7 @@ from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
-from harness.runs.records import Answer, Episode
+from harness.runs.records import TURNS, Answer, Episode
 
 AT_ONCE = 10_000  # decisions that are written together
 
@@ -56,7 +56,9 @@ def junit(run: Run, path: Path) -> Path:
 
 def answers_csv(answers: Sequence[Answer], actions: Sequence[str], path: Path) -> Path:
     """A line an answer: the fields of `answers.jsonl`, a column an action for the intent."""
-    plain = [name for name in Answer.__struct_fields__ if name not in ("intent", "message")]
+    plain = [name for name in Answer.__struct_fields__ if name not in ("intent", "message", "first")] + [
+        *TURNS
+    ]
     unknown = [None] * len(actions)
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -2,17 +2,30 @@
 
 from typing import Any, Literal
 
-from msgspec import Struct, field
+from msgspec import UNSET, Struct, UnsetType, field
 
 from harness.core.config import Seconds
 from harness.core.statistics import Estimate
 
 Role = Literal["ego", "helper", "merge", "blind"]
 BLIND = "~blind"  # at the end of an answer's key
+TURNS = ("turns", "first_status", "first_raw")  # what tables say of an answer's turns
+
+
+class FirstTurn(Struct, frozen=True, kw_only=True):
+    """The answer before a repair turn: what was said, how that was parsed, and what it took."""
+
+    raw: str
+    status: str
+    finish_reason: str
+    prompt_tokens: int | None
+    completion_tokens: int | None
+    seconds: float | None
+    slow_s: float
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """One answer of a model: a line of `answers.jsonl`.
+    """One answer of a model: a line of `answers.jsonl`. Tokens and times are those of a repair turn, too.
 
     Attributes:
         scene: id of the decision point.
@@ -40,6 +53,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         mass: their sum as written; None where none was.
         message: the rest of a helper's answer; None if there is none.
         detail: one sentence for people.
+        first: the answer before a repair turn; unset where there was none.
     """
 
     scene: str
@@ -67,6 +81,22 @@ class Answer(Struct, frozen=True, kw_only=True):
     detail: str
     first_token_s: float | None = None
     token_s: float | None = None
+    first: FirstTurn | UnsetType = UNSET
+
+    @property
+    def turns(self) -> int:
+        """How many questions it took: 2 with a repair turn."""
+        return 2 if self.first else 1
+
+    @property
+    def first_status(self) -> str | None:
+        """How the first turn was parsed, where there were two."""
+        return self.first.status if self.first else None
+
+    @property
+    def first_raw(self) -> str | None:
+        """What the first turn said, where there were two."""
+        return self.first.raw if self.first else None
 
     @property
     def id(self) -> str:

@@ -97,6 +97,14 @@ def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Sco
                 of = np.array([episodes[answer.scene] for answer in given])
                 yield Score.of(ALL, f"{verdict}_rate_{role}", rate_interval(hits, of), "answers")
     for role, given in by_role.items():
+        if any(answer.turns > 1 for answer in given):
+            of = np.array([episodes[answer.scene] for answer in given])
+            after = np.array([answer.verdict != "failed" for answer in given])
+            before = after & np.array([answer.turns == 1 for answer in given])
+            for when, hits in (("at_first", before), ("after_repair", after)):
+                estimate = rate_interval(hits.astype(float), of)
+                yield Score.of(ALL, f"valid_{when}_rate_{role}", estimate, "answers")
+    for role, given in by_role.items():
         for what in ("prompt_tokens", "completion_tokens", "label_mass"):
             counts = [
                 (value, episodes[answer.scene])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from harness.runs.folder import Run, read, whole
-from harness.runs.records import Answer
+from harness.runs.records import TURNS, Answer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +62,8 @@ class Tables:
         answers, actions = self._run.answers, self.config["actions"]
         columns = {
             name: [getattr(answer, name) for answer in answers]
-            for name in Answer.__struct_fields__ if name not in ("heard", "repairs", "intent", "message")
+            for name in (*Answer.__struct_fields__, *TURNS)
+            if name not in ("heard", "repairs", "intent", "message", "first")
         }  # fmt: skip
         unknown = (np.nan,) * len(actions)
         intents = np.array([answer.intent or unknown for answer in answers]).reshape(-1, len(actions))

@@ -54,7 +54,8 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
     h("div", { class: "pair" },
       h("div", {},
         h("small", {}, answer.spans.length ? "raw answer; marked: what was read" : "raw answer"),
-        highlighted(answer.raw, answer.spans)),
+        highlighted(answer.raw, answer.spans),
+        answer.first_status ? [h("small", {}, `before the repair turn: ${answer.first_status}`), h("pre", {}, answer.first_raw)] : null),
       h("div", {},
         h("small", {}, "as read"), h("p", {}, distribution(actions, answer.intent)),
         answer.mass != null && Math.abs(answer.mass - 1) > 1e-3
