@@ -35,7 +35,7 @@ FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
-OF_A_CROSSING = frozenset({"v1", "v2", "v3", "paper"})  # shipped versions that speak of nothing else
+OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions that speak of nothing else
 LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
 
 WIDE = re.compile(r"\d{3}|\*")  # in a format: a hundred characters or more, or a width from elsewhere

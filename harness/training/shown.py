@@ -24,8 +24,9 @@ def examples(
     """So many examples for each role, each from a layout of its own, the layout seeds from `first_seed` on.
 
     Of a layout's decision points, one is taken whose best action the role's examples have shown least so far,
-    the most careful of such actions first; a keyed draw decides between equals. A layout in which nothing is
-    safe is passed over, and so are a few whose best actions have all been shown oftener than others.
+    the most careful of such actions first, and whose viewer sees a conflict, so that there is a reason to be
+    seen; a keyed draw decides between equals. A layout in which nothing is safe is passed over, and so are a
+    few whose best actions have all been shown oftener than others.
 
     Args:
         prompt: the version, whose form of answer they have.
@@ -72,6 +73,6 @@ def _pick(
     ]  # fmt: skip
     order = noise.generator("examples", role, seed).permutation(len(every)).tolist()
     best: tuple[dict[str, Any], Floats, int] = min(
-        (every[n] for n in order), key=lambda one: (times[one[2]], one[2])
+        (every[n] for n in order), key=lambda one: (times[one[2]], one[2], not one[0]["conflicts"])
     )
     return best

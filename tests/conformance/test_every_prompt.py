@@ -13,7 +13,8 @@ def test_it_renders_every_graph_of_the_dataset_the_same_each_time(version: str, 
     for scene in scenes_of(small):
         for graph in scene.record["graphs"].values():
             messages = prompt.render(graph, small.actions, (), small.scenario.prompt_words)
-            assert [m["role"] for m in messages] == ["system", "user"]
+            shown = len(prompt.examples.of(graph["role"])) if prompt.examples else 0
+            assert [m["role"] for m in messages] == ["system", *["user", "assistant"] * shown, "user"]
             assert all(m["content"].strip() for m in messages)
             assert prompt.render(graph, small.actions, (), small.scenario.prompt_words) == messages
 
