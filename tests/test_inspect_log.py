@@ -24,7 +24,7 @@ HOSTILE = "# no JSON <img src=x onerror=alert(1)> \x1b[31m"
 @pytest.fixture(scope="module")
 def run(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One helper's answer cannot be read; the ego gives success away at one point, in one seed of two."""
-    spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), seeds=(0, 1))
+    spec = spec_of(small, prompt="v6", points=(POINTS["single-local"], POINTS["6g"]), seeds=(0, 1))
     done = evaluate(spec, tmp_path_factory.mktemp("inspect") / "run").out
     first = rows_of(done)[0]["scene"]
 
@@ -72,7 +72,7 @@ def test_a_sample_is_an_answer_with_its_prompt_and_scores(file: str, run: Path, 
 
 def test_the_header_says_who_answered_what_and_what_came_out(run: Path, harness: Harness) -> None:
     log = log_of(run, harness)
-    assert (log.status, log.eval.task, log.eval.model) == ("success", "small v2", "proxy/proxy")
+    assert (log.status, log.eval.task, log.eval.model) == ("success", "small v6", "proxy/proxy")
     assert log.eval.task_args["prompt"]["version"] == "v2"
     assert log.eval.viewer.trust_content is False
     scores = {score.name: score.metrics for score in log.results.scores}

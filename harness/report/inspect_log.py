@@ -23,7 +23,9 @@ from harness.runs.records import Answer, FrozenScenes
 
 VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
 STOPS = {"stop": "stop", "length": "max_tokens"}
-SPOKEN = {"system": model.ChatMessageSystem, "user": model.ChatMessageUser}
+SPOKEN = {
+    "system": model.ChatMessageSystem, "user": model.ChatMessageUser, "assistant": model.ChatMessageAssistant,
+}  # fmt: skip
 
 
 def write(run: Run, path: Path) -> Path:
