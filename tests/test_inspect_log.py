@@ -73,7 +73,7 @@ def test_a_sample_is_an_answer_with_its_prompt_and_scores(file: str, run: Path, 
 def test_the_header_says_who_answered_what_and_what_came_out(run: Path, harness: Harness) -> None:
     log = log_of(run, harness)
     assert (log.status, log.eval.task, log.eval.model) == ("success", "small v6", "proxy/proxy")
-    assert log.eval.task_args["prompt"]["version"] == "v2"
+    assert log.eval.task_args["prompt"]["version"] == "v6"
     assert log.eval.viewer.trust_content is False
     scores = {score.name: score.metrics for score in log.results.scores}
     for score in read(run).scores:

@@ -141,18 +141,15 @@ class Replay:
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:
     """One of the two turns of an answer: the second, or the first."""
-    took = ("prompt_tokens", "completion_tokens", "seconds", "slow_s")
-    of_first = {name: getattr(first, name) for name in took}
-    if not again:
-        return replace(
-            whole, text=first.raw, finish_reason=first.finish_reason,  # type: ignore[arg-type]
-            error=None, retries=0, **of_first,
-        )  # fmt: skip
-    both = {name: getattr(whole, name) for name in took}
-    rest: dict[str, Any] = {
-        n: None if both[n] is None or of_first[n] is None else both[n] - of_first[n] for n in took
-    }
-    return replace(whole, **rest)
+    took: dict[str, Any] = {}
+    for name in ("prompt_tokens", "completion_tokens", "seconds", "slow_s"):
+        both, of_first = getattr(whole, name), getattr(first, name)
+        rest = None if both is None or of_first is None else both - of_first
+        took[name] = rest if again else of_first
+    if again:
+        return replace(whole, **took)
+    reason: Any = first.finish_reason
+    return replace(whole, text=first.raw, finish_reason=reason, error=None, retries=0, **took)
 
 
 def _episode(scene: str) -> str:

@@ -13,6 +13,7 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.core import extras, resources
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import write_whole
 from harness.core.seeds import FIRST
 
 if TYPE_CHECKING:
@@ -92,12 +93,12 @@ def examples(
     first_seed: Annotated[int, typer.Option(help="Layout seed of the first.")] = FIRST["train"],
 ) -> None:
     """Give a draft examples: earlier turns of the chat, from train seeds, answered as the trees ask for."""
-    from harness.prompts import examples as files
     from harness.prompts import versions as prompts
+    from harness.prompts.examples import EXAMPLES, text_of
 
     extras.need("harness prompt examples", "highway_env")
     draft, of = prompts.load(version), ready_to_drive(scenario, count, first_seed, 1, "--count")
-    file = prompts.folder(version) / files.EXAMPLES
+    file = resources.find("prompts", version) / EXAMPLES
     if draft.released:
         raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
     if draft.examples:
@@ -108,7 +109,7 @@ def examples(
 
     with bar("drawing layouts", count) as progress:
         drawn = shown.examples(draft, of, count, first_seed, progress)
-    files.write(drawn, file.parent)
+    write_whole(file, text_of(drawn))
     typer.echo(f"wrote {printable(file)}: {drawn}")
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from msgspec import structs
 
 from harness.backends.base import AGAIN, Request
+from harness.parsing.status import Status
 from harness.prompts.densest import ERROR_CHARS
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer, FirstTurn
@@ -19,9 +20,11 @@ _CONTROL = re.compile(r"[<＜](?=\S)|[\[［](?=/?[A-Za-z])")
 def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
     """Whether an answer is asked for again: a model wrote it freely, and no intent can be read in it."""
     return (
-        request.answer == "json" and answer.verdict == "failed" and answer.error is None
-        and answer.finish_reason != "error" and request.role in prompt.repair_turn
-    )  # fmt: skip
+        request.answer == "json"
+        and request.role in prompt.repair_turn
+        and answer.verdict == "failed"
+        and answer.status != Status.ENGINE_ERROR
+    )
 
 
 def asked(request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]) -> Request:

@@ -4,7 +4,6 @@ They lie in a version's `examples.json`. Their layouts have train seeds, so that
 a model was shown.
 """
 
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,7 +11,7 @@ from msgspec import Struct
 
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_bytes, write_whole
+from harness.core.files import sha256_bytes
 from harness.core.seeds import FIRST
 from harness.dataset.schema import Graph
 
@@ -97,12 +96,6 @@ def _check(example: Example, role: str, what: str) -> None:
     convert(example.graph, Graph, f"{what}: its graph")
     if example.graph["role"] != role:
         raise UserError(f"{what} has the graph of a viewer whose role is {example.graph['role']}")
-
-
-def write(examples: Examples, folder: Path) -> Path:
-    """Write a version's examples."""
-    write_whole(folder / EXAMPLES, text_of(examples))
-    return folder / EXAMPLES
 
 
 def text_of(examples: Examples) -> str:

@@ -235,11 +235,10 @@ class Prompt:
         self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str
     ) -> list[str]:
         """What a role's blocks say. Raises UserError, which ends with what they need."""
+        template, empty = self._templates[role], self._contexts[role]
         try:
-            template, shared = self._templates[role], _context(self._contexts[role], variables)
+            shared = _context(empty, variables)
             return ["".join(template.blocks[block](shared)) for block in blocks]
-        except UserError:
-            raise
         except Exception as error:  # a template is its author's program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"
@@ -336,11 +335,6 @@ def lock(version: str, where: Path | None = None) -> str:
     lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
     write_whole(base / "released.toml", head + "".join(lines))
     return prompt.sha256
-
-
-def folder(version: str) -> Path:
-    """Where a version's files lie."""
-    return _base(version, None) / version
 
 
 def _base(version: str, where: Path | None) -> Path:

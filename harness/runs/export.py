@@ -56,9 +56,8 @@ def junit(run: Run, path: Path) -> Path:
 
 def answers_csv(answers: Sequence[Answer], actions: Sequence[str], path: Path) -> Path:
     """A line an answer: the fields of `answers.jsonl`, a column an action for the intent."""
-    plain = [name for name in Answer.__struct_fields__ if name not in ("intent", "message", "first")] + [
-        *TURNS
-    ]
+    fields = (*Answer.__struct_fields__, *TURNS)
+    plain = [name for name in fields if name not in ("intent", "message", "first")]
     unknown = [None] * len(actions)
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

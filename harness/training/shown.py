@@ -48,7 +48,9 @@ def examples(
                 f"{FIRST['report'] - 1}"
             )
         if points := drawn(scenario, seed, 0):
-            picked = {role: _pick(points, role, times[role], seed) for role in ROLES}
+            picked = {
+                role: one for role in ROLES if (one := _pick(points, role, times[role], seed)) is not None
+            }
             rare = all(times[role][best] == min(times[role]) for role, (_, _, best) in picked.items())
             if rare or passed == PATIENCE:
                 for role, (graph, label, best) in picked.items():
@@ -65,14 +67,17 @@ def examples(
 
 def _pick(
     points: list[dict[str, Any]], role: str, times: list[int], seed: int
-) -> tuple[dict[str, Any], Floats, int]:
-    """The scene graph that is shown, its soft label (A,), and its best action by number."""
+) -> tuple[dict[str, Any], Floats, int] | None:
+    """The scene graph that is shown, its soft label (A,), and its best action by number.
+
+    None where nobody has the role.
+    """
     every = [
         (graph, label := np.array(point["label"]), int(label.argmax()))
         for point in points for graph in point["moment"]["graphs"].values() if graph["role"] == role
     ]  # fmt: skip
     order = noise.generator("examples", role, seed).permutation(len(every)).tolist()
-    best: tuple[dict[str, Any], Floats, int] = min(
-        (every[n] for n in order), key=lambda one: (times[one[2]], one[2], not one[0]["conflicts"])
-    )
-    return best
+    return min(
+        (every[n] for n in order), default=None,
+        key=lambda one: (times[one[2]], one[2], not one[0]["conflicts"]),
+    )  # fmt: skip
