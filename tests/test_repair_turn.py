@@ -200,13 +200,14 @@ def test_what_is_wrong_is_quoted_as_text_too(small: Dataset) -> None:
 def test_tokens_and_seconds_are_those_of_both_turns(small: Dataset) -> None:
     ego = f"{all_scenes(small)[0].id}/v1"
     backend = Scripted({
-        ego: said(ego, BAD, retries=1, slow_s=0.4),
-        ego + AGAIN: said(ego, GOOD, prompt_tokens=360, seconds=0.7),
+        ego: said(ego, BAD, retries=1, slow_s=0.4, first_token_s=0.2, token_s=0.01),
+        ego + AGAIN: said(ego, GOOD, prompt_tokens=360, seconds=0.7, first_token_s=0.3, token_s=0.01),
     })  # fmt: skip
     _, asker = asked(with_repair(spec_of(small)), backend, small)
     answer = asker.answers[ego]
     took = (answer.prompt_tokens, answer.completion_tokens, answer.seconds, answer.retries, answer.slow_s)
     assert took == (660, 40, 1.2, 1, 0.4)
+    assert (answer.first_token_s, answer.token_s) == (None, None), "those are of one question"
     first = answer.first
     assert first
     assert (first.prompt_tokens, first.completion_tokens, first.seconds, first.slow_s) == (300, 20, 0.5, 0.4)

@@ -46,7 +46,10 @@ def as_text(text: str) -> str:
 
 
 def together(first: Answer, second: Answer) -> Answer:
-    """The second turn's answer, with the first's text, and with what both took."""
+    """The second turn's answer, with the first's text, and with what both took.
+
+    Times to and between tokens are of one question, and so of neither.
+    """
     turn = FirstTurn(**{name: getattr(first, name) for name in FirstTurn.__struct_fields__})
     return structs.replace(
         second, first=turn,
@@ -54,6 +57,7 @@ def together(first: Answer, second: Answer) -> Answer:
         completion_tokens=_sum(first.completion_tokens, second.completion_tokens),
         seconds=_sum(first.seconds, second.seconds), slow_s=first.slow_s + second.slow_s,
         retries=first.retries + second.retries, cached=first.cached and second.cached,
+        first_token_s=None, token_s=None,
     )  # fmt: skip
 
 

@@ -43,7 +43,8 @@ class Answer(Struct, frozen=True, kw_only=True):
         retries: attempts that failed before this one.
         cached: it comes from the cache.
         slow_s: seconds that it is declared to take beyond its card's latency.
-        first_token_s: time to its first token, prefill included; None where `seconds` is, or not known.
+        first_token_s: time to its first token, prefill included; None where `seconds` is, or not known, or
+            after a repair turn.
         token_s: time of each token after the first; None where `first_token_s` is, or there is none.
         prompt_sha256: digest of the chat messages.
         status: the parser's one outcome (`harness.parsing.status`).
