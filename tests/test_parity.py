@@ -1,5 +1,6 @@
 """`harness parity` on a tiny Qwen3: a GGUF file of the same weights, and one of others."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -92,3 +93,10 @@ def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, 
         "FAIL GGUF: greedy text equal", "FAIL GGUF: largest difference of a read-out",
     ]  # fmt: skip
     assert lines[-1] == f"the engines differ: {PROMPTS} prompts; measured, and what is allowed"
+
+
+def test_a_version_with_examples_is_compared_too(tiny: Path, small_path: Path) -> None:
+    arguments = ["parity", str(tiny), "--dataset", str(small_path), "--prompts", "2", "--prompt", "v6"]
+    said = CliRunner().invoke(app, [*arguments, "--json"])
+    assert said.exception is None or isinstance(said.exception, SystemExit)
+    assert len(json.loads(said.stdout)["findings"]) == 10

@@ -26,7 +26,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show what moved answers: leave out one object or message a time.
+    """Show what moved answers, by leaving things out one by one.
 
     The run's model is asked what the run has not, once. `harness report` then shows it at each decision.
     """

@@ -90,7 +90,7 @@ def show(
         False, "--camera", help="What its cameras see, the front above the rear, as a .png."
     ),
 ) -> None:
-    """Draw a scene from above, with what one vehicle sees of it, or as its cameras see it."""
+    """Draw a scene from above, or as the cameras of a vehicle see it."""
     from io import BytesIO
 
     from harness.core.files import write_whole

@@ -1,7 +1,8 @@
 """`harness parity`: one model through two engines."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from math import isfinite
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -10,6 +11,9 @@ from harness.cli.estimates import echo_json
 from harness.cli.progress import bar
 from harness.core import resources
 from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.backends.base import AnswerMode, Request
 
 
 def command(
@@ -22,13 +26,12 @@ def command(
     """Compare a model's answers on transformers and llama.cpp. Exit code 1 if they differ too much."""
     from harness.backends import cards
     from harness.backends.registry import missing
-    from harness.coordination.operating_point import POINTS
     from harness.dataset import load
     from harness.evaluate.agent import Agent
     from harness.evaluate.asking import requests
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
-    from harness.prompts import readout, versions
+    from harness.prompts import versions
     from harness.training.parity import PASSES, compare
 
     if prompts < 1:
@@ -40,10 +43,14 @@ def command(
                 f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
             )
     data = load.load(load.find(dataset))
-    spec = Spec(Agent(reference, versions.load(prompt)), FrozenSource(data), tuple(POINTS.values()), (0,))
-    asked = list(requests(spec, data.scenes(data.courses())))
-    asked = asked[:: max(1, len(asked) // prompts)][:prompts]
-    letters = [replace(r, messages=readout.asked(r.messages, r.actions), answer="readout") for r in asked]
+    scenes = data.scenes(data.courses())
+
+    def some(answer: "AnswerMode") -> "list[Request]":
+        agent = Agent(reference, versions.load(prompt), answer)
+        asked = list(requests(Spec(agent, FrozenSource(data), (), (0,)), scenes))
+        return asked[:: max(1, len(asked) // prompts)][:prompts]
+
+    asked, letters = some("json"), some("readout")
     with bar(f"comparing {printable(reference.name, 30)}", PASSES, as_json) as progress:
         findings = compare(reference, gguf, asked, letters, progress)
     holds = all(finding.holds for finding in findings)

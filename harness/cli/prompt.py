@@ -92,7 +92,7 @@ def examples(
     count: Annotated[int, typer.Option(help="How many for each role, each of a layout of its own.")] = 2,
     first_seed: Annotated[int, typer.Option(help="Layout seed of the first.")] = FIRST["train"],
 ) -> None:
-    """Give a draft examples: earlier turns of the chat, from train seeds, answered as the trees ask for."""
+    """Give a draft earlier turns, answered as the trees ask for."""
     from harness.prompts import versions as prompts
     from harness.prompts.examples import EXAMPLES, text_of
 
