@@ -63,7 +63,9 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
     for name, value in manifest.parameters.items():
         if name not in expected:
             yield f"[parameters]: {unknown('parameter', name, expected)}"
-        elif isinstance(value, list) != isinstance(expected[name], tuple):
+        elif any(
+            isinstance(value, a) != isinstance(expected[name], b) for a, b in ((list, tuple), (str, str))
+        ):
             yield f"[parameters]: {name} = {value}; wanted is a value such as {expected[name]}"
     if missing := scenario.parameters.stated().keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"

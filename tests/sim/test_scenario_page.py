@@ -22,8 +22,9 @@ def test_the_pages_table_has_every_parameter_with_its_value(name):
     rows = dict(line.strip("| ").split(" | ")[:2] for line in page.splitlines() if line.count(" | ") == 2)
     stated = {name.strip("`"): value for name, value in rows.items() if name.startswith("`")}
     values = {
-        name: ", ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}"
-        for name, value in asdict(parameters).items()
+        name: ", ".join(v if isinstance(v, str) else f"{v:g}" for v in value)
+        for name, stated_value in asdict(parameters).items()
+        for value in [stated_value if isinstance(stated_value, tuple) else (stated_value,)]
         if name in type(parameters).__annotations__ or page == PAGE
     }
     assert stated == values
