@@ -207,10 +207,16 @@ def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tu
 
 
 def _building(name: str, corners: Floats) -> Box:
+    return Box(name, corners, BUILDING_M, *_building_walls())
+
+
+@lru_cache(maxsize=1)
+def _building_walls() -> tuple[Pixels, Lit]:
+    """What is painted on any building from the ground up, of which nothing shines."""
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = WALL
     walls[:, ::6] = BRICK
-    return Box(name, corners, BUILDING_M, walls, np.zeros(walls.shape[:-1], dtype=bool))
+    return walls, np.zeros(walls.shape[:-1], dtype=bool)
 
 
 def _paint(
