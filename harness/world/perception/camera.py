@@ -21,7 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import sha256_bytes
 from harness.world.ambient import AMBIENTS, DAY, Ambient, Colour, sun_rad
-from harness.world.perception.rays import meetings, sweep
+from harness.world.perception.rays import meetings, sweep, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
 from harness.world.road import NORTH
 from harness.world.scenario import Scenario
@@ -262,8 +262,7 @@ def _hazy(colours: Floats, depth_m: Floats, ambient: Ambient) -> Floats:
 
 def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
     """One camera's pixels with the sun at this angle to the right of its middle."""
-    off = np.arctan((np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX) - sun_rad
-    off = (off + np.pi) % (2 * np.pi) - np.pi
+    off = turned(np.arctan((np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX) - sun_rad)
     clear = (1 - np.exp(-((off / ambient.glare_rad) ** 2)))[:, None]
     return np.asarray(clear * pixels + (1 - clear) * np.array(GLARE)).astype(np.uint8)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,11 @@ class Sweep:
     bearing_rad: Floats
     range_m: Floats
     hits: dict[str, NDArray[np.intp]]
+
+
+def turned(angle_rad: Any) -> Any:
+    """The same angle, or angles, from -pi to pi."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.core import noise
 from harness.world.ambient import AMBIENTS, DAY, Ambient, sun_rad
-from harness.world.perception.rays import Sweep
+from harness.world.perception.rays import Sweep, turned
 from harness.world.state import VehicleState, WorldState
 
 LIDAR_RANGE_M, RADAR_RANGE_M = 80.0, 150.0
@@ -71,7 +71,7 @@ def detect(
 def _fused(state: WorldState, viewer: VehicleState, v: VehicleState, ambient: Ambient) -> Detection | None:
     dx, dy = v.x_m - viewer.x_m, v.y_m - viewer.y_m
     distance, bearing = float(np.hypot(dx, dy)), float(np.arctan2(dy, dx))
-    off_axis = abs((bearing - viewer.heading_rad + np.pi) % (2 * np.pi) - np.pi)
+    off_axis = abs(turned(bearing - viewer.heading_rad))
     in_field = min(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
     seen = {
         "camera": in_field and distance <= ambient.camera_m and not _dazzled(state, bearing, ambient),
@@ -116,5 +116,4 @@ def _dazzled(state: WorldState, bearing_rad: float, ambient: Ambient) -> bool:
     """Whether the sun shines into a camera from there."""
     if not ambient.glare_rad:
         return False
-    off = (bearing_rad - sun_rad(state.episode_seed) + np.pi) % (2 * np.pi) - np.pi
-    return bool(abs(off) < ambient.glare_rad)
+    return bool(abs(turned(bearing_rad - sun_rad(state.episode_seed))) < ambient.glare_rad)
