@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.dataset.load import Dataset, Scene, find, load
 from harness.dataset.suites import named
-from harness.world.perception.camera import HEIGHT, WIDTH, frame
+from harness.world.perception.camera import SIZE_PX, frame
 from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import detect
 
@@ -70,7 +70,7 @@ def measured(dataset: Dataset, scenes: list[Scene]) -> tuple[list[float], int]:
 def limit(repeats: int = 50) -> float:
     """CPU milliseconds to write a frame's pixels from a table."""
     table = np.random.default_rng(0).integers(0, 256, (1000, 3), dtype=np.uint8)
-    which = np.random.default_rng(1).integers(0, 1000, (HEIGHT, WIDTH))
+    which = np.random.default_rng(1).integers(0, 1000, SIZE_PX[::-1])
     begun_s = process_time()
     for _ in range(repeats):
         table[which]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from harness.core.errors import UserError
-from harness.core.png import png
+from harness.core.image import Image
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load
 from harness.world import scenarios
@@ -19,11 +19,10 @@ from harness.world.perception.camera import (
     AMBER,
     BRAKE_LAMP,
     EYE_M,
-    FOCAL_PX,
-    HEIGHT,
     HORIZON,
-    WIDTH,
+    SIZE_PX,
     Frame,
+    focal_px,
     frame,
 )
 from harness.world.perception.graph import scene_graph
@@ -32,6 +31,8 @@ from harness.world.perception.sensors import HALF_FIELD_RAD, LEAST_RAYS, detect
 from harness.world.state import VehicleState, WorldState
 
 DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/manifest.json"))
+WIDTH, HEIGHT = SIZE_PX
+FOCAL_PX = focal_px(WIDTH)
 SCENES = 12  # of each dataset, four viewers each
 ROAD = scenarios.get("hard-brake-ahead")
 
@@ -197,6 +198,6 @@ def test_a_light_that_there_is_not_is_refused():
 def test_a_picture_is_a_png_of_the_same_pixels():
     image = pytest.importorskip("PIL.Image")
     pixels = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0)).pixels
-    read = image.open(BytesIO(png(pixels)))
+    read = image.open(BytesIO(Image(pixels).png()))
     assert np.array_equal(np.asarray(read), pixels)
     assert read.mode == "RGB"

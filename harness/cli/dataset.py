@@ -107,10 +107,9 @@ def show(
         raise unknown(f"viewer of scene {drawn.id}", viewer, drawn.viewers)
     picture = BytesIO()
     if camera:
-        from harness.core.png import png
         from harness.world.perception.camera import frame
 
-        picture.write(png(frame(data.scenario, drawn.state, viewer or drawn.viewers[0]).pixels))
+        picture.write(frame(data.scenario, drawn.state, viewer or drawn.viewers[0]).png())
     else:
         from harness.report.drawing.scene import draw
 

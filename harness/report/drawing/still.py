@@ -17,16 +17,18 @@ from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
 
 from harness.core.errors import printable
+from harness.core.image import Pixels
 from harness.evaluate.replay import Played, Still
 from harness.report.drawing.colours import BAD, GOOD, GREY, INK, LATE, ROLES
 from harness.report.drawing.colours import actions as colours_of
 from harness.report.drawing.geometry import VIEW_M, north_up
 from harness.report.drawing.ground import TEXT_PT, ground
 from harness.report.drawing.scene import style_of
-from harness.world.perception.camera import HEIGHT, WIDTH, Pixels, frame
+from harness.world.perception.camera import SIZE_PX, frame
 from harness.world.state import Building, VehicleState, WorldState
 
 SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
+WIDTH, HEIGHT = SIZE_PX
 CAMERA_IN, CAPTION_PX = WIDTH / DPI, 23
 PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
 

@@ -15,10 +15,10 @@ from PIL import Image
 from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
+from harness.core.image import Pixels
 from harness.evaluate.replay import Played, stills
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas
-from harness.world.perception.camera import Pixels
 from harness.world.perception.graph import scene_graph
 from harness.world.state import WorldState
 

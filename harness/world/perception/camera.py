@@ -19,7 +19,7 @@ from shapely.ops import substring
 
 from harness.core import noise
 from harness.core.arrays import Floats
-from harness.core.files import sha256_bytes
+from harness.core.image import Image, Pixels
 from harness.world.ambient import AMBIENTS, DAY, Ambient, Colour, sun_rad
 from harness.world.perception.rays import meetings, sweep, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
@@ -27,12 +27,10 @@ from harness.world.road import NORTH
 from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
 
-Pixels = NDArray[np.uint8]
 Places = NDArray[np.int16]
 Lit = NDArray[np.bool_]
 
-WIDTH, HEIGHT = 512, 256
-FOCAL_PX = WIDTH / 2 / math.tan(HALF_FIELD_RAD)
+SIZE_PX = (512, 256)  # width and height of both cameras' pictures together
 EYE_M = 1.4  # of a camera above the road
 HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 BUILDING_M = 6.0
@@ -56,23 +54,16 @@ LAMPS = AMBIENTS[DAY]  # light of their own carries as by day
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One picture.
+class Frame(Image):
+    """What the cameras of a vehicle see.
 
     Attributes:
-        pixels: (HEIGHT, WIDTH, 3) red, green and blue.
-        owners: (HEIGHT, WIDTH) place in `ids` of whose pixel it is; -1 for road, grass and sky.
+        owners: (height, width) place in `ids` of whose pixel it is; -1 for road, grass and sky.
         ids: of vehicles and buildings.
     """
 
-    pixels: Pixels
     owners: Places
     ids: tuple[str, ...]
-
-    @property
-    def sha256(self) -> str:
-        """Digest of its size and its pixels, whatever file holds them."""
-        return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
         """Left, top, right and bottom of what each owns in either half, the last two beyond its pixels."""
@@ -86,8 +77,9 @@ class Frame:
         return found
 
 
-def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
-    """What the cameras of one vehicle see."""
+def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX) -> Frame:
+    """What the cameras of one vehicle see, in a picture of this width and height, which is even."""
+    width, height = size_px
     viewer = state.vehicle(viewer_id)
     ambient = scenario.parameters.light
     reported = detect(state, viewer, sweep(state, viewer), ambient)
@@ -95,7 +87,7 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str) -> Frame:
         *(_vehicle(state, state.vehicle(d.id)) for d in reported),
         *(_building(b.id, b.corners()) for b in state.buildings),
     ]
-    halves = [_half(scenario, viewer, boxes, turned) for turned in (0.0, np.pi)]
+    halves = [_half(scenario, viewer, boxes, turned, width, height // 2) for turned in (0.0, np.pi)]
     pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
     if ambient.glare_rad:
         sun = sun_rad(state.episode_seed) - viewer.heading_rad
@@ -125,24 +117,29 @@ class Box:
     lamps: Lit
 
 
+def focal_px(width: int) -> float:
+    """Focal length of a camera whose pictures are so wide."""
+    return width / 2 / math.tan(HALF_FIELD_RAD)
+
+
 def _half(
-    scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float
+    scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float, width: int, rows: int
 ) -> tuple[Pixels, Places]:
-    """Pixels and owners of one camera, (HEIGHT / 2, WIDTH, ...)."""
-    rows, eye = HEIGHT // 2, np.array([viewer.x_m, viewer.y_m])
+    """Pixels and owners of one camera, (rows, width, ...)."""
+    eye, focal = np.array([viewer.x_m, viewer.y_m]), focal_px(width)
     heading = viewer.heading_rad + turned_rad
     ahead, right = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     # A ray of a column goes 1 m ahead, so that its parameter is the depth in metres.
-    across = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX
+    across = (np.arange(width) + 0.5 - width / 2) / focal
     rays = ahead + across[:, None] * right
     below = np.arange(0.5, rows) - HORIZON * rows  # the horizon
     ambient = scenario.parameters.light
     pixels = _background(scenario, eye, rays, below)
-    owners = np.full((rows, WIDTH), NOBODY, dtype=np.int16)
+    owners = np.full((rows, width), NOBODY, dtype=np.int16)
     if not boxes:
         return pixels, owners
     t, along = meetings(eye, rays, np.array([box.corners for box in boxes]))
-    t, along = t.reshape(WIDTH, -1, 4), along.reshape(WIDTH, -1, 4)
+    t, along = t.reshape(width, -1, 4), along.reshape(width, -1, 4)
     wall = t.argmin(axis=2)
     depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
     heights, walls = np.array([box.height_m for box in boxes]), np.array([box.walls for box in boxes])
@@ -157,7 +154,7 @@ def _half(
             continue
         box = place[columns]
         z, side, u = (a[columns, box] for a in (depth, wall, along))
-        height_m = EYE_M - below[:, None] * z / FOCAL_PX  # above the road, of each pixel
+        height_m = EYE_M - below[:, None] * z / focal  # above the road, of each pixel
         row, column = np.nonzero((height_m >= 0) & (height_m < heights[box]))
         onward = np.minimum(u * COLUMNS, COLUMNS - 1).astype(int)
         shades = SHADE[side, None, None] * walls[box, side, :, onward]
@@ -167,7 +164,7 @@ def _half(
             _hazy(ambient.light * shades, z[:, None], ambient),
         ).astype(np.uint8)  # fmt: skip
         up = (height_m[row, column] * (ROWS / heights[box])[column]).astype(int)
-        at = row * WIDTH + columns[column]
+        at = row * width + columns[column]
         pixels.reshape(-1, 3)[at] = strips[column, up]
         owners.reshape(-1)[at] = box[column]
     return pixels, owners
@@ -233,13 +230,13 @@ def _paint(
 
 
 def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) -> Pixels:
-    """Sky and ground, (rows, WIDTH, 3)."""
+    """Sky and ground, (rows, width, 3)."""
     ambient = scenario.parameters.light
     pixels = np.empty((len(below), len(rays), 3), dtype=np.uint8)
     sky = int(np.count_nonzero(below <= 0))
     up = (below[:sky] / below[0])[:, None]
     pixels[:sky] = (up * np.array(ambient.sky) + (1 - up) * np.array(ambient.haze))[:, None]
-    depth_m = EYE_M * FOCAL_PX / below[sky:]
+    depth_m = EYE_M * focal_px(len(rays)) / below[sky:]
     ground = _ground_map(scenario)
     x, y = (
         ((np.multiply.outer(depth_m, rays[:, k]) + (eye[k] + REACH_M)) / CELL_M)
@@ -262,7 +259,8 @@ def _hazy(colours: Floats, depth_m: Floats, ambient: Ambient) -> Floats:
 
 def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
     """One camera's pixels with the sun at this angle to the right of its middle."""
-    off = turned(np.arctan((np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX) - sun_rad)
+    width = pixels.shape[1]
+    off = turned(np.arctan((np.arange(width) + 0.5 - width / 2) / focal_px(width)) - sun_rad)
     clear = (1 - np.exp(-((off / ambient.glare_rad) ** 2)))[:, None]
     return np.asarray(clear * pixels + (1 - clear) * np.array(GLARE)).astype(np.uint8)
 
