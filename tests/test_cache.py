@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from evaluating import Scripted, failed, same_decisions, spec_of
 from hypothesis import given
@@ -23,6 +24,7 @@ from harness.backends.cards import Latency
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
+from harness.core.image import Image
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
@@ -48,6 +50,7 @@ CHANGED: dict[str, Any] = {
     "sample": 1,
     "timed": True,
     "agent": 1,
+    "image": Image(np.zeros((2, 4, 3), dtype=np.uint8)),
     "view": {"nodes": []},
     "truth": {"nodes": []},
     "scenario": SCENARIO,

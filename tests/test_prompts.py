@@ -60,6 +60,9 @@ def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_cou
     prompt = prompts.load(version)
     *_, user = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS, (), CROSSING)
     listed = [v for v in ("v4", "v20", "v21", "v22", "v23") if re.search(rf"^{v}\b", user["content"], re.M)]
+    if version == "v8":  # whose picture is all that it says of others
+        assert not listed
+        return
     assert listed == ["v4", "v20", "v21"][: prompt.max_objects]
     assert re.search(
         rf"{5 - prompt.max_objects} (more )?farther|{5 - prompt.max_objects} more", user["content"]
@@ -106,7 +109,12 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
     seen = graph(role, [node], [{**STANDING, "with": WORDS}])
     messages = ({**MESSAGES[0], "sender": WORDS, "evidence": WORDS},) if role == "ego" else ()
     said = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
-    assert said.count(WORDS) >= 3
+    assert said.count(WORDS) >= {
+        ("ego", "v7"): 2,
+        ("helper", "v7"): 2,
+        ("ego", "v8"): 1,
+        ("helper", "v8"): 0,
+    }.get((role, version), 3)
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
@@ -115,7 +123,7 @@ def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
     said = text_of(
         prompts.load(version).render(graph("ego", [{**CAR, "id": name}], []), ACTIONS, (), CROSSING)
     )
-    assert name in said
+    assert name in said or version == "v8"  # which lists nobody
 
 
 # Section III-C, Prompt Engineering for Multimodal Perception.
@@ -365,6 +373,7 @@ def vocabulary() -> Path:
     return found
 
 
+PICTURE = 128  # tokens, of 512 x 256 pixels with Qwen3-VL and 448 x 224 with Qwen2.5-VL
 # As long as a message may be asked for: twelve words, and long ones.
 LONG = tuple(
     {**MESSAGES[0], "sender": f"v{n}", "risk": "medium", "intent": (0.33, 0.33, 0.34), "confidence": 0.34,
@@ -387,7 +396,7 @@ def test_every_prompt_keeps_its_token_budget(
         for viewer, seen in scene.record["graphs"].items():
             if messages and seen["role"] == "helper":
                 continue
-            n = count(prompt.render(seen, small.actions, messages, CROSSING))
+            n = count(prompt.render(seen, small.actions, messages, CROSSING)) + bool(prompt.image) * PICTURE
             assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
 
 

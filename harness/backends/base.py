@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from harness.core.image import Image
+
 if TYPE_CHECKING:
     from harness.runs.records import Latency
     from harness.world.scenario import Scenario
@@ -39,6 +41,7 @@ class Request:
             for.
         timed: whether it is asked to measure its time: a server streams it then, which shows its first token.
         agent: which of the run's agents is asked: 0 is the ego's.
+        image: the picture before the text of the user's message that asks; None where there is none.
         view: the viewer's own scene graph. Only backends that are no language model read it
             (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
@@ -58,6 +61,7 @@ class Request:
     sample: int = 0
     timed: bool = False
     agent: int = 0
+    image: Image | None = None
     view: Mapping[str, Any] | None = None
     truth: Mapping[str, Any] | None = None
     scenario: "Scenario | None" = None

@@ -9,6 +9,7 @@ from msgspec import Meta
 from harness.backends.failures import Failures
 from harness.backends.registry import engines, find, registrations
 from harness.backends.servers import Server
+from harness.backends.vision import Vision
 from harness.core.config import Count, Seconds, convert, toml
 from harness.core.errors import UserError, printable, unknown
 
@@ -63,6 +64,8 @@ class Card:
         thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
         server: where an `openai` model is asked; None for other engines.
         failures: how often the proxy fails on purpose; None if it never does.
+        vision: how it takes pictures; None if it reads texts alone.
+        projector: name of the GGUF file beside `file` that turns pictures into tokens.
     """
 
     name: str
@@ -84,6 +87,8 @@ class Card:
     thinking_tokens: Count = 2048
     server: Server | None = None
     failures: Failures | None = None
+    vision: Vision | None = None
+    projector: str | None = None
 
 
 @dataclass(frozen=True)
@@ -95,9 +100,20 @@ class _File(Card):
 
 # Keys that mean something to some engines only; a `Registration` says to which.
 _OF_SOME = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation", "failures",
-            "privileged")  # fmt: skip
+            "privileged", "vision", "projector")  # fmt: skip
 # Keys that a model may have anew for each engine that it runs on.
-_ANEW = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation", "server")
+_ANEW = (
+    "latency",
+    "weights",
+    "file",
+    "revision",
+    "sha256",
+    "gated",
+    "dtype",
+    "quantisation",
+    "server",
+    "projector",
+)
 
 
 def read(path: Path) -> list[Card]:
@@ -142,9 +158,14 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
     for key in _OF_SOME:
         lacking = key in engine.required_keys and key not in table
         if lacking or (key in table and key not in engine.allowed_keys):
-            shown = f"[{key}]" if key in ("server", "failures") else key
+            shown = f"[{key}]" if key in ("server", "failures", "vision") else key
             takers = " or ".join(_takers(key))
             raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
+    if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
+        raise UserError(
+            f"{where}: [vision] and projector go together on {card.engine}: give the name of its mmproj "
+            "file, or leave both out"
+        )
     if card.server and card.thinking == "switch" and not card.server.tells_thinking:
         raise UserError(
             f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '

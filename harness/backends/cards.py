@@ -4,12 +4,17 @@ A card is one file, `models/<name>.toml`; `<name>:<engine>` is the same model on
 names. A directory, a GGUF file, a hub id and `replay:RUN_DIR` get a card on the spot.
 """
 
+import json
 import os.path
 import re
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking, read
 from harness.backends.registry import engines
+from harness.backends.vision import Vision, of_checkpoint
+from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.resources import entries, find
 
@@ -86,7 +91,9 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
             raise UserError(
                 f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
             )
-        return _made(f"replay:{run.name}", "replay", str(run), "Answers of a run")
+        return replace(
+            _made(f"replay:{run.name}", "replay", str(run), "Answers of a run"), vision=_stated(run)
+        )
     where = _path(text)
     if where is not None and where.is_dir():
         return _of_directory(text, where, engine)
@@ -108,7 +115,8 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
 def _of_directory(text: str, where: Path, engine: str | None) -> Card:
     files = sorted(where.glob("*.gguf"))
     if (where / "config.json").is_file() and engine != "llama-cpp":
-        return _made(where.name, "transformers", str(where), "Local directory", _thinking(where))
+        card = _made(where.name, "transformers", str(where), "Local directory", _thinking(where))
+        return replace(card, vision=_vision(text, where))
     if len(files) == 1:
         return _made(files[0].stem, "llama-cpp", str(files[0]), "Local GGUF file", _gguf_thinking(files[0]))
     if files:
@@ -136,6 +144,29 @@ def _thinking(checkpoint: Path) -> Thinking:
     """Whether a checkpoint's chat template knows the thinking switch, read without loading it."""
     files = (checkpoint / name for name in _TEMPLATE_FILES)
     return "switch" if any(_SWITCH in f.read_bytes() for f in files if f.is_file()) else "none"
+
+
+def _stated(run: Path) -> Vision | None:
+    """How the model of a run took pictures; None too where nothing can be read, which opening it says."""
+    with suppress(OSError, ValueError, TypeError, KeyError, UserError):
+        stated = json.loads((run / "run.json").read_bytes())["model"]["vision"]
+        return stated and convert(stated, Vision, "vision")
+    return None
+
+
+def _vision(text: str, checkpoint: Path) -> Vision | None:
+    """How a checkpoint takes pictures, by its small files. Raises UserError where they do not say."""
+    try:
+        config, processor = (
+            json.loads(file.read_bytes()) if file.is_file() else {}
+            for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
+        )
+        return of_checkpoint(config, processor)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"model directory {printable(text)!r}: its config does not say how it takes pictures "
+            f"({printable(repr(error), 120)}); write a card with a [vision] for it"
+        ) from None
 
 
 def _gguf_thinking(file: Path) -> Thinking:

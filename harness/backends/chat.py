@@ -8,12 +8,21 @@ from harness.core.errors import UserError, printable
 
 
 class Chat:
-    """A tokenizer that has a chat template."""
+    """A tokenizer that has a chat template.
 
-    def __init__(self, name: str, tokenizer: Any) -> None:
+    Attributes:
+        name: the model's.
+        template: Jinja.
+        image_token: what the template writes for a picture; None if the model takes none.
+    """
+
+    image_token: str | None = None
+
+    def __init__(self, name: str, tokenizer: Any, image_token: str | None = None) -> None:
         self.name = name
         self.tokenizer = tokenizer
         self.template = str(tokenizer.get_chat_template())
+        self.image_token = image_token
 
     @property
     def bos(self) -> int | None:
@@ -34,19 +43,24 @@ class Chat:
         return "always" if prompt.rstrip().endswith("<think>") else "none"
 
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
-        """The prompt as the model reads it. Raises UserError where the template refuses the messages."""
+        """The prompt as the model reads it, `image_token` in the place of a picture.
+
+        Raises:
+            UserError: the template refuses the messages.
+        """
         from jinja2 import TemplateError
 
         switch = {"enable_thinking": thinking} if self._switch else {}
+        shown = in_parts(messages, {"type": "image"}) if self.image_token else list(map(dict, messages))
         try:
-            return self._apply([dict(message) for message in messages], switch)
+            return self._apply(shown, switch)
         except TemplateError as error:
             raise UserError(
                 f"model {self.name!r}: its chat template refuses the messages "
                 f"({printable(error)}); use a prompt with roles that it knows"
             ) from None
 
-    def _apply(self, messages: list[dict[str, str]], switch: Mapping[str, bool]) -> str:
+    def _apply(self, messages: list[dict[str, Any]], switch: Mapping[str, bool]) -> str:
         text: str = self.tokenizer.apply_chat_template(
             messages, tokenize=False, add_generation_prompt=True, **switch
         )
@@ -68,3 +82,16 @@ class Chat:
             self.tokenizer.decode([i], skip_special_tokens=False, clean_up_tokenization_spaces=False)
             for i in ids
         ]
+
+
+def in_parts(messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Messages whose contents are lists of parts, as models that see take them.
+
+    Args:
+        messages: texts of a chat; one with the key `image` has the picture before its text.
+        picture: that part.
+    """
+    return [
+        {"role": m["role"], "content": [picture] * ("image" in m) + [{"type": "text", "text": m["content"]}]}
+        for m in messages
+    ]

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from harness.backends.chat import Chat
 from harness.core.arrays import Floats
+from harness.core.image import Image
 
 
 class Session(Protocol):
@@ -53,6 +54,17 @@ class Engine(Protocol):
     chat: Chat
     context_tokens: int
     stops: Sequence[int]
+
+    def look(self, image: Image) -> list[int]:
+        """What stands for a picture in a prompt.
+
+        Tokens that its vision encoder fills are negative, the same for the same pixels and others for another
+        picture; markers around them are tokens of the vocabulary.
+
+        Raises:
+            ValueError: the model takes no pictures.
+        """
+        ...
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
         """Read some prompts, none of them empty; what they begin with in common is computed once."""

@@ -9,7 +9,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.decoding import Answer, Decoding
 from harness.backends.engine import Engine
 from harness.core.arrays import Floats
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 
 
 class _Prompt(NamedTuple):
@@ -48,7 +48,7 @@ class LanguageModel:
         done: dict[int, Completion] = {}
         fitting = []
         for position, request in enumerate(requests):
-            ids = self.chat.encode(self.chat.render(request.messages, thinking=request.thinking))
+            ids = self._tokens(request)
             room = self._decoding.room(request)
             if len(ids) + room > self.engine.context_tokens:
                 done[position] = _failed(request, len(ids), self._overflow(len(ids), room))
@@ -58,6 +58,19 @@ class LanguageModel:
             for prompt, completion in zip(batch, self._answer(batch), strict=True):
                 done[prompt.position] = completion
         return [done[position] for position in range(len(requests))]
+
+    def _tokens(self, request: Request) -> list[int]:
+        """A prompt, in tokens; those of a picture as its engine gives them."""
+        text = self.chat.render(request.messages, thinking=request.thinking)
+        if request.image is None:
+            return self.chat.encode(text)
+        before, *after = text.split(self.chat.image_token) if self.chat.image_token else [text]
+        if len(after) != 1:
+            raise UserError(
+                f"model {printable(self.chat.name)!r}: its chat template writes {len(after)} places for one "
+                "picture; give a model that takes pictures, with the template that it was trained with"
+            )
+        return [*self.chat.encode(before), *self.engine.look(request.image), *self.chat.encode(after[0])]
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]

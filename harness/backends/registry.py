@@ -97,7 +97,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
         Capabilities(has_weights=True, samples=True),
-        card_keys=(*_WEIGHTS, "dtype"),
+        card_keys=(*_WEIGHTS, "dtype", "vision"),
         required_keys=("weights",),
         packages={"torch": "torch", "transformers": "transformers"},
         install=extras.install("transformers"),
@@ -106,7 +106,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "llama-cpp": Registration(
         "harness.backends.llama_cpp.backend:open",
         Capabilities(has_weights=True, samples=True),
-        card_keys=(*_WEIGHTS, "file", "quantisation"),
+        card_keys=(*_WEIGHTS, "file", "quantisation", "vision", "projector"),
         required_keys=("weights",),
         packages={"llama_cpp": "llama-cpp-python"},
         install=extras.install("llama-cpp"),
@@ -115,6 +115,7 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True),
+        card_keys=("vision",),
         required_keys=("weights", "server"),
     ),
 }

@@ -115,10 +115,11 @@ class Replay:
         agent = self._run.agent(answer)
         self._check(request, agent)
         again = request.id.endswith(AGAIN)
-        if answer.prompt_sha256 != digest(request.messages[: -2 if again else None]):
+        asked = digest(request.messages[: -2 if again else None]), request.image and request.image.sha256
+        if asked != (answer.prompt_sha256, answer.image_sha256 or None):
             raise UserError(
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "
-                "replay it with that run's --prompt and --dataset"
+                "replay it with that run's --prompt, --image and --dataset"
             )
         whole = Completion(
             request.id, answer.raw, answer.prompt_tokens, answer.completion_tokens,

@@ -48,6 +48,7 @@ def command(
     sample_seed: int = typer.Option(0, help="Seed of the draw."),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
+    image: options.Image = "own",
     helper_model: options.HelperModel = None,
     helper_prompt: options.HelperPrompt = None,
     helper_answer: options.HelperAnswer = None,
@@ -84,7 +85,16 @@ def command(
         for name in (named.datasets if named else (dataset,))
     ]
     swarm = Swarm(
-        model, engine, prompt, answer, thinking, helper_model, helper_prompt, helper_answer, helper_thinking
+        model,
+        engine,
+        prompt,
+        answer,
+        thinking,
+        image,
+        helper_model,
+        helper_prompt,
+        helper_answer,
+        helper_thinking,
     )
     channel_seeds = options.parse_seeds(seeds)
     specs = [

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
     from harness.backends.base import AnswerMode
     from harness.coordination.operating_point import OperatingPoint
+    from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
-    AnswerMode = str
+    AnswerMode = ImageMode = str
 
 MOST_SEEDS = 1000
 MOST_WORKERS = 256
@@ -49,6 +50,10 @@ Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,
 FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
 Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
 Answer = Annotated[AnswerMode, Option(help="json: free text; constrained: to the schema; readout: letters.")]
+Image = Annotated[
+    ImageMode,
+    Option(help="Picture of an image prompt: own, blank, another (scene's), or none, which leaves its text."),
+]
 HelperModel = Annotated[
     str | None,
     Option(help="Model of the helpers; several, such as a,b,c, take them in turn. Default: the ego's."),

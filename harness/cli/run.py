@@ -17,7 +17,7 @@ from harness.core.formats import WORK
 
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
-    from harness.evaluate.agent import Agent
+    from harness.evaluate.agent import Agent, ImageMode
     from harness.evaluate.run import Evaluated
     from harness.evaluate.spec import Spec
     from harness.runs.records import Manifest, Score
@@ -52,6 +52,7 @@ class Swarm:
     prompt: str | None
     answer: "AnswerMode"
     thinking: bool
+    image: "ImageMode"
     helper_model: str | None
     helper_prompt: str | None
     helper_answer: "AnswerMode | None"
@@ -65,13 +66,15 @@ class Swarm:
 
         version = self.prompt or scenario.prompt
         card = cards.resolve(self.model, self.engine)
-        ego = Agent(card, versions.load(version), self.answer, self.thinking)
+        ego = Agent(card, versions.load(version), self.answer, self.thinking, self.image)
         models = self.helper_model.split(",") if self.helper_model else []
         prompt, mode = versions.load(self.helper_prompt or version), self.helper_answer or self.answer
         thinks = self.thinking if self.helper_thinking is None else self.helper_thinking
+        image = self.image if prompt.image else "own"
         others = [cards.resolve(name.strip()) for name in models] or [card]
         with helper_options({"--answer": self.helper_answer, "--thinking": self.helper_thinking}):
-            return {"ego": ego, "helpers": tuple(Agent(other, prompt, mode, thinks) for other in others)}
+            helpers = tuple(Agent(other, prompt, mode, thinks, image) for other in others)
+            return {"ego": ego, "helpers": helpers}
 
 
 @contextmanager
@@ -163,7 +166,8 @@ class Together:
 
 
 def _mode(agent: "Agent") -> str:
-    return "" if agent.answer == "json" else f"-{agent.answer}"
+    answer = "" if agent.answer == "json" else f"-{agent.answer}"
+    return answer + ("" if agent.image == "own" else f"-{agent.image}-image")
 
 
 def as_mapping(done: "Evaluated") -> dict[str, Any]:

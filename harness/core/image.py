@@ -1,7 +1,6 @@
 """A picture: its pixels, their digest, and a PNG file of them (ISO/IEC 15948), which needs no package."""
 
 import zlib
-from dataclasses import dataclass
 from functools import cached_property
 from struct import pack
 
@@ -13,7 +12,6 @@ from harness.core.files import sha256_bytes
 Pixels = NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
 class Image:
     """A picture.
 
@@ -21,7 +19,12 @@ class Image:
         pixels: (height, width, 3) red, green and blue.
     """
 
-    pixels: Pixels
+    def __init__(self, pixels: Pixels) -> None:
+        self._pixels = pixels
+
+    @property
+    def pixels(self) -> Pixels:
+        return self._pixels
 
     @cached_property
     def sha256(self) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from harness.backends.base import AnswerMode, Role
 from harness.backends.cards import Card
@@ -11,6 +11,8 @@ from harness.core.errors import UserError, printable, unknown
 from harness.parsing.parse import Status, parse
 from harness.prompts import readout
 from harness.prompts.versions import Prompt
+
+ImageMode = Literal["own", "blank", "another", "none"]
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,15 @@ class Agent:
         prompt: the prompt version.
         answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
         thinking: whether the model thinks first.
+        image: which picture an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
+            scene, or `none`, which leaves its text alone.
     """
 
     card: Card
     prompt: Prompt
     answer: AnswerMode = "json"
     thinking: bool = False
+    image: ImageMode = "own"
 
     def __post_init__(self) -> None:
         name = printable(self.card.name)
@@ -36,6 +41,17 @@ class Agent:
             raise UserError(f"--thinking: {name} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought, asked for or not
             object.__setattr__(self, "thinking", True)
+        if self.image not in get_args(ImageMode):
+            raise unknown("image", self.image, get_args(ImageMode))
+        if self.image != "own" and self.prompt.image is None:
+            raise UserError(
+                f"--image {self.image}: prompt {self.prompt.version} shows no picture; leave it out"
+            )
+        if self.prompt.image and self.image != "none" and self.can.renders and self.card.vision is None:
+            raise UserError(
+                f"--prompt {self.prompt.version}: it shows a picture, and {name} reads texts alone (its card "
+                "has no [vision]); give another model or prompt, or --image none"
+            )
         if self.answer not in get_args(AnswerMode):
             raise unknown("answer mode", self.answer, get_args(AnswerMode))
         if self.answer not in self.can.answer_modes:
@@ -69,8 +85,15 @@ class Agent:
         self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]
     ) -> tuple[Mapping[str, str], ...]:
         """The chat messages about a scene graph."""
-        rendered = self.prompt.render(graph, actions, words=words)
+        rendered = self.rendered(graph, actions, (), words)
         return in_mode(self.answer, self.prompt, rendered, graph["role"], actions)
+
+    def rendered(
+        self, graph: Mapping[str, Any], actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
+        words: Mapping[str, str],
+    ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
+        """The chat messages about a scene graph and messages, as they are free of an answer mode."""
+        return shown(self.image, self.prompt.render(graph, actions, heard, words))
 
     def settings(self) -> dict[str, Any]:
         """All that decides its answers, as plain values."""
@@ -79,7 +102,15 @@ class Agent:
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
             "thinking": self.thinking,
             "answer": self.answer,
+            "image": self.image,
         }
+
+
+def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
+    """A prompt's chat in an image mode: without its picture where that is `none`."""
+    if image != "none":
+        return tuple(messages)
+    return tuple({key: text for key, text in m.items() if key != "image"} for m in messages)
 
 
 def in_mode(

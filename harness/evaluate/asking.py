@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from harness.backends.base import Backend, Completion, Request, Role
 from harness.coordination.coordinate import FusionCall
@@ -19,6 +20,7 @@ from harness.dataset.load import Scene
 from harness.evaluate import repair
 from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
+from harness.evaluate.pictures import picture
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import parse
 from harness.runs.records import BLIND, Answer, Latency
@@ -44,7 +46,8 @@ def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterat
             yield _request(
                 spec, who, name, graph["role"],
                 agent.messages(graph, spec.actions, spec.scenario.prompt_words),
-                view=graph, truth=truth if agent.card.privileged else None, scenario=spec.scenario,
+                image=picture(spec, who, scene, viewer, blind), view=graph,
+                truth=truth if agent.card.privileged else None, scenario=spec.scenario,
             )  # fmt: skip
 
 
@@ -70,8 +73,9 @@ def fusion_request(
 ) -> Request:
     """The fusion call with these helpers' messages; `answers` by key, as `senders` has them."""
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
-    messages = spec.ego.prompt.render(graph, spec.actions, heard, spec.scenario.prompt_words)
-    return _request(spec, 0, _fusion_id(scene, senders), "ego", messages)
+    messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
+    image = picture(spec, 0, scene, scene.viewers[0])
+    return _request(spec, 0, _fusion_id(scene, senders), "ego", messages, image=image)
 
 
 def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
@@ -98,7 +102,9 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
         retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
         first_token_s=completion.first_token_s, token_s=completion.token_s,
-        prompt_sha256=digest(request.messages), status=str(said.status), verdict=said.verdict,
+        prompt_sha256=digest(request.messages),
+        image_sha256=request.image.sha256 if request.image else UNSET,
+        status=str(said.status), verdict=said.verdict,
         repairs=tuple(map(str, said.repairs)), intent=said.intent, mass=said.mass, message=said.message,
         detail=said.detail,
     )  # fmt: skip

@@ -165,6 +165,8 @@ class Spec:
         if reason := unfit(agent.prompt, self.scenario):
             raise UserError(f"--prompt {version} {reason}; give {self.scenario.prompt}, or one of your own")
         self._check_examples(agent.prompt)
+        if self.source.kind == "closed-loop" and agent.image == "another":
+            raise UserError("--image another: pictures of other scenes are a dataset's; give blank or none")
         if self.source.kind == "closed-loop" and not agent.can.closed_loop:
             raise UserError(
                 f"--model {name}: a replay has answers to frozen scenes alone; give the model that it replays"
@@ -277,6 +279,7 @@ class Spec:
             ("--model", argument(self.ego.card)), ("--prompt", self.ego.prompt.version),
             *self._helper_options(), *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
+            ("--image", None if self.ego.image == "own" else self.ego.image),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
             ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),

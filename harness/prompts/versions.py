@@ -106,6 +106,7 @@ class Prompt:
         reasons_first: roles asked for reasons before the answer, which are then no fault of the answer.
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
+        image: the picture before the user's text: what the viewer's `camera` sees; None if there is none.
     """
 
     version: str
@@ -122,6 +123,7 @@ class Prompt:
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
     max_conflicts: Count | None = None
     examples: Examples | None = None
+    image: Literal["camera"] | None = None
 
     def __post_init__(self) -> None:
         least, most = self.token_budget
@@ -129,6 +131,8 @@ class Prompt:
             raise ValueError(f"token_budget is [{least}, {most}], wants [least, most]")
         if self.max_answer_tokens.keys() != set(ROLES):
             raise ValueError("max_answer_tokens wants exactly ego and helper")
+        if self.image and self.examples:
+            raise ValueError("image and examples.json exclude each other: an example shows no picture")
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: all but what is compiled."""
@@ -175,7 +179,8 @@ class Prompt:
     ) -> tuple[dict[str, str], ...]:
         """Chat messages for one viewer's scene graph; exactly what a model is sent.
 
-        The examples stand as earlier turns behind the system's message.
+        The examples stand as earlier turns behind the system's message. A message with the key `image` has
+        a picture before its text.
 
         Args:
             graph: the viewer's scene graph; its `role` chooses the template.
@@ -186,7 +191,8 @@ class Prompt:
         """
         system, user = self._said(graph, actions, messages, words, "system", "user")
         turns = self._turns(graph["role"], actions, words)
-        return ({"role": "system", "content": system}, *turns, {"role": "user", "content": user})
+        asked = {"role": "user", "content": user} | ({"image": self.image} if self.image else {})
+        return ({"role": "system", "content": system}, *turns, asked)
 
     def _turns(
         self, role: str, actions: tuple[str, ...], words: Mapping[str, str]

@@ -8,7 +8,7 @@ import numpy as np
 
 from harness.core.files import digest
 from harness.dataset.load import Scene
-from harness.evaluate.agent import in_mode
+from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of
 from harness.parsing.parse import spans
 from harness.parsing.status import Status
@@ -51,7 +51,7 @@ def prompts_of(run: Run) -> Sent | None:
         agent = manifest.agent(scene.viewers.index(viewer))
         prompt = prompts[agent["prompt"]["version"]]
         graph = scene.record["graphs"][viewer]
-        messages = prompt.render(graph, run.actions, heard, words)
+        messages = shown(agent.get("image", "own"), prompt.render(graph, run.actions, heard, words))
         return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
 
     return sent

@@ -55,6 +55,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         message: the rest of a helper's answer; None if there is none.
         detail: one sentence for people.
         first: the answer before a repair turn; unset where there was none.
+        image_sha256: digest of the pixels of the picture in its prompt; unset where there was none.
     """
 
     scene: str
@@ -83,6 +84,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     first_token_s: float | None = None
     token_s: float | None = None
     first: FirstTurn | UnsetType = UNSET
+    image_sha256: str | UnsetType = UNSET
 
     @property
     def turns(self) -> int:
@@ -375,6 +377,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     thinking: bool
     answer: str
+    image: str = "own"
     batch_size: int
     dtype: str | None
     temperature: float = 0.0
@@ -417,4 +420,4 @@ class Manifest(Struct, frozen=True, kw_only=True):
         """Who answers for a scene's viewer at this place, as `helpers` has it; the ego is at 0."""
         if place and self.helpers:
             return self.helpers[(place - 1) % len(self.helpers)]
-        return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking")}
+        return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking", "image")}

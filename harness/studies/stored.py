@@ -24,7 +24,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Scene
-from harness.evaluate.agent import Agent
+from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
@@ -180,7 +180,10 @@ class Stored:
     def _agent(self, stated: Mapping[str, Any]) -> Agent:
         card = convert(stated["model"], Card, f"{printable(self.run.path)}: its model")
         prompt = versions.load(stated["prompt"]["version"])
-        return Agent(card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"])
+        return Agent(
+            card, prompt, cast("AnswerMode", stated["answer"]), stated["thinking"],
+            cast("ImageMode", stated.get("image", "own")),
+        )  # fmt: skip
 
     def _open(self) -> Backend:
         spec, shown, manifest = self._asker.spec, printable(self.run.path), self.run.manifest

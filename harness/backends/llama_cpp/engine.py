@@ -19,6 +19,7 @@ from harness.backends.weights import hub_commit
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
+from harness.core.image import Image
 
 BEGINNINGS = 3  # of prompts, kept between calls: one a role, and one of a batch with both
 _ANSWER = 256  # tokens of an answer that memory is made for at once
@@ -55,6 +56,10 @@ class LlamaEngine:
         self._free = list(range(batch_size))
         # Least lately used first.
         self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
+
+    def look(self, image: Image) -> list[int]:
+        """What stands for a picture in a prompt."""
+        raise ValueError("llama.cpp takes no pictures here")
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
         """Read some prompts, none of them empty; what they begin with in common is computed once.

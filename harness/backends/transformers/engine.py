@@ -14,6 +14,7 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.weights import fetching, find_checkpoint, held_to_digest, hub_commit
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_bytes, sha256_file
+from harness.core.image import Image
 
 # What decides an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
@@ -52,7 +53,8 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
         with catch_warnings():
             simplefilter("ignore")  # torch's of a pickle: what is wrong with it is said below
             tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
-            model, report = transformers.AutoModelForCausalLM.from_pretrained(
+            kind = "AutoModelForImageTextToText" if card.vision else "AutoModelForCausalLM"
+            model, report = getattr(transformers, kind).from_pretrained(
                 where, dtype=dtype, output_loading_info=True, **options
             )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
@@ -118,15 +120,18 @@ class TransformersEngine:
         chat: its tokenizer and chat template.
         context_tokens: the card's bound, else the checkpoint's own.
         stops: token ids that end an answer, sorted.
+        eyes: its image processor; None if it takes no pictures.
         model: the transformers model.
     """
 
     def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
+        from harness.backends.transformers.eyes import Eyes
         from harness.backends.transformers.session import Reader
 
         self.card = card
         self.where = where
-        self.chat = Chat(card.name, tokenizer)
+        self.eyes = Eyes(card.name, where, card.vision, tokenizer, model) if card.vision else None
+        self.chat = Chat(card.name, tokenizer, self.eyes.image_token if self.eyes else None)
         self.model = model
         self.context_tokens: int = (
             card.context_tokens or self.model.config.get_text_config().max_position_embeddings
@@ -135,7 +140,13 @@ class TransformersEngine:
         # A chat model's turn may end with a token that its generation config does not list.
         ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id}
         self.stops: Sequence[int] = sorted(ends - {None})
-        self._reader = Reader(self.model)
+        self._reader = Reader(self.model, self.eyes)
+
+    def look(self, image: Image) -> list[int]:
+        """What stands for a picture in a prompt."""
+        if self.eyes is None:
+            raise ValueError(f"{self.card.name} takes no pictures")
+        return self.eyes.look(image)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
         """Read some prompts. What they begin with in common, or earlier prompts did, is computed once."""

@@ -17,6 +17,7 @@ import torch
 from transformers.cache_utils import DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits
+from harness.backends.transformers.eyes import Eyes
 from harness.backends.transformers.prefixes import LEAST_TOKENS, NOTHING, Prefix, Prefixes, common
 from harness.core.arrays import Floats
 
@@ -28,8 +29,8 @@ class Reader:
         together: whether sequences can be padded, and so read in one batch.
     """
 
-    def __init__(self, model: Any) -> None:
-        self._model = model
+    def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
+        self._model, self._eyes = model, eyes
         self._prefixes = Prefixes()
         self._failed = False
         self._positions = "position_ids" in signature(model.forward).parameters
@@ -66,21 +67,32 @@ class Reader:
         """An empty cache of the model's layers."""
         return DynamicCache(config=self._model.config)
 
-    def forward(self, cache: DynamicCache, ids: Any, mask: Any) -> Any:
+    def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
+        """Where each prompt's tokens stand, (3, tokens); None where that is their number."""
+        if self._eyes is None or not any(token < 0 for prompt in prompts for token in prompt):
+            return None
+        places = [self._eyes.positions(prompt) for prompt in prompts]
+        return None if places[0] is None else places
+
+    def forward(self, cache: DynamicCache, ids: Any, mask: Any, places: Any = None) -> Any:
         """Logits behind the last column, (n, vocabulary).
 
         Args:
             cache: what was read so far; what is read now is added.
             ids: tokens, (n, width), on the CPU.
             mask: 1 where there is a token and 0 at a pad, (n, cached + width), on the CPU.
+            places: where they stand, (3, n, width), if not one behind the other.
         """
         device = self._model.device
         options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
-        if self._positions:
+        if places is not None:
+            options["position_ids"] = places.to(device)
+        elif self._positions:
             options["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)[:, -ids.shape[1] :].to(device)
+        options |= self._eyes.inputs(ids) if self._eyes else {"input_ids": ids.to(device)}
         try:
             with torch.inference_mode():
-                return self._model(input_ids=ids.to(device), logits_to_keep=1, **options).logits[:, -1]
+                return self._model(logits_to_keep=1, **options).logits[:, -1]
         except Exception:
             self._failed = True
             raise
@@ -98,6 +110,7 @@ class Rows:
             self._cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
         self._mask = torch.ones(n, known, dtype=torch.long)
         self._logits: Any = None
+        self._places = reader.positions(prompts)
         self.advance([prompt[known:] for prompt in prompts])
 
     def layers(self) -> list[tuple[Any, Any]]:
@@ -134,11 +147,29 @@ class Rows:
                 ids[row, width - len(chunk) :] = torch.tensor(chunk)
                 new[row, width - len(chunk) :] = 1
         self._mask = torch.cat([self._mask, new], dim=1)
-        logits = self._reader.forward(self._cache, ids, self._mask)
+        logits = self._reader.forward(self._cache, ids, self._mask, self._standing(chunks, width))
         moved = new[:, -1:].bool().to(logits.device)
         self._logits = logits if self._logits is None else torch.where(moved, logits, self._logits)
 
+    def _standing(self, chunks: Sequence[Sequence[int]], width: int) -> Any:
+        """Where new tokens stand, (3, n, width); None if one behind the other."""
+        if self._places is None:
+            return None
+        standing = torch.zeros(3, len(chunks), width, dtype=torch.long)
+        for row, chunk in enumerate(chunks):
+            if not chunk:
+                continue
+            end = int(self._mask[row].sum())  # tokens of the row, these among them
+            place, start = self._places[row], end - len(chunk)
+            if end > place.shape[1]:  # behind the prompt each stands one further
+                more = torch.arange(1, end - place.shape[1] + 1) + place.max()
+                place = self._places[row] = torch.cat([place, more.expand(3, -1)], dim=1)
+            standing[:, row, -len(chunk) :] = place[:, start:end]
+        return standing
+
     def keep(self, places: Sequence[int]) -> None:
+        if self._places is not None:
+            self._places = [self._places[place] for place in places]
         rows = torch.tensor(places)
         self._mask = self._mask[rows]
         self._logits = self._logits[rows.to(self._logits.device)]

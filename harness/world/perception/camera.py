@@ -39,6 +39,7 @@ REACH_M, CELL_M = 160.0, 0.2  # of the map of the ground, from the origin; beyon
 LINE_M = 0.4  # width of a painted line
 DASH_M, GAP_M = 3.0, 4.5
 NOBODY = -1
+KEPT = 64  # frames drawn lately, 0.65 MB each
 
 GLARE = (255, 247, 224)
 GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
@@ -53,7 +54,6 @@ SHADE = np.array([0.96, 0.80, 0.88, 0.72])
 LAMPS = AMBIENTS[DAY]  # light of their own carries as by day
 
 
-@dataclass(frozen=True)
 class Frame(Image):
     """What the cameras of a vehicle see.
 
@@ -62,8 +62,9 @@ class Frame(Image):
         ids: of vehicles and buildings.
     """
 
-    owners: Places
-    ids: tuple[str, ...]
+    def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
+        super().__init__(pixels)
+        self.owners, self.ids = owners, ids
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
         """Left, top, right and bottom of what each owns in either half, the last two beyond its pixels."""
@@ -96,6 +97,26 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[
             for half, turned in zip(np.split(pixels, 2), (0.0, np.pi), strict=True)
         ])  # fmt: skip
     return Frame(pixels, owners, tuple(box.name for box in boxes))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight(Image):
+    """A frame that is drawn when its pixels are asked for, and not kept; another process gets the pixels."""
+
+    scenario: Scenario
+    state: WorldState
+    viewer_id: str
+    size_px: tuple[int, int]
+
+    @property
+    def pixels(self) -> Pixels:
+        return _drawn(self.scenario, self.state, self.viewer_id, self.size_px).pixels
+
+    def __reduce__(self) -> tuple[type[Image], tuple[Pixels]]:
+        return Image, (self.pixels,)
+
+
+_drawn = lru_cache(maxsize=KEPT)(frame)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,62 @@
+"""Which picture stands in a prompt: what the viewer's cameras see, or a test of whether a model looks."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.errors import UserError
+from harness.core.image import Image
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.spec import Spec
+from harness.world.perception.camera import Sight
+
+GREY = 127
+
+
+def picture(spec: Spec, who: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
+    """The picture that a viewer's agent is shown; None where its prompt has none, or it is no model of them.
+
+    Args:
+        spec: the evaluation.
+        who: which of its agents answers.
+        scene: the decision point.
+        viewer: id of the vehicle that answers.
+        blind: whether it is shown nothing, and so a blank one.
+
+    Raises:
+        UserError: there is no other scene to take one from.
+    """
+    agent = spec.agents[who]
+    vision = agent.card.vision
+    if agent.prompt.image is None or vision is None or agent.image == "none":
+        return None
+    if blind or agent.image == "blank":
+        return blank(vision.size_px)
+    if agent.image == "another":
+        place = scene.viewers.index(viewer)
+        scene = another(spec, scene)
+        viewer = scene.viewers[min(place, len(scene.viewers) - 1)]
+    return Sight(spec.scenario, scene.state, viewer, vision.size_px)
+
+
+@lru_cache(maxsize=4)
+def blank(size_px: tuple[int, int]) -> Image:
+    """A picture of one grey."""
+    width, height = size_px
+    return Image(np.full((height, width, 3), GREY, dtype=np.uint8))
+
+
+def another(spec: Spec, scene: Scene) -> Scene:
+    """A decision point of the same step in another episode, drawn by the scene's id."""
+    dataset: Dataset = getattr(spec.source, "dataset")  # noqa: B009 closed loops are refused before
+    forest = dataset.forest
+    n = forest.place[scene.id]
+    others = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
+    if not len(others):
+        raise UserError(
+            f"--image another: no other episode of {dataset.name} has a decision point at step "
+            f"{int(forest.step[n])}; give a greater --limit"
+        )
+    drawn = int(noise.uniforms((1,), "another picture", scene.id)[0] * len(others))
+    return dataset.scenes([forest.ids[others[drawn]]])[0]
