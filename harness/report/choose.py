@@ -1,4 +1,4 @@
-"""Which decision points of a driven run tell most: where episodes begin to fail, then an even sample."""
+"""Which decision points of a run tell most: where episodes are lost, then a sample."""
 
 from collections.abc import Sequence
 
@@ -46,11 +46,17 @@ def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
     chosen: list[str] = []
     for kind, room in ((list(failed), n // 4), (disagreement, n // 4), (answer, n // 4), (list(d.scenes), n)):
         left = [scene for scene in kind if scene not in chosen]
-        chosen += _spread(left, min(room, n - len(chosen)))
+        chosen += spread(left, min(room, n - len(chosen)))
     return [scene for scene in d.scenes if scene in chosen]
 
 
-def _spread(items: Sequence[str], n: int) -> list[str]:
+def lost(run: Run) -> list[str]:
+    """Decision points of a frozen run whose action, with some seed and condition, gives success away."""
+    regret = np.nan_to_num(run.decisions["regret"]) == 1.0
+    return [scene for scene, rows in run.decisions.scenes.items() if regret[rows.start : rows.stop].any()]
+
+
+def spread(items: Sequence[str], n: int) -> list[str]:
     """Up to n of the items, evenly spaced, the first among them."""
     n = min(n, len(items))
     return [items[k * len(items) // n] for k in range(n)]

@@ -14,7 +14,7 @@ from harness.parsing.parse import spans
 from harness.parsing.status import Status
 from harness.prompts import versions
 from harness.report import scenes
-from harness.report.choose import failures, pick
+from harness.report.choose import failures, lost, pick, spread
 from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision
@@ -22,6 +22,7 @@ from harness.world import scenarios
 from harness.world.perception.graph import blinded
 
 BLOCK = 24  # scenes that are compressed and read together
+FRAMES = 400  # cameras' pictures in a page, each some 3.5 kB of it
 REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
 
 Messages = Sequence[Mapping[str, Any]]
@@ -88,12 +89,15 @@ class Decisions:
         self._ends = [_ends(run) for run in runs.runs]
         self._left_out = [_left_out(run) for run in runs.runs]
         self._episodes = [_episodes(run) for run in runs.runs]
+        self._pictured = [_pictured(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
+        self._framed = self._telling()
         self.index = {
             "actions": runs.actions,
             "scenes": [[scene, *place] for scene, place in order],
             "block": BLOCK,
             "live": runs.live,
+            "framed": len(self._framed),
             "statuses": list(map(str, Status)),
             "runs": [self._indexed(n, list(of)) for n, of in enumerate(failed)],
         }
@@ -121,6 +125,16 @@ class Decisions:
             if scene.id == name:
                 replayed[name] = scene
         return replayed
+
+    def _telling(self) -> set[str]:
+        """Decision points that have cameras' pictures: where episodes are lost, then a sample."""
+        most = FRAMES // max((len(scene.viewers) for scene in self._scenes.values()), default=1)
+        if self._runs.live:
+            return set(spread(list(self._scenes), most))
+        runs = self._runs.runs
+        first = spread(list(dict.fromkeys(scene for run in runs for scene in lost(run))), most)
+        more = dict.fromkeys(scene for run in runs for scene in pick(run, {}, most) if scene not in first)
+        return {*first, *spread(list(more), most - len(first))}
 
     def _indexed(self, n: int, first_failures: Sequence[str]) -> dict[str, Any]:
         """One run's part of the index: a letter a scene, condition and seed, in this order."""
@@ -164,6 +178,7 @@ class Decisions:
             outcomes = scenes.outcomes(self._runs.dataset.forest, name)
         return {
             "world": scene and scenes.world(scene),
+            "cameras": scene and name in self._framed and scenes.cameras(self._runs.scenario, scene),
             "outcomes": outcomes,
             "runs": [self._of_run(n, name, scene, sent) for n in range(len(self._runs.runs))],
             "prompts": list(sent.values()),
@@ -190,8 +205,10 @@ class Decisions:
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
+            agent = run.agent(answer)
+            if (pictured := self._pictured[n][agent["prompt"]["version"]]) is not False:
+                shown["pictured"] = pictured
             if run.manifest.helpers:
-                agent = run.agent(answer)
                 shown["agent"] = " · ".join(
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
                 )
@@ -219,6 +236,15 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
     role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
+
+
+def _pictured(run: Run) -> dict[str, bool | None]:
+    """Whether a prompt shows what the cameras see, by version; None if it is not here as it was."""
+    found: dict[str, bool | None] = {}
+    for agent in (run.manifest.agent(0), *run.manifest.helpers):
+        prompt = versions.as_it_was(agent["prompt"]["version"], agent["prompt"]["sha256"])
+        found[agent["prompt"]["version"]] = None if prompt is None else bool(getattr(prompt, "image", None))
+    return found
 
 
 def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:

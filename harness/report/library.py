@@ -19,7 +19,9 @@ from typing import Any
 from markupsafe import Markup
 
 # In the order in which they need each other.
-SCRIPTS = ("dom", "tables", "charts", "ends", "scene", "answers", "decision", "list", "episodes", "main")
+SCRIPTS = (
+    "dom", "tables", "charts", "ends", "scene", "cameras", "answers", "decision", "list", "episodes", "main",
+)  # fmt: skip
 FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
@@ -53,9 +55,9 @@ def packed(value: Any) -> Markup:
     return Markup(base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode())
 
 
-def picture(svg: bytes) -> str:
-    """A picture as what an `img` of a page that stands alone takes."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
+def picture(content: bytes, kind: str = "svg+xml") -> str:
+    """A picture as an address that a page which stands alone can show."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def policy(*scripts: str) -> str:

@@ -41,12 +41,12 @@ class Runs:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of their episodes."""
+        """The scenario of their episodes, with its parameters of then."""
         if self.dataset is not None:
             return self.dataset.scenario
         world = self.runs[0].manifest.world
         assert isinstance(world, ClosedLoop)
-        return scenarios.get(world.scenario["name"])
+        return scenarios.stated(world.scenario["name"], world.scenario["parameters"])
 
     @property
     def conditions(self) -> tuple[str, ...]:

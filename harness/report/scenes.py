@@ -5,9 +5,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from harness.core.image import Image
 from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.report.drawing.geometry import conflict_points
+from harness.report.library import picture
+from harness.world.perception.camera import frame
+from harness.world.scenario import Scenario
+
+# A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of each colour.
+FRAME_PX = 256, 128
+SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 
 
 def world(scene: Scene) -> dict[str, Any]:
@@ -37,6 +45,20 @@ def world(scene: Scene) -> dict[str, Any]:
             for viewer, graph in scene.record["graphs"].items()
         },
     }  # fmt: skip
+
+
+def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
+    """Of each viewer, what its cameras see and boxes around what its sensors list (`Frame.boxes`)."""
+    shown = {}
+    for viewer, graph in scene.record["graphs"].items():
+        seen = frame(scenario, scene.state, viewer, FRAME_PX)
+        boxes = seen.boxes()
+        shown[viewer] = {
+            "size": FRAME_PX,
+            "picture": picture(Image(seen.pixels & SHADES | HALF_A_SHADE).png(), "png"),
+            "boxes": [[n["id"], *box] for n in graph["nodes"] for box in boxes.get(n["id"], ())],
+        }
+    return shown
 
 
 def _conflicts(scene: Scene, viewer: str) -> list[dict[str, Any]]:

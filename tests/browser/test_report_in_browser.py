@@ -11,12 +11,18 @@ pytest.importorskip("playwright", reason="needs the dev extra")
 pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 
 from axe_playwright_python.sync_playwright import Axe
-from opening import NARROW, picture, wait
+from opening import NARROW, WIDE, picture, wait
 from playwright.sync_api import expect
 from reading import packed
 
 from harness import cli
 
+SIZE = """async (shown) => {
+  const image = new Image();
+  image.src = shown.querySelector("image").getAttribute("href");
+  await image.decode();
+  return [image.width, image.height];
+}"""
 RUNS = (("proxy", "v1"), ("proxy", "v2"), ("proxy-faulty", "v2"), ("local-view", "v2"))
 
 
@@ -124,6 +130,30 @@ def test_the_picture_follows_the_conflict_and_shades_what_is_hidden(opened, repo
     assert box["y"] + box["height"] <= 900, "the distributions are on the first screen too"
     page.locator("select[name=zoom]").select_option("all")
     expect(page.locator("svg.scene")).to_have_attribute("viewBox", "-80 -80 160 160")
+
+
+@pytest.mark.parametrize(("size", "beside"), [(WIDE, 4), (NARROW, 1)])
+def test_the_cameras_pictures_have_boxes_that_can_be_switched_off(opened, report, index, size, beside):
+    page = opened(report, f"#scene={index['scenes'][1][0]}", size)
+    frames, boxes = page.locator(".frame"), page.locator(".frame .label")
+    assert frames.count() == 4
+    assert len({round(frames.nth(n).bounding_box()["x"]) for n in range(4)}) == beside
+    for shown in frames.all():
+        assert shown.get_attribute("viewBox") == "0 0 {} {}".format(*shown.evaluate(SIZE))
+        labels = shown.locator(".label").all_text_contents()
+        assert set(
+            re.findall(r"v\d+(?= [a-z])", shown.get_attribute("aria-label").split("Listed")[0])
+        ) == set(labels)
+    assert "The model was not shown these pictures" in page.locator(".cameras").inner_text()
+    assert boxes.first.is_visible()
+    page.get_by_label("boxes around what the sensors list").uncheck()
+    assert not boxes.first.is_visible()
+    page.get_by_role("link", name="next →").click()
+    expect(page.locator("#decision h1")).to_contain_text(index["scenes"][2][0])
+    assert not boxes.first.is_visible()
+    page.emulate_media(media="print")
+    assert frames.first.is_visible()
+    assert not page.locator(".cameras label").is_visible()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

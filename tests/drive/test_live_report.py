@@ -1,5 +1,6 @@
 """The report page of a real, small live run."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.evaluate.replay import find, scene_of
 from harness.prompts import versions as prompts
+from harness.report import scenes
 from harness.report.choose import failures, pick
 from harness.report.compare.pair import pair
 from harness.report.page import render
@@ -21,6 +23,7 @@ from harness.report.runs import gather
 from harness.runs.folder import read
 from harness.runs.records import ClosedLoop
 from harness.studies.stored import Stored
+from harness.world import scenarios
 
 V2 = prompts.load("v2")
 
@@ -82,6 +85,24 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
     )
     with pytest.raises(UserError, match="scenario occluded-intersection has other parameters here"):
         scene_of(read(gone), scene)
+
+
+def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
+    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT)
+    name = "occluded-intersection:ambient=night"
+    run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
+    found = read(tmp_path / "run")
+    every = details(written(tmp_path / "run"))
+    assert list(every) == list(found.decisions.scenes)
+    for scene, detail in every.items():
+        replayed = scene_of(found, scene)
+        assert detail["cameras"] == plain(scenes.cameras(scenarios.get(name), replayed))
+        assert detail["cameras"] != plain(scenes.cameras(scenarios.get("occluded-intersection"), replayed))
+
+
+def plain(value):
+    """As it comes back from JSON."""
+    return json.loads(json.dumps(value))
 
 
 def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
@@ -220,7 +241,7 @@ def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(dri
     episodes.to_csv(other / "episodes.csv", index=False)
     every = details(written(other))
     assert every
-    assert all(detail["world"] is None for detail in every.values())
+    assert all(detail["world"] is None and detail["cameras"] is None for detail in every.values())
     assert not any(shown(every).values())
 
 

@@ -69,8 +69,20 @@ def test_a_run_full_of_failures_still_shows_ordinary_decisions(tmp_path):
     assert len(failures) == 51
     chosen = choose.pick(run, failures, 40)
     # A quarter are chosen as failures, and 30 are spread over the other 90, of which 49 are ordinary.
-    assert set(choose._spread(list(failures), 10)) <= set(chosen)
+    assert set(choose.spread(list(failures), 10)) <= set(chosen)
     assert len([scene for scene in chosen if scene not in failures]) == 16
+
+
+def test_a_decision_lost_an_episode_where_any_condition_with_any_seed_gave_success_away(tmp_path):
+    def decision(row):
+        row["regret"] = (row["scene"], row["condition"]) == ("00001-1", "6g")
+        row["value"] = row["scene"] != "00002-0"  # nothing was left to lose, so regret is not known
+
+    points = [POINTS[name] for name in ("single-local", "6g")]
+    run = read(
+        made_up(tmp_path / "run", decision, points=points, seeds=(0, 1), episodes=3, steps=2, helpers=0)
+    )
+    assert choose.lost(run) == ["00001-1"]
 
 
 POINTS_AS_DRAWN = st.builds(

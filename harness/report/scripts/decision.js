@@ -123,6 +123,7 @@ class DecisionPage {
         h("div", { class: "pair" },
           this.picture(),
           h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
+        this.cameras(),
         h("h2", {}, "What was decided"),
         this.told ? this.decided() : null,
         this.messages(),
@@ -186,6 +187,22 @@ class DecisionPage {
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
     return h("div", { class: "picture" },
       drawing, h("p", { class: "quiet" }, `${said}. `, KEY), save("svg"), " ", save("png"));
+  }
+
+  cameras() {
+    const { world, cameras } = this.detail, { framed, scenes, live } = this.index;
+    if (!world) return null;
+    if (!cameras) {
+      const drawn = live ? "`harness video` draws them" : "`harness dataset show --camera` draws any other";
+      return h("p", { class: "quiet" }, `What the cameras saw is in this page for ${framed} of ${scenes.length} `
+        + `${live ? "moments" : "decisions, those that lost an episode first"}; ${drawn}.`);
+    }
+    const boxes = h("input", { type: "checkbox", checked: this.boxes !== false, onchange: () => { this.boxes = boxes.checked; } });
+    return h("section", { class: "cameras" },
+      h("h3", {}, "What the cameras saw"),
+      h("p", { class: "quiet" }, shownTo(this.told?.answers ?? [], this.viewers), " Front above rear, each 120° wide. ",
+        h("label", {}, boxes, " boxes around what the sensors list")),
+      h("div", { class: "frames" }, this.viewers.map((viewer) => cameraFrame(world, viewer, cameras[viewer]))));
   }
 
   came() {
