@@ -89,7 +89,6 @@ class Decisions:
         self._ends = [_ends(run) for run in runs.runs]
         self._left_out = [_left_out(run) for run in runs.runs]
         self._episodes = [_episodes(run) for run in runs.runs]
-        self._pictured = [_pictured(run) for run in runs.runs]
         self._scenes = self._frozen() if runs.dataset else self._played(failed)
         self._framed = self._telling()
         self.index = {
@@ -206,8 +205,8 @@ class Decisions:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
             agent = run.agent(answer)
-            if (pictured := self._pictured[n][agent["prompt"]["version"]]) is not False:
-                shown["pictured"] = pictured
+            if answer.image_sha256:
+                shown["picture"] = "blank" if answer.role == "blind" else agent["image"]
             if run.manifest.helpers:
                 shown["agent"] = " · ".join(
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
@@ -236,15 +235,6 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Where in a recovered completion its answers stand."""
     role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
-
-
-def _pictured(run: Run) -> dict[str, bool | None]:
-    """Whether a prompt shows what the cameras see, by version; None if it is not here as it was."""
-    found: dict[str, bool | None] = {}
-    for agent in (run.manifest.agent(0), *run.manifest.helpers):
-        prompt = versions.as_it_was(agent["prompt"]["version"], agent["prompt"]["sha256"])
-        found[agent["prompt"]["version"]] = None if prompt is None else bool(getattr(prompt, "image", None))
-    return found
 
 
 def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:

@@ -2,8 +2,8 @@
 
 import base64
 import json
+import shutil
 from io import BytesIO
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,15 +58,19 @@ def test_where_an_episode_was_lost_comes_first_if_a_page_cannot_have_all(run, mo
         assert with_pictures < set(lost) if room < len(lost) else set(lost) < with_pictures
 
 
-@pytest.mark.parametrize(
-    ("prompt", "pictured"),
-    [(SimpleNamespace(image="camera"), True), (SimpleNamespace(image=None), False), (None, None)],
-)
-def test_an_answer_says_whether_its_prompt_had_the_picture(run, monkeypatch, prompt, pictured):
-    monkeypatch.setattr(decisions.versions, "as_it_was", lambda version, sha256: prompt)
-    for detail in details(render(gather([run]), lambda run: None)).values():
+@pytest.mark.parametrize("mode", ["own", "blank", "another"])
+def test_an_answer_says_which_picture_its_prompt_had(run, tmp_path, mode):
+    """By what the run recorded: here of the ego alone."""
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    manifest = json.loads((copy / "run.json").read_text())
+    (copy / "run.json").write_text(json.dumps({**manifest, "image": mode}))
+    lines = map(json.loads, (copy / "answers.jsonl").read_text().splitlines())
+    seen = [{**a, "image_sha256": "0" * 64} if a["role"] == "ego" else a for a in lines]
+    (copy / "answers.jsonl").write_text("".join(json.dumps(a) + "\n" for a in seen))
+    for detail in details(render(gather([copy]))).values():
         [of] = detail["runs"]
-        assert {answer.get("pictured", False) for answer in of["answers"]} == {pictured}
+        assert {(a["role"], a.get("picture")) for a in of["answers"]} == {("ego", mode), ("helper", None)}
 
 
 def test_pictures_of_a_report_of_the_default_dataset_take_less_than_one_and_a_half_megabytes():

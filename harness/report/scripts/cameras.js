@@ -1,14 +1,15 @@
 // What the cameras of each viewer saw, with a box around each vehicle that its sensors list.
 
-// Of the viewers that answered alone, whose prompt had the picture.
+// What viewers that answered alone were shown: their own cameras' picture, another in its place, or none.
 function shownTo(answers, viewers) {
   const own = answers.filter((a) => a.role === "ego" || a.role === "helper");
-  const of = (pictured) => viewers.filter((id) => own.some((a) => a.viewer === id && a.pictured === pictured)).join(", ");
-  const [shown, not, unknown] = [of(true), of(undefined), of(null)];
+  const of = (picture) => viewers.filter((id) => own.some((a) => a.viewer === id && a.picture === picture)).join(", ");
+  const [seen, blank, another, not] = ["own", "blank", "another", undefined].map(of);
   return [
-    shown && `The model was shown the picture of ${shown}.`,
-    not && `The model was not shown ${shown || unknown ? `the picture of ${not}` : "these pictures"}: the prompt is text alone.`,
-    unknown && `Whether the model was shown the picture of ${unknown} is not known: the prompt is not here as it was.`,
+    seen && `The model was shown the picture of ${seen}.`,
+    blank && `The model was shown a blank picture in place of that of ${blank}.`,
+    another && `The model was shown another scene's picture in place of that of ${another}.`,
+    not && `The model was not shown ${seen ? `the picture of ${not}` : "these pictures"}: the prompt is text alone.`,
   ].filter(Boolean).join(" ");
 }
 
