@@ -14,21 +14,26 @@ PARTS = 20  # of a stated distribution: so small a model cannot make hundredths 
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
 
 
-def evidence(view: Mapping[str, Any]) -> str:
+def evidence(view: Mapping[str, Any], named: bool = True) -> str:
     """What a viewer reports: who brakes ahead of the ego, or comes closest to it, or what it cannot see.
 
-    The gap is by how many seconds that vehicle is later than the ego where their ways meet.
+    The gap is by how many seconds that vehicle is later than the ego where their ways meet. A vehicle that
+    is not `named` in the prompt is no more than one.
     """
+
+    def who(conflict: Mapping[str, Any]) -> str:
+        return str(conflict["with"]) if named else "one"
+
     for conflict in view["conflicts"]:
         if conflict["other"].get("braking") and conflict["kind"] == "ahead":
-            return f"{conflict['with']} brakes, {conflict['lane']} lane, {conflict['ego']['arc_m']:.0f} m"
+            return f"{who(conflict)} brakes, {conflict['lane']} lane, {conflict['ego']['arc_m']:.0f} m"
     gaps = [(_gap_s(c), c) for c in view["conflicts"]]
     moving = [(gap, c) for gap, c in gaps if gap is not None]
     if moving:
         gap, first = min(moving, key=lambda pair: abs(pair[0]))
-        return f"{first['with']} from {first['sector']}, gap {gap:+.1f} s"
+        return f"{who(first)} from {first['sector']}, gap {gap:+.1f} s"
     if gaps:
-        return f"{gaps[0][1]['with']} from {gaps[0][1]['sector']}, one of us stands"
+        return f"{who(gaps[0][1])} from {gaps[0][1]['sector']}, one of us stands"
     hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
     return f"nothing crosses, hidden {' '.join(hidden) or 'none'}"
 
@@ -38,13 +43,15 @@ def _gap_s(conflict: Mapping[str, Any]) -> float | None:
     return None if ours is None or theirs is None else float(theirs - ours)
 
 
-def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> dict[str, Any]:
+def message(
+    view: Mapping[str, Any], intent: Floats, actions: Sequence[str], named: bool = True
+) -> dict[str, Any]:
     """A helper's message that states an intent, with what any prompt may show of it."""
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
     braking = stated[0]  # the most careful action comes first
     return {
-        "evidence": evidence(view),
+        "evidence": evidence(view, named),
         "risk": "high" if braking > HIGH else "medium" if braking > MEDIUM else "low",
         "intent": tuple(stated),
         "recommended_maneuver": actions[best],
@@ -53,10 +60,11 @@ def message(view: Mapping[str, Any], intent: Floats, actions: Sequence[str]) -> 
 
 
 def answer(
-    prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False
-) -> str:
+    prompt: Prompt, view: Mapping[str, Any], intent: Floats, actions: Sequence[str], *, bare: bool = False,
+    named: bool = True,
+) -> str:  # fmt: skip
     """The answer that states an intent; `bare` without free text, as a constrained answer has to begin."""
-    said = message(view, intent, actions)
+    said = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, said["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
     if view["role"] == "helper":

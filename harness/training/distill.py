@@ -97,6 +97,7 @@ def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Prog
     """Train what is missing, and write the model's folder."""
     plan = student.plan
     curves = {name: student.stage(name, progress) for name in STAGES}
+    weights = student.rounded()
     facts = {
         **curriculum.settings(),
         "scenes": {each.scenario.name: len(each.scenes) for each in student.lessons},
@@ -108,7 +109,7 @@ def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Prog
     }  # fmt: skip
     student.model.eval()
     transformers.utils.logging.disable_progress_bar()  # of a file that is written in no time
-    student.model.save_pretrained(out)
+    student.model.save_pretrained(out, state_dict=weights)
     save_tokenizer(student.tokenizer, out)
     export(out, out / f"{out.absolute().name}-f16.gguf")
     write_whole(out / "README.md", model_card(out.absolute().name, facts))

@@ -8,11 +8,14 @@ import numpy as np
 
 from harness.core import noise
 from harness.core.arrays import Floats
+from harness.core.image import Image
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode
 from harness.prompts.versions import Prompt
 from harness.training.answers import message
 from harness.training.lessons import Lessons
+from harness.training.model import VISION
+from harness.world.perception.camera import Sight
 from harness.world.scenario import Scenario
 
 ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
@@ -29,6 +32,7 @@ class Question:
         graph: the viewer's scene graph.
         messages: chat messages.
         label: soft label, (A,).
+        image: what the viewer's cameras see, if the prompt shows it.
     """
 
     key: str
@@ -37,6 +41,12 @@ class Question:
     graph: Mapping[str, Any]
     messages: tuple[Mapping[str, str], ...]
     label: Floats
+    image: Image | None = None
+
+    @property
+    def named(self) -> bool:
+        """Whether the prompt names those whom the answer may speak of; a picture names nobody."""
+        return any(f"{c['with']} " in self.messages[-1]["content"] for c in self.graph["conflicts"])
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -76,14 +86,12 @@ def with_messages(
         ego, *helpers = scene.viewers
         for prompt in lessons.prompts:
             draws = noise.uniforms((len(helpers),), "arrives", scene.record["episode_seed"], scene.id)
-            heard = [
-                {
-                    "sender": h,
-                    **message(graphs[h], intents[key(lessons, scene, h, prompt)], lessons.scenario.actions),
-                }
-                for h, u in zip(helpers, draws, strict=True)
-                if u < ARRIVES
-            ]
+            heard = []
+            for h, u in zip(helpers, draws, strict=True):
+                if u < ARRIVES:
+                    asked = question(lessons, scene, h, prompt)
+                    said = message(graphs[h], intents[asked.key], asked.actions, asked.named)
+                    heard.append({"sender": h, **said})
             if heard:
                 yield question(lessons, scene, ego, prompt, heard)
 
@@ -95,7 +103,8 @@ def question(
     graph, scenario = scene.record["graphs"][viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
-    return Question(name, scenario, prompt, graph, sent, lessons.labels[scene.id])
+    image = Sight(scenario, scene.state, viewer, VISION.size_px) if prompt.image else None
+    return Question(name, scenario, prompt, graph, sent, lessons.labels[scene.id], image)
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:

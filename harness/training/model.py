@@ -1,52 +1,107 @@
-"""The embedded model before it has learnt anything, and its language: a small BPE tokenizer with ChatML."""
+"""The embedded models before they have learnt anything, and their language: a small BPE with ChatML.
+
+One reads texts, a Qwen3; one sees as well, a Qwen3-VL whose text part is the same.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from harness.backends.tokens import byte_level
+from harness.backends.vision import Vision
 
 CONTEXT_TOKENS = 2048
 # 512 entries leave a prompt a third longer (371 tokens against 282, prompt v2, ego); merges end at 819.
 VOCABULARY = 768
 END, START, PAD = "<|im_end|>", "<|im_start|>", "<|endoftext|>"
+PICTURE, VIDEO, BEGINS, ENDS = "<|image_pad|>", "<|video_pad|>", "<|vision_start|>", "<|vision_end|>"
 TEMPLATE = (
     "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content }}<|im_end|>\n{% endfor %}"
     "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
 )
+SEEING_TEMPLATE = TEMPLATE.replace(
+    "{{ m.content }}",
+    "{% if m.content is string %}{{ m.content }}{% else %}{% for part in m.content %}"
+    f"{{% if part.type == 'image' %}}{BEGINS}{PICTURE}{ENDS}{{% else %}}{{{{ part.text }}}}{{% endif %}}"
+    "{% endfor %}{% endif %}",
+)
+VISION = Vision(512, 256, patch_px=16, merge=2)  # as Qwen3-VL's
+LAYERS, HIDDEN, HEADS, HEAD = 4, 96, 3, 32
+EYES = {  # its vision encoder: a fifth of the weights
+    "depth": 2, "hidden_size": 64, "intermediate_size": 128, "num_heads": 2, "out_hidden_size": HIDDEN,
+    "patch_size": VISION.patch_px, "spatial_merge_size": VISION.merge, "deepstack_visual_indexes": [],
+    "num_position_embeddings": 256,
+}  # fmt: skip
 
 
-def new_model(vocabulary: int, eos: int, pad: int, seed: int) -> Any:
-    """A `Qwen3ForCausalLM` of half a million random weights.
+def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
+    """A `Qwen3ForCausalLM` of half a million random weights, or a `Qwen3VLForConditionalGeneration`.
 
-    They are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream.
+    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream.
+
+    Args:
+        tokenizer: its `tokenizers.Tokenizer`.
+        seed: of the weights.
+        sees: whether it takes pictures.
     """
     import torch
-    from transformers import Qwen3Config, Qwen3ForCausalLM
+    import transformers
 
     torch.manual_seed(seed)
-    config = Qwen3Config(
-        vocab_size=vocabulary, hidden_size=96, intermediate_size=320, num_hidden_layers=4,
-        num_attention_heads=3, num_key_value_heads=1, head_dim=32, tie_word_embeddings=True,
-        max_position_embeddings=CONTEXT_TOKENS, eos_token_id=eos, pad_token_id=pad, bos_token_id=None,
-    )  # fmt: skip
-    model = Qwen3ForCausalLM(config)
+    ids = tokenizer.token_to_id
+    text = {
+        "vocab_size": tokenizer.get_vocab_size(), "hidden_size": HIDDEN, "intermediate_size": 320,
+        "num_hidden_layers": LAYERS, "num_attention_heads": HEADS, "num_key_value_heads": 1, "head_dim": HEAD,
+        "max_position_embeddings": CONTEXT_TOKENS, "eos_token_id": ids(END), "pad_token_id": ids(PAD),
+        "bos_token_id": None,
+    }  # fmt: skip
+    if sees:
+        # A third of the frequencies each for time, height and width, in turn.
+        shares = [-(-(HEAD // 2 - axis) // 3) for axis in range(3)]
+        rope = {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": shares,
+                "mrope_interleaved": True}  # fmt: skip
+        model = transformers.Qwen3VLForConditionalGeneration(
+            transformers.Qwen3VLConfig(
+                text_config={**text, "rope_parameters": rope}, vision_config=EYES, tie_word_embeddings=True,
+                image_token_id=ids(PICTURE), video_token_id=ids(VIDEO), vision_start_token_id=ids(BEGINS),
+                vision_end_token_id=ids(ENDS),
+            )
+        )  # fmt: skip
+        model.generation_config.update(eos_token_id=ids(END), pad_token_id=ids(PAD))
+        embed = model.model.visual.patch_embed
+        # A convolution whose stride is its size is a product of matrices, and takes many times as long.
+        embed.forward = lambda patches: torch.nn.functional.linear(
+            patches, embed.proj.weight.flatten(1), embed.proj.bias
+        )
+    else:
+        model = transformers.Qwen3ForCausalLM(transformers.Qwen3Config(**text, tie_word_embeddings=True))
     with torch.no_grad():
         for name, p in model.named_parameters():
             if p.ndim == 2:
                 std = 0.04 if "embed" in name else 1 / math.sqrt(p.shape[1])
-                residual = "o_proj" in name or "down_proj" in name
-                p.normal_(0.0, std / (math.sqrt(2 * config.num_hidden_layers) if residual else 1.0))
+                residual = "o_proj" in name or "down_proj" in name or "attn.proj" in name or "fc2" in name
+                p.normal_(0.0, std / (math.sqrt(2 * LAYERS) if residual else 1.0))
     return model
 
 
-def train_tokenizer(texts: Iterable[str]) -> Any:
+@lru_cache(maxsize=1)
+def image_processor() -> Any:
+    """What turns pictures into the model's patches."""
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+    pixels = {"shortest_edge": 1 << 12, "longest_edge": 1 << 20}
+    return Qwen2VLImageProcessorPil(patch_size=VISION.patch_px, merge_size=VISION.merge, size=pixels)
+
+
+def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
     """A byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
     from tokenizers import AddedToken, models, pre_tokenizers, trainers
 
     tokenizer = byte_level(models.BPE())
-    special = [AddedToken(t, special=True, normalized=False) for t in (PAD, START, END)]
+    marks = (PICTURE, VIDEO, BEGINS, ENDS) if sees else ()
+    special = [AddedToken(t, special=True, normalized=False) for t in (PAD, START, END, *marks)]
     trainer = trainers.BpeTrainer(
         vocab_size=VOCABULARY - len(special),
         initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
@@ -58,17 +113,24 @@ def train_tokenizer(texts: Iterable[str]) -> Any:
 
 
 def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
-    """A prompt as the chat template renders it: its system message, and the rest up to the answer."""
-    parts = [f"{START}{m['role']}\n{m['content']}{END}\n" for m in messages]
+    """A prompt as the model reads it: its system message, and the rest up to the answer.
+
+    A picture is there as often as it has tokens.
+    """
+    picture = f"{BEGINS}{PICTURE * VISION.tokens}{ENDS}"
+    parts = [f"{START}{m['role']}\n{picture * ('image' in m)}{m['content']}{END}\n" for m in messages]
     return parts[0], "".join(parts[1:]) + f"{START}assistant\n"
 
 
 def save_tokenizer(tokenizer: Any, folder: Path) -> None:
-    """Write it as transformers reads it, chat template included."""
+    """Write it as transformers reads it, chat template included, and what makes patches of pictures."""
     from transformers import PreTrainedTokenizerFast
 
     fast = PreTrainedTokenizerFast(
         tokenizer_object=tokenizer, eos_token=END, pad_token=PAD, clean_up_tokenization_spaces=False
     )
-    fast.chat_template = TEMPLATE
+    sees = tokenizer.token_to_id(PICTURE) is not None
+    fast.chat_template = SEEING_TEMPLATE if sees else TEMPLATE
     fast.save_pretrained(folder)
+    if sees:
+        image_processor().save_pretrained(folder)

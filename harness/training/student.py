@@ -10,11 +10,12 @@ import torch
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
+from harness.core.image import Image
 from harness.prompts import readout
 from harness.training.answers import answer, evidence
 from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.lessons import Lessons
-from harness.training.model import END, PAD, chat, new_model, train_tokenizer
+from harness.training.model import END, chat, new_model, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -33,11 +34,11 @@ class Student:
         self.plan, self.work = plan, work
         self.lessons, self.held_out = zip(*(each.split(HELD_OUT) for each in lessons), strict=True)
         self.questions = [q for each in self.lessons for q in alone(each)]
-        self.tokenizer = self._tokenizer()
+        sees = any(p.image for each in lessons for p in each.prompts)
+        self.tokenizer = self._tokenizer(sees)
         most = max((each.scenario.actions for each in lessons), key=len)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
-        end, pad = (self.tokenizer.token_to_id(t) for t in (END, PAD))
-        self.model = new_model(self.tokenizer.get_vocab_size(), end, pad, plan.seed).to(device)
+        self.model = new_model(self.tokenizer, plan.seed, sees).to(device)
         self._shared: dict[str, Any] = {}
 
     def reading(self, questions: Sequence[Question]) -> list[Sample]:
@@ -46,15 +47,20 @@ class Student:
         samples = []
         for q in questions:
             letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=q.label)]
-            said = f"{letter}: {evidence(q.graph)}{END}"
-            samples.append(self._sample(q.read_out, said, q.label))
+            said = f"{letter}: {evidence(q.graph, q.named)}{END}"
+            samples.append(self._sample(q.read_out, said, q.label, q.image))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
         """Samples whose answer states a distribution."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         return [
-            self._sample(q.messages, answer(q.prompt, q.graph, p, q.actions, bare=bool(b)) + END, None)
+            self._sample(
+                q.messages,
+                answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named) + END,
+                None,
+                q.image,
+            )
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
 
@@ -131,6 +137,15 @@ class Student:
         going.unlink(missing_ok=True)
         return curve
 
+    def rounded(self) -> dict[str, Any]:
+        """The weights in F16, to which the model's are rounded: every engine reads the same numbers."""
+        halves: dict[int, Any] = {}  # by place, since some are there under two names
+        with torch.no_grad():
+            for p in self.model.parameters():
+                halves[p.data_ptr()] = half = p.half()
+                p.copy_(half)
+        return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
+
     def held_out_kl(self) -> list[dict[str, Any]]:
         """Of each scenario, KL (nats) of the read-out to the soft labels on held-out layouts.
 
@@ -154,24 +169,26 @@ class Student:
         """Read-outs of some samples, (A,) each."""
         return read_out(self.model, samples, self.letters)
 
-    def _sample(self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None) -> Sample:
+    def _sample(
+        self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None, image: Image | None
+    ) -> Sample:
         system, rest = chat(messages)
         if system not in self._shared:
             self._shared[system] = self._encode(system)
         head, asked = self._shared[system], self._encode(rest)
         ids = np.concatenate([head, asked, self._encode(said)])
-        return Sample(ids, len(head), system, len(head) + len(asked), target)
+        return Sample(ids, len(head), system, len(head) + len(asked), target, image)
 
     def _encode(self, text: str) -> Any:
         return np.array(self.tokenizer.encode(text).ids, dtype=np.int32)
 
-    def _tokenizer(self) -> Any:
+    def _tokenizer(self, sees: bool) -> Any:
         from tokenizers import Tokenizer
 
         file = self.work / "tokenizer.json"
         if not file.is_file():
             some = self.some(self.questions, 5000)
-            texts = ["".join(chat(q.read_out)) for q in some]
+            texts = [m["content"] for q in some for m in q.read_out]
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
-            train_tokenizer(texts).save(str(file))
+            train_tokenizer(texts, sees).save(str(file))
         return Tokenizer.from_file(str(file))

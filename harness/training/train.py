@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
 from harness.core.files import replacing
+from harness.core.image import Image
+from harness.training.model import image_processor
 from harness.training.muon import Muon
 
 STAGES = ("excerpts", "alone", "messages", "answers")
@@ -47,6 +49,8 @@ class Sample:
         answer_at: where the answer starts.
         target: what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
             text from its first token.
+        image: the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
+            or none has.
     """
 
     ids: NDArray[np.int32]
@@ -54,6 +58,7 @@ class Sample:
     kind: str
     answer_at: int
     target: Floats | None
+    image: Image | None = None
 
 
 @dataclass(frozen=True)
@@ -159,15 +164,30 @@ def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
     first = torch.from_numpy(batch[0].ids[None, :shared].astype(np.int64)).to(device)
     model.model(first, past_key_values=cache, use_cache=True)
     cache.batch_repeat_interleave(len(batch))
-    rest = _padded([s.ids[shared:] for s in batch]).to(device)
-    return model.model(rest, past_key_values=cache, use_cache=True).last_hidden_state
+    ids = _padded([s.ids for s in batch]).to(device)
+    options = _pictures(model, batch, ids)
+    return model.model(ids[:, shared:], past_key_values=cache, use_cache=True, **options).last_hidden_state
+
+
+def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
+    """What a model that sees is given beside the tokens (n, width): patches, and where each token stands."""
+    images = [s.image.pixels for s in batch if s.image is not None]
+    if not images:
+        return {}
+    made = image_processor()(images=images, return_tensors="pt").to(ids.device)
+    places, _ = model.model.get_rope_index(
+        ids, mm_token_type_ids=(ids == model.config.image_token_id).int(),
+        image_grid_thw=made["image_grid_thw"],
+    )  # fmt: skip
+    return {**made, "position_ids": places[:, :, batch[0].shared :]}
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
     """KL of the read-out to its target (nats), plus cross-entropy of the answer's tokens, each a mean."""
     hidden = hidden_states(model, batch)
-    weight, device, shared = model.model.embed_tokens.weight, hidden.device, batch[0].shared
-    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch)
+    weight, device, shared = model.get_input_embeddings().weight, hidden.device, batch[0].shared
+    picture = getattr(model.config, "image_token_id", None)
+    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, picture)
     targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
     if targets:
         reading = list(targets)
@@ -191,13 +211,18 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
     return total
 
 
-def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample]) -> Any:
-    """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers."""
+def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], picture: int | None) -> Any:
+    """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers.
+
+    The token that stands for a `picture` is none of them.
+    """
     shared = batch[0].shared
     ids = _padded([s.ids[shared:] for s in batch]).to(hidden.device)
     places = torch.arange(ids.shape[1])
     ends = torch.tensor([s.answer_at - shared for s in batch])
     there = (places[None, 1:] < ends[:, None]).to(hidden.device)
+    if picture is not None:
+        there &= ids[:, 1:] != picture
     return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
 
 
@@ -205,7 +230,7 @@ def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batc
     """Distribution over the letters after each prompt, (A,) each."""
     model.eval()
     device = next(model.parameters()).device
-    of_letters = model.model.embed_tokens.weight[torch.tensor(letters, device=device)]
+    of_letters = model.get_input_embeddings().weight[torch.tensor(letters, device=device)]
     p: dict[int, Floats] = {}
     order = sorted(range(len(samples)), key=lambda i: (samples[i].kind, samples[i].answer_at))
     for _, group in groupby(order, key=lambda i: samples[i].kind):

@@ -1,0 +1,122 @@
+"""A small model that learns to see: what it is shown in training is what it is shown in a run."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the transformers extra")
+pytest.importorskip("highway_env", reason="needs the sim extra")
+
+from harness.backends import cards
+from harness.backends.base import Request
+from harness.backends.registry import open_backend
+from harness.core.seeds import FIRST
+from harness.prompts import readout
+from harness.prompts import versions as prompts
+from harness.training.distill import Curriculum, distill
+from harness.training.examples import Question, alone
+from harness.training.lessons import Lessons, draw
+from harness.training.model import VISION
+from harness.training.student import Student
+from harness.training.train import STAGES, Plan
+from harness.world.scenarios.occluded_intersection import SCENARIO
+
+VERSIONS = (prompts.load("v7"), prompts.load("v8"))
+PLAN = Plan(dict(zip(STAGES, (32, 64, 32, 32), strict=True)), batch=8)
+LAYOUTS = 2
+
+
+def silent(*_: object) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def lessons(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
+    place = tmp_path_factory.mktemp("lessons")
+    return draw(SCENARIO, VERSIONS, LAYOUTS, FIRST["train"], place, 1, silent)
+
+
+@pytest.fixture(scope="module")
+def folder(lessons: Lessons, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("distilled") / "seer"
+    of_layout: list[Any] = [[], []]
+    for scene in lessons.scenes:
+        point = {"moment": scene.record, "label": lessons.labels[scene.id].tolist()}
+        of_layout[scene.record["episode"]].append(point)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.training.lessons.drawn", lambda scenario, seed, n: of_layout[n])
+        distill(Curriculum({SCENARIO: VERSIONS}, LAYOUTS, FIRST["train"]), PLAN, out, silent, silent, "cpu")
+    return out
+
+
+@pytest.fixture(scope="module")
+def asked(lessons: Lessons) -> list[Question]:
+    return list(alone(lessons))[::17][:12]
+
+
+def request(q: Question, answer: Any = "readout") -> Request:
+    messages = q.read_out if answer == "readout" else q.messages
+    return Request(q.key, q.graph["role"], messages, q.actions, 160, answer=answer, image=q.image)
+
+
+def test_every_question_of_an_image_prompt_has_its_viewers_picture(asked: list[Question]):
+    for q in asked:
+        assert q.image is not None
+        assert q.image.pixels.shape == (VISION.height_px, VISION.width_px, 3)
+    assert len({q.image.sha256 for q in asked if q.image}) > 1
+
+
+def test_an_answer_names_only_those_whom_its_prompt_names(lessons: Lessons):
+    for q in alone(lessons):
+        if q.named:
+            assert q.prompt.version == "v7"
+            assert any(f"{c['with']} " in q.messages[-1]["content"] for c in q.graph["conflicts"])
+
+
+def test_an_engine_reads_what_the_model_learnt_from(
+    folder: Path, lessons: Lessons, asked: list[Question], tmp_path: Path
+):
+    """The same tokens, and the same read-outs as training computed from its own patches and positions."""
+    import torch
+
+    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
+    student = Student([lessons], PLAN, tmp_path, "cpu")
+    student.tokenizer = model.chat.tokenizer.backend_tokenizer
+    student.letters = [student.tokenizer.token_to_id(x) for x in readout.letters(SCENARIO.actions)]
+    state = model.engine.model.state_dict()
+    assert all(torch.equal(p, p.half().float()) for p in state.values()), "as F16 holds them"
+    if student.model.get_input_embeddings().num_embeddings == len(model.chat.tokenizer):
+        student.model.load_state_dict(state)
+    else:
+        student.model = model.engine.model
+    samples = student.reading(asked)
+    filled = model.engine.model.config.image_token_id
+    for q, sample in zip(asked, samples, strict=True):
+        tokens = [filled if token < 0 else token for token in model._tokens(request(q))]
+        assert tokens == sample.ids[: sample.answer_at].tolist()
+    completions = model.complete([request(q) for q in asked])
+    for p, completion in zip(student.read(samples), completions, strict=True):
+        said = json.loads(completion.text)["action_distribution"]
+        assert p == pytest.approx([said[a] for a in SCENARIO.actions], abs=2e-5)
+
+
+def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
+    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
+    for answer in ("json", "constrained", "readout"):
+        for completion in model.complete([request(q, answer) for q in asked[:3]]):
+            assert completion.error is None
+            assert completion.prompt_tokens > VISION.tokens
+
+
+def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
+    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
+    one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)
+    vocabulary = len(model.chat.tokenizer)
+    tokens = [model._tokens(request(one)), model._tokens(Request(
+        "x", "ego", one.read_out, one.actions, 160, answer="readout", image=other.image,
+    ))]  # fmt: skip
+    p = model.next_log_probs(tokens, vocabulary)
+    assert np.abs(p[0] - p[1]).max() > 1e-4
