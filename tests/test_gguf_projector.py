@@ -81,8 +81,8 @@ def test_the_two_say_what_llama_cpp_must_know(tiny: Path, tmp_path: Path) -> Non
     [
         ("vision_config", "spatial_merge_size", 4, r"\[vision_config\]: spatial_merge_size = 4; only 2"),
         ("vision_config", "hidden_act", "gelu", "hidden_act = gelu; only gelu_pytorch_tanh"),
-        ("text_config", "rope_parameters", {"rope_theta": 1e4, "mrope_section": [5, 5, 5]},
-         r"mrope_section = \[5, 5, 5\]; only a sum of 8"),
+        ("text_config", "rope_parameters", {"rope_theta": 1e4, "mrope_section": [4, 2, 2]},
+         r"mrope_section = \[4, 2, 2\]; only \[3, 3, 2\]"),
         ("text_config", "attention_bias", True, "attention_bias = True; only False"),
     ],
 )  # fmt: skip

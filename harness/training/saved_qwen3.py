@@ -72,10 +72,11 @@ def read(checkpoint: Path, shown: str) -> Saved:
         config = {**config["text_config"], "tie_word_embeddings": config["tie_word_embeddings"]}
         _check(vision, _SEEN, f"{shown} [vision_config]")
         sections, half = rope(config)["mrope_section"], config["head_dim"] // 2
-        if sum(sections) != half:  # those left over are time's to transformers, and nobody's to llama.cpp
-            raise UserError(
-                f"{shown}: mrope_section = {printable(sections)}; only a sum of {half} can be exported"
-            )
+        # Frequencies go to time, height and width in turn. One past its turn is time's to transformers, and
+        # not turned at all by llama.cpp.
+        if any(i >= 3 * sections[i % 3] for i in range(half)):
+            whole = [-(-(half - axis) // 3) for axis in range(3)]
+            raise UserError(f"{shown}: mrope_section = {printable(sections)}; only {whole} can be exported")
     elif config["architectures"] != ["Qwen3ForCausalLM"]:
         given = printable(config["architectures"])
         raise UserError(
