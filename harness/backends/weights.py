@@ -58,9 +58,13 @@ def find_gguf(card: Card) -> Path:
     if card.file and not local.is_dir():
         hint = f"run `harness model pull {printable(card.name)}`, or point --model at a .gguf file"
         where = (_snapshot(card) or local) / card.file
-    for file in (where, where.with_name(card.projector)) if card.projector else (where,):
-        if not file.is_file():
-            raise UserError(f"model {printable(card.name)!r}: no file {printable(file)}; {hint}")
+    if not where.is_file():
+        raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
+    if card.projector and not (beside := where.with_name(card.projector)).is_file():
+        raise UserError(
+            f"model {printable(card.name)!r}: no projector {printable(beside)}; put it beside the model's "
+            f"file, or run `harness model pull {printable(card.name)}` where it is on the hub"
+        )
     return where
 
 
