@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 # Half of the build of llama.cpp is tools that nothing here uses. Without GGML_NATIVE one wheel runs on any
 # x86-64 of the last ten years; SOURCE_DATE_EPOCH would take AVX2 from it as well.
-LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DLLAVA_BUILD=OFF -DGGML_NATIVE=OFF \
+LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DMTMD_VIDEO=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
 
 .PHONY: eval test check light browser docs bench clean

@@ -25,11 +25,13 @@ CHECKPOINT: Mapping[str, bytes | None] = {
 }
 
 
-def harness(home: Path, endpoint: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def harness(
+    home: Path, endpoint: str, *arguments: str, cwd: Path | None = None
+) -> subprocess.CompletedProcess[str]:
     """A command line in a process of its own, since the hub's package reads its address when it loads."""
     environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1"}
     command = [sys.executable, "-m", "harness", "model", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
 
 
 def snapshot(home: Path, repository: str) -> Path:
@@ -66,6 +68,20 @@ def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_
     assert "model 'qwen3-4b:llama-cpp': " in done.stderr
     assert f"is not what its card says: sha256 {sha256_bytes(b'GGUF')}, and the card has 7485" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_projector_is_fetched_with_the_file_that_it_belongs_to(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "models" / "eyes.toml").write_text(
+        'engine = "llama-cpp"\ndescription = "d"\nweights = "some/eyes"\nfile = "eyes.gguf"\n'
+        'projector = "mmproj-eyes.gguf"\n[latency]\nsource = "paper"\nbasis = "b"\n'
+        "[vision]\nwidth_px = 512\nheight_px = 256\npatch_px = 16\nmerge = 2\n"
+    )
+    files = {"eyes.gguf": b"GGUF", "mmproj-eyes.gguf": b"GGUF too", "mmproj-other.gguf": b"GGUF"}
+    with serving({"some/eyes": files}) as hub:
+        done = harness(tmp_path, hub.url, "pull", "eyes", cwd=tmp_path)
+        assert (done.returncode, sorted(hub.asked)) == (0, ["eyes.gguf", "mmproj-eyes.gguf"])
 
 
 def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> None:

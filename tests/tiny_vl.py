@@ -3,6 +3,7 @@
 Nothing is downloaded. The weights are random, so tests speak of plumbing, never of what is seen.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,14 @@ TEXT = {
 }  # fmt: skip
 
 
-def build(folder: Path, family: str = "qwen3-vl") -> Path:
-    """Write checkpoint, tokenizer and image processor of a family."""
+def build(folder: Path, family: str = "qwen3-vl", deepstack: Sequence[int] = (0,)) -> Path:
+    """Write checkpoint, tokenizer and image processor of a family.
+
+    Args:
+        folder: where to.
+        family: one of `FAMILIES`.
+        deepstack: layers of Qwen3-VL's vision encoder whose features go into the first layers of its texts.
+    """
     import torch
     from tokenizers import models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast
@@ -70,14 +77,18 @@ def build(folder: Path, family: str = "qwen3-vl") -> Path:
     )  # fmt: skip
     tokenizer.save_pretrained(folder)
     torch.manual_seed(2)
-    model, processor = (_idefics if family == "smolvlm" else _qwen)(tokenizer, family)
+    model, processor = (_idefics if family == "smolvlm" else _qwen)(tokenizer, family, deepstack)
+    with torch.no_grad():  # biases begin as zeros and norms as ones, which would hide one in another's place
+        for parameter in model.parameters():
+            if parameter.ndim == 1:
+                parameter += 0.2 * torch.randn_like(parameter)
     processor.save_pretrained(folder)
     model.generation_config.eos_token_id = tokenizer.eos_token_id
     model.save_pretrained(folder)
     return folder
 
 
-def _qwen(tokenizer: Any, family: str) -> tuple[Any, Any]:
+def _qwen(tokenizer: Any, family: str, deepstack: Sequence[int]) -> tuple[Any, Any]:
     import transformers
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
@@ -87,12 +98,12 @@ def _qwen(tokenizer: Any, family: str) -> tuple[Any, Any]:
     text = {**TEXT, "vocab_size": len(tokenizer), "eos_token_id": tokenizer.eos_token_id}
     if family == "qwen3-vl":
         text |= {"head_dim": 16, "rope_parameters": {
-            "rope_type": "default", "rope_theta": 10000.0, "mrope_section": [4, 2, 2],
+            "rope_type": "default", "rope_theta": 10000.0, "mrope_section": [3, 3, 2],
             "mrope_interleaved": True,
         }}  # fmt: skip
         vision = {
             "depth": 2, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2, "out_hidden_size": 32,
-            "patch_size": 16, "deepstack_visual_indexes": [0], "num_position_embeddings": 64,
+            "patch_size": 16, "deepstack_visual_indexes": list(deepstack), "num_position_embeddings": 64,
             "initializer_range": 0.3,
         }  # fmt: skip
         config = transformers.Qwen3VLConfig(text_config=text, vision_config=vision, **ids)
@@ -109,7 +120,7 @@ def _qwen(tokenizer: Any, family: str) -> tuple[Any, Any]:
     return transformers.Qwen2_5_VLForConditionalGeneration(config), Qwen2VLImageProcessorPil(size=limits)
 
 
-def _idefics(tokenizer: Any, family: str) -> tuple[Any, Any]:
+def _idefics(tokenizer: Any, family: str, deepstack: Sequence[int]) -> tuple[Any, Any]:
     import transformers
     from transformers.models.smolvlm.image_processing_pil_smolvlm import SmolVLMImageProcessorPil
 

@@ -75,9 +75,9 @@ class LanguageModel:
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
-    def next_log_probs(self, prompts: Sequence[Sequence[int]], vocabulary: int) -> Floats:
+    def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
         """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
-        with closing(self.engine.begin(prompts)) as session:
+        with closing(self.engine.begin([self._tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 
     def identity(self) -> dict[str, Any]:

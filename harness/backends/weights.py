@@ -47,10 +47,10 @@ def find_checkpoint(card: Card) -> Path:
 
 
 def find_gguf(card: Card) -> Path:
-    """The GGUF file of a card: as given, beside the cards, or in the hub's cache.
+    """The GGUF file of a card, as given, beside the cards, or in the hub's cache; its projector is beside it.
 
     Raises:
-        UserError: it is nowhere.
+        UserError: one of them is nowhere.
     """
     local = find("models", card.weights or "")
     where = local / card.file if card.file else local
@@ -60,6 +60,11 @@ def find_gguf(card: Card) -> Path:
         where = (_snapshot(card) or local) / card.file
     if not where.is_file():
         raise UserError(f"model {printable(card.name)!r}: no file {printable(where)}; {hint}")
+    if card.projector and not (beside := where.with_name(card.projector)).is_file():
+        raise UserError(
+            f"model {printable(card.name)!r}: no projector {printable(beside)}; put it beside the model's "
+            f"file, or run `harness model pull {printable(card.name)}` where it is on the hub"
+        )
     return where
 
 
@@ -101,7 +106,7 @@ def _download(card: Card) -> None:
     logging.set_verbosity_error()
     if not sys.stderr.isatty():
         disable_progress_bars()
-    patterns = [card.file] if card.file else _FETCHED
+    patterns = [name for name in (card.file, card.projector) if name] if card.file else _FETCHED
     shown = f"model {printable(card.name)!r}"
     at = f"{printable(constants.ENDPOINT)}/{printable(card.weights)}"
     try:

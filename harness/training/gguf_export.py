@@ -1,16 +1,21 @@
-"""A saved Qwen3 checkpoint as one GGUF file, which llama.cpp reads."""
+"""A saved Qwen3 checkpoint as a GGUF file, which llama.cpp reads; a Qwen3-VL's as two."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing
+from harness.training import projector
 from harness.training.saved_qwen3 import Saved, numbers, read, rope
 
-_ENDS = {"model.embed_tokens": "token_embd", "model.norm": "output_norm", "lm_head": "output"}
+Dtype = Literal["F16", "F32"]
+_ENDS = {"embed_tokens": "token_embd", "norm": "output_norm"}
 _BLOCK = {
     "input_layernorm": "attn_norm",
     "self_attn.q_proj": "attn_q",
@@ -26,13 +31,14 @@ _BLOCK = {
 }
 
 
-def export(checkpoint: Path, out: Path, dtype: Literal["F16", "F32"] = "F16") -> None:
-    """Write a `Qwen3ForCausalLM` folder as a GGUF file, whole or not at all.
+def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
+    """Write a Qwen3 folder as a GGUF file, whole or not at all; of a Qwen3-VL its projector beside it.
 
     Args:
-        checkpoint: folder with config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json
-            and a chat template.
-        out: the file to write; replaced if it exists.
+        checkpoint: folder of a `Qwen3ForCausalLM` or `Qwen3VLForConditionalGeneration` with config.json,
+            model.safetensors (float32, float16 or bfloat16), tokenizer.json, a chat template and, of the
+            latter, preprocessor_config.json.
+        out: the file to write; replaced if it exists. The projector is `mmproj-` and its name.
         dtype: number format of the matrices; vectors are always F32.
 
     Raises:
@@ -41,8 +47,16 @@ def export(checkpoint: Path, out: Path, dtype: Literal["F16", "F32"] = "F16") ->
     shown = f"checkpoint {printable(checkpoint)}"
     try:
         saved = read(checkpoint, shown)
-        with replacing(out) as part:
-            _write(part, checkpoint, saved, dtype, shown)
+        name = checkpoint.resolve().name
+        with ExitStack() as files:
+            part = files.enter_context(replacing(out))
+            architecture = "qwen3vl" if saved.vision else "qwen3"
+            describe = partial(_describe, saved, name, shown)
+            _write(part, checkpoint, _names(saved), dtype, shown, architecture, describe)
+            if saved.vision:
+                part = files.enter_context(replacing(projector_of(out)))
+                describe = partial(projector.describe, saved.vision, name)
+                _write(part, checkpoint, projector.names(saved.vision), dtype, shown, "clip", describe)
     except UserError:
         raise
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
@@ -50,23 +64,31 @@ def export(checkpoint: Path, out: Path, dtype: Literal["F16", "F32"] = "F16") ->
         raise UserError(f"{shown} cannot be exported: {reason}; save or copy it again") from error
 
 
-def _write(part: Path, checkpoint: Path, saved: Saved, dtype: Literal["F16", "F32"], shown: str) -> None:
-    from gguf import GGUFWriter
+def projector_of(out: Path) -> Path:
+    """Where the projector of an exported file goes."""
+    return out.with_name(f"mmproj-{out.name}")
 
-    writer = GGUFWriter(part, "qwen3")
+
+def _write(
+    part: Path, checkpoint: Path, names: Mapping[str, str], dtype: Dtype, shown: str, architecture: str,
+    describe: Callable[[Any, int], None],
+) -> None:  # fmt: skip
+    from gguf import GGUFWriter, LlamaFileType
+
+    writer = GGUFWriter(part, architecture)
     try:
-        _describe(writer, checkpoint.resolve().name, saved, dtype, shown)
+        describe(writer, LlamaFileType.MOSTLY_F16 if dtype == "F16" else LlamaFileType.ALL_F32)
         # Told first and written one by one: no more than one matrix is in memory.
-        tensors = list(_tensors(checkpoint, saved.config, dtype, shown))
+        tensors = list(_tensors(checkpoint, names, dtype, shown))
         for name, tensor, kind in tensors:
-            size = int(np.prod(tensor.shape)) * kind.itemsize
-            writer.add_tensor_info(name, tensor.shape, kind, size)
+            shape = _frame(name, np.broadcast_to(np.float32(0), tensor.shape)).shape
+            writer.add_tensor_info(name, shape, kind, int(np.prod(shape)) * kind.itemsize)
         writer.write_header_to_file()
         writer.write_kv_data_to_file()
         writer.write_ti_data_to_file()
         for name, tensor, kind in tensors:
             with np.errstate(over="ignore"):
-                converted = numbers(tensor).astype(kind)
+                converted = _frame(name, numbers(tensor)).astype(kind)
             if not np.isfinite(converted).all():
                 raise UserError(f"{shown}: {name} has numbers past the range of {dtype}; export it as F32")
             writer.write_tensor_data(converted)
@@ -74,12 +96,10 @@ def _write(part: Path, checkpoint: Path, saved: Saved, dtype: Literal["F16", "F3
         writer.close()
 
 
-def _describe(writer: Any, name: str, saved: Saved, dtype: Literal["F16", "F32"], shown: str) -> None:
-    from gguf import LlamaFileType
-
+def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) -> None:
     config, tokenizer = saved.config, saved.tokenizer
     writer.add_name(name)
-    writer.add_file_type(LlamaFileType.MOSTLY_F16 if dtype == "F16" else LlamaFileType.ALL_F32)
+    writer.add_file_type(file_type)
     writer.add_vocab_size(config["vocab_size"])
     writer.add_context_length(config["max_position_embeddings"])
     writer.add_embedding_length(config["hidden_size"])
@@ -91,6 +111,9 @@ def _describe(writer: Any, name: str, saved: Saved, dtype: Literal["F16", "F32"]
     writer.add_value_length(config["head_dim"])
     writer.add_layer_norm_rms_eps(config["rms_norm_eps"])
     writer.add_rope_freq_base(rope(config)["rope_theta"])
+    if saved.vision:
+        writer.add_rope_dimension_sections([*rope(config)["mrope_section"], 0])
+        writer.add_num_deepstack_layers(len(saved.vision["deepstack_visual_indexes"]))
     tokens, types = _vocabulary(tokenizer, config["vocab_size"], shown)
     writer.add_tokenizer_model("gpt2")
     writer.add_tokenizer_pre("qwen2")
@@ -124,21 +147,32 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
     return [text for text, _ in by_row], [int(kind) for _, kind in by_row]
 
 
+def _names(saved: Saved) -> dict[str, str]:
+    """Each tensor of the text part: its name in the GGUF, and in the checkpoint."""
+    within = "model.language_model" if saved.vision else "model"
+    names = {ours: f"{within}.{theirs}" for theirs, ours in _ENDS.items()}
+    if not saved.config["tie_word_embeddings"]:  # else llama.cpp takes the embedding for it
+        names["output"] = "lm_head"
+    for i in range(saved.config["num_hidden_layers"]):
+        names |= {f"blk.{i}.{ours}": f"{within}.layers.{i}.{theirs}" for theirs, ours in _BLOCK.items()}
+    return {f"{ours}.weight": f"{theirs}.weight" for ours, theirs in names.items()}
+
+
 def _tensors(
-    checkpoint: Path, config: Mapping[str, Any], dtype: Literal["F16", "F32"], shown: str
+    checkpoint: Path, names: Mapping[str, str], dtype: Dtype, shown: str
 ) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
     """Name in the GGUF, place in the checkpoint and number format of each tensor."""
     from gguf.utility import SafetensorsLocal
 
-    names = dict(_ENDS)
-    if config["tie_word_embeddings"]:  # llama.cpp then takes the embedding for it
-        del names["lm_head"]
-    for i in range(config["num_hidden_layers"]):
-        names |= {f"model.layers.{i}.{theirs}": f"blk.{i}.{ours}" for theirs, ours in _BLOCK.items()}
     tensors = SafetensorsLocal(checkpoint / "model.safetensors").tensors
-    for theirs, ours in names.items():
-        tensor = tensors.get(f"{theirs}.weight")
+    for ours, theirs in names.items():
+        tensor = tensors.get(theirs)
         if tensor is None:
-            raise UserError(f"{shown} lacks {theirs}.weight; save or copy it again")
-        full = dtype == "F32" or len(tensor.shape) == 1
-        yield f"{ours}.weight", tensor, np.dtype(np.float32 if full else np.float16)
+            raise UserError(f"{shown} lacks {theirs}; save or copy it again")
+        full = dtype == "F32" or len(tensor.shape) == 1 or ours in projector.FULL
+        yield ours, tensor, np.dtype(np.float32 if full else np.float16)
+
+
+def _frame(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weights as they are; of those of a video's two frames, (out, in, 2, y, x), the name's frame."""
+    return values[:, :, int(name.endswith(".1"))] if values.ndim == 5 else values

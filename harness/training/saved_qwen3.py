@@ -1,7 +1,7 @@
-"""A saved Qwen3 checkpoint, read from its files without torch or transformers.
+"""A saved Qwen3 or Qwen3-VL checkpoint, read from its files without torch or transformers.
 
 What llama.cpp would take otherwise than the checkpoint means it, without a word, is refused: another
-pre-tokeniser, another rope, a bias.
+pre-tokeniser, another rope, a bias, another vision encoder.
 """
 
 import json
@@ -18,17 +18,29 @@ from harness.core.errors import UserError, printable
 # Where a file may say otherwise, and llama.cpp would not hear it. Its Unicode normalisation is none; NFC is
 # what Qwen's tokenizer does, and nothing to text that is composed already.
 _ONE_VALUE = {"attention_bias": False, "use_sliding_window": False, "hidden_act": "silu"}
+_SEEN = {"temporal_patch_size": 2, "spatial_merge_size": 2, "in_channels": 3,
+         "hidden_act": "gelu_pytorch_tanh"}  # fmt: skip
 _NORMALIZERS = (None, {"type": "NFC"})
+_PIXELS = "preprocessor_config.json"
 _SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_SPLIT}, "behavior": "Isolated", "invert": False}
 _BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
 
 
 class Saved(NamedTuple):
-    """What its small files say."""
+    """What its small files say.
+
+    Attributes:
+        config: of the text part.
+        tokenizer: whole.
+        template: of a chat.
+        vision: config of the vision encoder, and its processor's `image_mean` and `image_std`; None if the
+            model reads text only.
+    """
 
     config: dict[str, Any]
     tokenizer: dict[str, Any]
     template: str
+    vision: dict[str, Any] | None = None
 
 
 def read(checkpoint: Path, shown: str) -> Saved:
@@ -39,7 +51,7 @@ def read(checkpoint: Path, shown: str) -> Saved:
     """
     texts = {
         name: (checkpoint / name).read_text(encoding="utf-8")
-        for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja")
+        for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja", _PIXELS)
         if (checkpoint / name).is_file()
     }
     for name in ("config.json", "tokenizer.json", "model.safetensors"):
@@ -51,17 +63,37 @@ def read(checkpoint: Path, shown: str) -> Saved:
     )
     if not isinstance(template, str):
         raise UserError(f"{shown} has no chat template; put a chat_template.jinja beside its config.json")
-    if config["architectures"] != ["Qwen3ForCausalLM"]:
+    vision = None
+    if config["architectures"] == ["Qwen3VLForConditionalGeneration"]:
+        if _PIXELS not in texts:
+            raise UserError(f"{shown} has no {_PIXELS}; save its image processor as well")
+        processor = json.loads(texts[_PIXELS])
+        vision = config["vision_config"] | {key: processor[key] for key in ("image_mean", "image_std")}
+        config = {**config["text_config"], "tie_word_embeddings": config["tie_word_embeddings"]}
+        _check(vision, _SEEN, f"{shown} [vision_config]")
+        sections, half = rope(config)["mrope_section"], config["head_dim"] // 2
+        # Frequencies go to time, height and width in turn. One past its turn is time's to transformers, and
+        # not turned at all by llama.cpp.
+        if any(i >= 3 * sections[i % 3] for i in range(half)):
+            whole = [-(-(half - axis) // 3) for axis in range(3)]
+            raise UserError(f"{shown}: mrope_section = {printable(sections)}; only {whole} can be exported")
+    elif config["architectures"] != ["Qwen3ForCausalLM"]:
         given = printable(config["architectures"])
-        raise UserError(f"{shown} is a {given}; only Qwen3ForCausalLM can be exported")
-    for key, value in _ONE_VALUE.items():
-        if config.get(key, value) != value:
-            raise UserError(f"{shown}: {key} = {printable(config[key])}; only {value} can be exported")
+        raise UserError(
+            f"{shown} is a {given}; only Qwen3ForCausalLM and Qwen3VLForConditionalGeneration can be exported"
+        )
+    _check(config, _ONE_VALUE, shown)
     scaling = rope(config).get("rope_type", "default")
     if scaling != "default" or config.get("rope_scaling"):
         raise UserError(f"{shown} scales its rope ({printable(scaling)}); only the default can be exported")
     _check_tokenizer(tokenizer, shown)
-    return Saved(config, tokenizer, template)
+    return Saved(config, tokenizer, template, vision)
+
+
+def _check(config: Mapping[str, Any], only: Mapping[str, Any], shown: str) -> None:
+    for key, value in only.items():
+        if config.get(key, value) != value:
+            raise UserError(f"{shown}: {key} = {printable(config[key])}; only {value} can be exported")
 
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.backends.base import Request
 from harness.backends.cards import Card
 from harness.backends.chat import Chat
 from harness.backends.llama_cpp.child import Child
@@ -38,9 +39,9 @@ class LlamaBackend(Child):
         )
         self.chat = _RemoteChat(card.name, self)
 
-    def next_log_probs(self, prompts: Sequence[Sequence[int]], vocabulary: int) -> Floats:
+    def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
         """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
-        found: Floats = self.call("next_log_probs", prompts, vocabulary)
+        found: Floats = self.call("next_log_probs", requests, vocabulary)
         return found
 
 
@@ -59,6 +60,7 @@ class _RemoteChat(Chat):
     def __init__(self, name: str, child: Child) -> None:
         self.name = name
         self.template = child.call("chat.template")
+        self.image_token = child.call("chat.image_token")
         self.child = child
 
     bos = property(_of_child("bos"))

@@ -29,8 +29,9 @@ class Vocabulary(Protocol):
 class GgufChat(Chat):
     """A GGUF file's tokenizer and chat template."""
 
-    def __init__(self, name: str, vocabulary: Vocabulary) -> None:
+    def __init__(self, name: str, vocabulary: Vocabulary, image_token: str | None = None) -> None:
         self.name = name
+        self.image_token = image_token
         self.template = vocabulary.template
         self._vocabulary = vocabulary
         try:

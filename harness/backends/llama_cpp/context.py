@@ -1,6 +1,5 @@
 """Sequences of tokens in llama.cpp's memory, which grows with them."""
 
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.backends.engine import common_length
-from harness.backends.llama_cpp.model import LlamaModel, last_error
+from harness.backends.llama_cpp.model import LlamaModel, last_error, threads
+from harness.backends.llama_cpp.projector import Projector, Run, text_run
 
 Ints = NDArray[np.int32]
 Logits = NDArray[np.float32]
@@ -23,6 +23,8 @@ _FIELDS = c.llama_batch._fields_
 class LlamaContext:
     """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
 
+    Negative tokens are a picture's. A sequence may be cut before or behind a picture, not within.
+
     Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would
     attend to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a
     sequence has filled its room it is made anew at twice the size, and filled again from the tokens.
@@ -32,20 +34,23 @@ class LlamaContext:
         cache_type: number format of keys and values, `F32` for F32 weights and else `F16`.
     """
 
-    def __init__(self, model: LlamaModel, sequences: int) -> None:
+    def __init__(self, model: LlamaModel, sequences: int, projector: Projector | None = None) -> None:
         self._model = model
+        self._projector = projector
         self._sequences = sequences
         self._context: int | None = None
         self._room = 0
         self.cache_type = "F32" if model.dtype == "F32" else "F16"
         self.tokens: dict[int, list[int]] = {}
+        self._ends: dict[int, list[int]] = {}  # of each token, the position behind it
 
     def fork(self, source: int, copy: int, length: int) -> None:
         """Let a new sequence begin with the first `length` tokens of another, as they were computed."""
         if length:  # between rooms llama.cpp copies a whole sequence only
             c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
-            c.llama_memory_seq_rm(self._memory(), copy, length, -1)
-        self.tokens[copy] = self.tokens[source][:length] if length else []
+            c.llama_memory_seq_rm(self._memory(), copy, self._ends[source][length - 1], -1)
+        for each in (self.tokens, self._ends):
+            each[copy] = each[source][:length] if length else []
 
     def drop(self, sequence: int) -> None:
         """Forget a sequence, if it is there."""
@@ -78,15 +83,13 @@ class LlamaContext:
         except BaseException:
             self.free()
             raise
-        for sequence, chunk in chunks.items():
-            self.tokens[sequence] += chunk
         return logits
 
     def free(self) -> None:
         """Give all memory back; every sequence is gone."""
         if self._context:
             c.llama_free(self._context)
-        self._context, self.tokens = None, {}
+        self._context, self.tokens, self._ends = None, {}, {}
 
     def _memory(self) -> int:
         memory: int = c.llama_get_memory(self._context)
@@ -122,50 +125,91 @@ class LlamaContext:
         for sequence, tokens in held:
             shared = [] if self._model.whole_state else self.tokens.get(before, [])
             self.fork(before, sequence, common_length([shared, tokens]))
-            if rest := tokens[len(self.tokens[sequence]) :]:
-                self._decode({sequence: rest})
-            self.tokens[sequence], before = tokens, sequence
+            try:
+                if rest := tokens[len(self.tokens[sequence]) :]:
+                    self._decode({sequence: rest})
+            except LookupError:  # a beginning with a picture that nobody has any more
+                self.drop(sequence)
+            else:
+                before = sequence
 
     def _decode(self, chunks: Mapping[int, Sequence[int]]) -> Logits | None:
-        """Logits after each chunk; None if there is no room."""
-        each = [(t, len(self.tokens[s]) + i, s) for s, chunk in chunks.items() for i, t in enumerate(chunk)]
-        token, place, owner = np.array(each, dtype=np.int32).T.copy()
-        last = np.cumsum([len(chunk) for chunk in chunks.values()]) - 1
-        wanted = np.zeros(len(token), dtype=np.int8)
-        wanted[last] = 1
+        """Append chunks; logits after each. None, with nothing appended, if there is no room."""
+        queues = {s: self._runs(chunk) for s, chunk in chunks.items()}
+        ends = {s: self._ends[s][-1:] or [0] for s in chunks}
         logits = np.empty((len(chunks), self._model.vocabulary), dtype=np.float32)
-        for start in range(0, len(token), _BATCH):
-            part = slice(start, start + _BATCH)
-            code = self._call(token[part], place[part], owner[part], wanted[part])
-            if code == _FULL:
+        while fronts := {s: queue[0] for s, queue in queues.items() if queue}:
+            texts = {s: run for s, run in fronts.items() if run.inputs.ndim == 1}
+            now = texts or fronts  # llama.cpp takes texts together, or pictures
+            rows = [row if len(queues[s]) == 1 else None for row, s in enumerate(chunks) if s in now]
+            if not self._read(now, [ends[s][-1] for s in now], logits, rows):
                 return None
-            if code:
-                raise RuntimeError(f"llama_decode returned {code}: {last_error()}")
-            for row in np.flatnonzero((last >= start) & (last < start + _BATCH)):
-                found = c.llama_get_logits_ith(self._context, int(last[row]) - start)
-                logits[row] = np.ctypeslib.as_array(found, (self._model.vocabulary,))
+            for s, run in now.items():
+                ends[s] += run.ends(ends[s][-1])
+                del queues[s][0]
+        for s, chunk in chunks.items():
+            self.tokens[s] += chunk
+            self._ends[s] += ends[s][1:]
         return logits
 
-    def _call(self, token: Ints, place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
+    def _runs(self, chunk: Sequence[int]) -> list[Run]:
+        """A chunk as texts and pictures in turn."""
+        if self._projector is None or min(chunk) >= 0:
+            return [text_run(chunk)]
+        runs, start = [], 0
+        while start < len(chunk):
+            if chunk[start] < 0:
+                runs.append(self._projector.run(chunk[start]))
+            else:
+                end = next((i for i in range(start, len(chunk)) if chunk[i] < 0), len(chunk))
+                runs.append(text_run(chunk[start:end]))
+            start += len(runs[-1].inputs)
+        return runs
+
+    def _read(
+        self, runs: Mapping[int, Run], starts: Sequence[int], logits: Logits, rows: Sequence[int | None]
+    ) -> bool:
+        """Read a run of each of some sequences, all texts or all pictures; whether there was room.
+
+        Args:
+            runs: by sequence.
+            starts: position of the first token of each.
+            logits: where those behind a run go.
+            rows: into which row; None if those of a run are not wanted.
+        """
+        inputs = np.concatenate([run.inputs for run in runs.values()])
+        places = [run.at(start) for run, start in zip(runs.values(), starts, strict=True)]
+        place = np.concatenate(places, axis=1)
+        lengths = [len(run.inputs) for run in runs.values()]
+        owner = np.repeat(np.array(list(runs), dtype=np.int32), lengths)
+        last = np.cumsum(lengths) - 1
+        wanted = np.zeros(len(inputs), dtype=np.int8)
+        wanted[last] = [row is not None for row in rows]
+        for start in range(0, len(inputs), _BATCH):
+            part = slice(start, start + _BATCH)
+            code = self._call(inputs[part], place[:, part].copy(), owner[part], wanted[part])
+            if code == _FULL:
+                return False
+            if code:
+                raise RuntimeError(f"llama_decode returned {code}: {last_error()}")
+            for row, i in zip(rows, last - start, strict=True):
+                if row is not None and 0 <= i < _BATCH:
+                    found = c.llama_get_logits_ith(self._context, int(i))
+                    logits[row] = np.ctypeslib.as_array(found, (self._model.vocabulary,))
+        return True
+
+    def _call(self, inputs: NDArray[Any], place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
         """llama_decode on arrays of one length, without a copy."""
         one = np.ones_like(owner)
         # One address a token: it belongs to one sequence.
         owners = owner.ctypes.data + owner.itemsize * np.arange(len(owner), dtype=np.uintp)
         arrays: dict[str, NDArray[Any]] = {
-            "token": token,
+            "token" if inputs.ndim == 1 else "embd": inputs,
             "pos": place,
             "n_seq_id": one,
             "seq_id": owners,
             "logits": wanted,
         }
         pointers = {name: arrays[name].ctypes.data_as(kind) for name, kind in _FIELDS if name in arrays}
-        code: int = c.llama_decode(self._context, c.llama_batch(n_tokens=len(token), **pointers))
+        code: int = c.llama_decode(self._context, c.llama_batch(n_tokens=len(inputs), **pointers))
         return code
-
-
-def threads() -> int:
-    """Threads of a computation: OMP_NUM_THREADS, as for any other engine, else one a core."""
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    if asked.isdigit() and int(asked):
-        return int(asked)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -15,6 +15,7 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.chat import GgufChat
 from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel, build, most_sequences
+from harness.backends.llama_cpp.projector import Projector
 from harness.backends.weights import hub_commit
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
@@ -23,23 +24,30 @@ from harness.core.image import Image
 
 BEGINNINGS = 3  # of prompts, kept between calls: one a role, and one of a batch with both
 _ANSWER = 256  # tokens of an answer that memory is made for at once
+_PICTURES = ("<|image_pad|>", "<image>")  # what chat templates write for a picture
 
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
     """Load a GGUF file in this process, which llama.cpp may end.
 
     Raises:
-        UserError: the file, the device or the batch size is none for llama.cpp.
+        UserError: the file, its projector, the device or the batch size is none for llama.cpp.
     """
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # which starts a debugger where there is one
     most = most_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
-    return LanguageModel(LlamaEngine(card, file, LlamaModel(card.name, file, device), batch_size), batch_size)
+    model = LlamaModel(card.name, file, device)
+    projector = None
+    if card.vision and card.projector:
+        projector = Projector(card.name, file.with_name(card.projector), model, card.vision)
+    return LanguageModel(LlamaEngine(card, file, model, batch_size, projector), batch_size)
 
 
 class LlamaEngine:
     """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts.
+
+    Without a projector it takes no pictures.
 
     Attributes:
         chat: its tokenizer and chat template.
@@ -47,19 +55,27 @@ class LlamaEngine:
         stops: token ids that end an answer, sorted.
     """
 
-    def __init__(self, card: Card, file: Path, model: LlamaModel, batch_size: int) -> None:
-        self.chat: Chat = GgufChat(card.name, model)
+    def __init__(
+        self, card: Card, file: Path, model: LlamaModel, batch_size: int, projector: Projector | None = None
+    ) -> None:
+        shown = [text for text in _PICTURES if projector and text in model.template]
+        if projector and not shown:
+            raise UserError(f"model {card.name!r}: its chat template has none of {_PICTURES} for a picture")
+        self.chat: Chat = GgufChat(card.name, model, shown[0] if shown else None)
         self.context_tokens = card.context_tokens or model.trained_tokens
         self.stops: Sequence[int] = model.stops
         self._card, self._file, self._model = card, file, model
-        self._context = LlamaContext(model, batch_size + BEGINNINGS)
+        self._projector = projector
+        self._context = LlamaContext(model, batch_size + BEGINNINGS, projector)
         self._free = list(range(batch_size))
         # Least lately used first.
         self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
 
     def look(self, image: Image) -> list[int]:
         """What stands for a picture in a prompt."""
-        raise ValueError("llama.cpp takes no pictures here")
+        if self._projector is None:
+            raise ValueError(f"model {self._card.name!r} takes no pictures")
+        return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
         """Read some prompts, none of them empty; what they begin with in common is computed once.
@@ -85,6 +101,8 @@ class LlamaEngine:
         kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
         new = 2 * max(kept.values()) < common
         if not rest:  # a prompt that is asked again is read again: else its time would be no answer's time
+            if self._projector and max(kept.values()) == common:
+                self._projector.forget(shared)
             kept = {b: n if n < common else 0 for b, n in kept.items()}
         nearest = max(self._beginnings, key=kept.__getitem__)
         known = kept[nearest]
@@ -127,10 +145,20 @@ class LlamaEngine:
             "file": self._card.file,
             "revision": commit,
             "file_sha256": None if commit else self._sha256,
+            **self._projector_identity,
             "dtype": self._model.dtype,
             "kv_cache": self._context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
+        }
+
+    @cached_property
+    def _projector_identity(self) -> dict[str, Any]:
+        if not (self._projector and self._card.projector):
+            return {}
+        return {
+            "projector": self._card.projector,
+            "projector_sha256": sha256_file(self._file.with_name(self._card.projector)),
         }
 
     @cached_property

@@ -4,6 +4,7 @@ Everything here runs in the child process (`harness.backends.llama_cpp.child`): 
 """
 
 import ctypes
+import os
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +20,7 @@ _errors: list[str] = []
 
 
 @c.llama_log_callback  # type: ignore[untyped-decorator]
-def _log(level: int, text: bytes, _: Any) -> None:
+def keep_errors(level: int, text: bytes, _: Any) -> None:
     """Keep what went wrong for the user's one line; the rest is chatter."""
     if level == _ERROR:
         _errors.append(text.decode(errors="replace").strip())
@@ -27,7 +28,7 @@ def _log(level: int, text: bytes, _: Any) -> None:
 
 def last_error() -> str:
     """The first thing that llama.cpp complained of since the last call, made safe to show."""
-    said = printable(_errors[0], 200) if _errors else "llama.cpp does not say why"
+    said = printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
     _errors.clear()
     return said
 
@@ -49,7 +50,7 @@ class LlamaModel:
     """
 
     def __init__(self, name: str, file: Path, device: str | None) -> None:
-        c.llama_log_set(_log, ctypes.c_void_p(0))
+        c.llama_log_set(keep_errors, ctypes.c_void_p(0))
         shown = f"model {name!r} in {printable(file)}"
         if device not in (None, "cpu") and not (device == "gpu" and c.llama_supports_gpu_offload()):
             known = "cpu, gpu" if c.llama_supports_gpu_offload() else "cpu"
@@ -132,3 +133,11 @@ def build() -> dict[str, str]:
     """What of llama.cpp itself moves an answer's last digits."""
     features: bytes = c.llama_print_system_info()
     return {"llama_cpp_python": version("llama-cpp-python"), "system": features.decode().strip(" |")}
+
+
+def threads() -> int:
+    """Threads of a computation: OMP_NUM_THREADS, as for any other engine, else one a core."""
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    if asked.isdigit() and int(asked):
+        return int(asked)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,216 @@
+"""The projector of a model that takes pictures: a second GGUF file, which llama.cpp's mtmd reads.
+
+A picture's tokens are negative numbers made from its digest, so they are the same in every process.
+"""
+
+import ctypes
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
+
+import llama_cpp as c
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error, threads
+from harness.backends.vision import Vision
+from harness.core.errors import UserError, printable
+from harness.core.image import Image
+
+KEPT = 64  # pictures whose embeddings are kept: those of a chunk of requests, for a repair turn
+_BITS = 16  # of a token's number, which say its place among a picture's tokens
+_DIGITS = 10  # of a picture's digest, in the other bits
+
+
+class Run(NamedTuple):
+    """Tokens that llama.cpp takes in one go.
+
+    Attributes:
+        inputs: token ids, (n,) int32, or embeddings, (n, width) float32.
+        places: their positions from the first one's, (1, n) int32; with M-RoPE a picture's are (4, n).
+        span: positions that they take; a picture may take fewer than it has tokens.
+    """
+
+    inputs: NDArray[Any]
+    places: NDArray[np.int32]
+    span: int
+
+    def at(self, start: int) -> NDArray[np.int32]:
+        """Positions of its tokens; the fourth row is no position, and 0."""
+        shifted = self.places + np.int32(start)
+        shifted[3:] = 0
+        return shifted
+
+    def ends(self, start: int) -> Sequence[int]:
+        """Position behind each token, of a picture behind all of it."""
+        n = len(self.inputs)
+        return range(start + 1, start + n + 1) if self.inputs.ndim == 1 else [start + self.span] * n
+
+
+def text_run(ids: Sequence[int]) -> Run:
+    """Tokens of a text."""
+    return Run(np.array(ids, dtype=np.int32), np.arange(len(ids), dtype=np.int32)[None], len(ids))
+
+
+class Projector:
+    """A loaded projector.
+
+    Pictures are encoded when their tokens are first read, so that this is part of an answer's time.
+    """
+
+    def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
+        """Load it.
+
+        Raises:
+            UserError: llama-cpp-python has no mtmd, the file is no projector or another model's, or a picture
+                does not become as many tokens as the card says.
+        """
+        shown = f"model {name!r} with projector {printable(file)}"
+        try:
+            m = import_module("llama_cpp.mtmd_cpp")
+        except (ImportError, OSError):  # OSError: its library is not there
+            raise UserError(
+                f"model {name!r}: llama-cpp-python was built here without what reads pictures; run "
+                "`pip install --force-reinstall --no-cache-dir --no-deps llama-cpp-python`"
+            ) from None
+        self._m: Any = m
+        self._model = model
+        m.mtmd_log_set(keep_errors, ctypes.c_void_p(0))
+        params = m.mtmd_context_params_default()
+        params.use_gpu = model.device == "gpu"
+        params.n_threads = threads()
+        params.flash_attn_type = c.LLAMA_FLASH_ATTN_TYPE_DISABLED  # which rounds to F16
+        params.print_timings = params.warmup = False
+        if vision.scaled_to_px is None:
+            square = (vision.patch_px * vision.merge) ** 2
+            params.image_min_tokens = max(1, -(-(vision.least_px or 1) // square))
+            params.image_max_tokens = (vision.most_px or square << _BITS) // square
+        last_error()
+        self._context = m.mtmd_init_from_file(bytes(file), model.pointer, params)
+        if not self._context:
+            raise UserError(f"{shown} does not load: {last_error()}; give the mmproj file of this very model")
+        if not m.mtmd_support_vision(self._context):
+            raise UserError(f"{shown} takes no pictures; give an mmproj file of a model that does")
+        if m.mtmd_decode_use_non_causal(self._context, None):
+            raise UserError(f"{shown}: its pictures' tokens see those behind them, which is not done here")
+        self._mrope: bool = m.mtmd_decode_use_mrope(self._context)
+        self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
+        self._layouts: dict[tuple[int, ...], list[Sequence[int] | int]] = {}
+        self._encoded: OrderedDict[int, dict[int, Run]] = OrderedDict()
+        found = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
+        if found != vision.tokens:
+            raise UserError(
+                f"{shown} makes {found} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
+                f"card's [vision] {vision.tokens}; mend the card, or give the model's own projector"
+            )
+
+    def tokens(self, image: Image) -> list[int]:
+        """What stands for a picture in a prompt; the picture must be there until it is read."""
+        key = int(image.sha256[:_DIGITS], 16)
+        self._images[key] = image
+        found: list[int] = []
+        place = 0
+        for part in self._layout(image.pixels.shape[:2]):
+            if isinstance(part, int):
+                found += [-1 - (key << _BITS | i) for i in range(place, place + part)]
+                place += part
+            else:
+                found += part
+        return found
+
+    def run(self, token: int) -> Run:
+        """The part of a picture that begins with a token.
+
+        Raises:
+            LookupError: none does, or its picture is gone.
+        """
+        key, place = _of(token)
+        if key not in self._encoded:
+            if (image := self._images.get(key)) is None:
+                raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
+            self._encoded[key] = self._encode(image)
+            if len(self._encoded) > KEPT:
+                self._encoded.popitem(last=False)
+        self._encoded.move_to_end(key)
+        return self._encoded[key][place]
+
+    def forget(self, tokens: Sequence[int]) -> None:
+        """Encode the pictures among some tokens again when they are read again."""
+        for key in {_of(token)[0] for token in tokens if token < 0}:
+            self._encoded.pop(key, None)
+
+    def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
+        """Token ids of a marker, or how many tokens a picture's part has, in order.
+
+        What the chat template writes around a picture itself is left out.
+        """
+        if shape not in self._layouts:
+            with self._chunks(shape, None) as chunks:
+                found = [
+                    self._marker(chunk) or self._m.mtmd_input_chunk_get_n_tokens(chunk) for chunk in chunks
+                ]
+            self._layouts[shape] = [
+                part
+                for part in found
+                if isinstance(part, int) or "".join(self._model.pieces(part)) not in self._model.template
+            ]
+        return self._layouts[shape]
+
+    def _marker(self, chunk: int) -> list[int]:
+        """Token ids of a text chunk; none of a picture's."""
+        if self._m.mtmd_input_chunk_get_type(chunk) != self._m.MTMD_INPUT_CHUNK_TYPE_TEXT:
+            return []
+        count = ctypes.c_size_t()
+        ids = self._m.mtmd_input_chunk_get_tokens_text(chunk, ctypes.byref(count))
+        return [int(ids[i]) for i in range(count.value)]
+
+    def _encode(self, image: Image) -> dict[int, Run]:
+        """The parts of a picture, by the place of their first token."""
+        pixels = np.ascontiguousarray(image.pixels)
+        runs: dict[int, Run] = {}
+        place = 0
+        with self._chunks(pixels.shape[:2], pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))) as chunks:
+            for chunk in chunks:
+                if not self._marker(chunk):
+                    runs[place] = self._encoded_run(chunk)
+                    place += len(runs[place].inputs)
+        return runs
+
+    def _encoded_run(self, chunk: int) -> Run:
+        if self._m.mtmd_encode_chunk(self._context, chunk):
+            raise RuntimeError(f"llama.cpp cannot encode the picture: {last_error()}")
+        n = self._m.mtmd_input_chunk_get_n_tokens(chunk)
+        width = c.llama_model_n_embd_inp(self._model.pointer)
+        embeddings = np.ctypeslib.as_array(self._m.mtmd_get_output_embd(self._context), (n, width)).copy()
+        places = np.arange(n, dtype=np.int32)[None]
+        if self._mrope:
+            tokens = self._m.mtmd_input_chunk_get_tokens_image(chunk)
+            at = [self._m.mtmd_image_tokens_get_decoder_pos(tokens, 0, i) for i in range(n)]
+            places = np.array([[p.t, p.y, p.x, p.z] for p in at], dtype=np.int32).T
+        return Run(embeddings, places, self._m.mtmd_input_chunk_get_n_pos(chunk))
+
+    @contextmanager
+    def _chunks(self, shape: tuple[int, ...], pixels: Any) -> Iterator[list[int]]:
+        """What mtmd makes of a picture of (height, width) pixels, alone; without pixels only their number."""
+        marker = self._m.mtmd_default_marker()
+        text = self._m.mtmd_input_text(marker, len(marker), False, True)
+        bitmap = ctypes.c_void_p(self._m.mtmd_bitmap_init(shape[1], shape[0], pixels))
+        chunks = self._m.mtmd_input_chunks_init()
+        try:
+            last_error()
+            if self._m.mtmd_tokenize(self._context, chunks, ctypes.byref(text), ctypes.byref(bitmap), 1):
+                raise RuntimeError(f"llama.cpp cannot take the picture: {last_error()}")
+            count = self._m.mtmd_input_chunks_size(chunks)
+            yield [self._m.mtmd_input_chunks_get(chunks, i) for i in range(count)]
+        finally:
+            self._m.mtmd_input_chunks_free(chunks)
+            self._m.mtmd_bitmap_free(bitmap)
+
+
+def _of(token: int) -> tuple[int, int]:
+    """A picture's key, and the place of a token in it."""
+    return divmod(-1 - token, 1 << _BITS)
