@@ -1,6 +1,7 @@
 """A small model that learns to see: what it is shown in training is what it is shown in a run."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,12 +112,22 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
             assert completion.prompt_tokens > VISION.tokens
 
 
+def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    requests = [request(q) for q in asked[:6]]
+    here = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32").complete(requests)
+    card = cards.resolve(str(folder), "llama-cpp")
+    assert card.projector == "mmproj-seer-f16.gguf"
+    there = open_backend(card, device="cpu").complete(requests)
+    for one, other in zip(here, there, strict=True):
+        assert one.prompt_tokens == other.prompt_tokens
+        p, q = (json.loads(c.text)["action_distribution"] for c in (one, other))
+        assert p == pytest.approx(q, abs=0.02)
+
+
 def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
     model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
     one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)
     vocabulary = len(model.chat.tokenizer)
-    tokens = [model._tokens(request(one)), model._tokens(Request(
-        "x", "ego", one.read_out, one.actions, 160, answer="readout", image=other.image,
-    ))]  # fmt: skip
-    p = model.next_log_probs(tokens, vocabulary)
+    p = model.next_log_probs([request(one), replace(request(one), image=other.image)], vocabulary)
     assert np.abs(p[0] - p[1]).max() > 1e-4

@@ -23,6 +23,7 @@ __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", 
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
+PROJECTOR = "mmproj-"  # how a GGUF file of one begins
 _SWITCH = b"enable_thinking"  # what a chat template calls its thinking switch
 _GGUF_HEAD = 1 << 25  # bytes of a GGUF file that hold its vocabulary and its template
 
@@ -98,7 +99,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
     if where is not None and where.is_dir():
         return _of_directory(text, where, engine)
     if where is not None and where.suffix == ".gguf":
-        return _made(where.stem, "llama-cpp", str(where), "Local GGUF file", _gguf_thinking(where))
+        return _of_file(text, where)
     if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
         return _made(text, "transformers", text, "Hub model without a card")
     if "/" in text:
@@ -113,12 +114,12 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
 
 
 def _of_directory(text: str, where: Path, engine: str | None) -> Card:
-    files = sorted(where.glob("*.gguf"))
+    files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
         card = _made(where.name, "transformers", str(where), "Local directory", _thinking(where))
         return replace(card, vision=_vision(text, where))
     if len(files) == 1:
-        return _made(files[0].stem, "llama-cpp", str(files[0]), "Local GGUF file", _gguf_thinking(files[0]))
+        return _of_file(text, files[0])
     if files:
         raise UserError(
             f"model directory {printable(text)!r} holds {len(files)} .gguf files; give one of them"
@@ -127,6 +128,14 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
         f"model directory {printable(text)!r} holds no config.json and no .gguf file; "
         "give the directory of a transformers checkpoint, or a .gguf file"
     )
+
+
+def _of_file(text: str, file: Path) -> Card:
+    """The card of a GGUF file, with the projector that lies beside it under its name."""
+    card = _made(file.stem, "llama-cpp", str(file), "Local GGUF file", _gguf_thinking(file))
+    beside = file.with_name(f"{PROJECTOR}{file.name}")
+    vision = _vision(text, file.parent) if beside.is_file() else None
+    return replace(card, vision=vision, projector=beside.name if vision else None)
 
 
 def _path(text: str) -> Path | None:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.backends.cards import PROJECTOR
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing
 from harness.training import projector
@@ -66,7 +67,7 @@ def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
 
 def projector_of(out: Path) -> Path:
     """Where the projector of an exported file goes."""
-    return out.with_name(f"mmproj-{out.name}")
+    return out.with_name(f"{PROJECTOR}{out.name}")
 
 
 def _write(

@@ -29,8 +29,8 @@ SEEING_TEMPLATE = TEMPLATE.replace(
 )
 VISION = Vision(512, 256, patch_px=16, merge=2)  # as Qwen3-VL's
 LAYERS, HIDDEN, HEADS, HEAD = 4, 96, 3, 32
-EYES = {  # its vision encoder: a fifth of the weights
-    "depth": 2, "hidden_size": 64, "intermediate_size": 128, "num_heads": 2, "out_hidden_size": HIDDEN,
+EYES = {  # its vision encoder: a quarter of the weights
+    "depth": 2, "hidden_size": 48, "intermediate_size": 96, "num_heads": 3, "out_hidden_size": HIDDEN,
     "patch_size": VISION.patch_px, "spatial_merge_size": VISION.merge, "deepstack_visual_indexes": [],
     "num_position_embeddings": 256,
 }  # fmt: skip
