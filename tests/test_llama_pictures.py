@@ -175,7 +175,9 @@ def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> R
 
 
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
-def test_a_backend_answers_what_its_picture_shows(tiny: Path, theirs: Any, answer: str) -> None:
+def test_a_backend_answers_what_its_picture_shows(
+    tiny: Path, theirs: Any, answer: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     asked = [question(0, A, answer), question(1, B, answer, "Another, longer"), question(2, None, answer)]
     backend = open_backend(card_of(tiny), batch_size=3)
     together = backend.complete(asked)
@@ -191,6 +193,7 @@ def test_a_backend_answers_what_its_picture_shows(tiny: Path, theirs: Any, answe
     first, *others, same = (c.text for c in backend.complete(shown))
     assert first == same
     assert first not in others
+    assert capfd.readouterr() == ("", ""), "llama.cpp has much to say of a projector"
 
 
 def test_parity_is_measured_with_pictures_too(tiny: Path, theirs: Any) -> None:
