@@ -75,6 +75,20 @@ class Engine(Protocol):
         ...
 
 
+_PLACE_BITS, _DIGITS = 16, 10  # of a picture's token: its place among them, and digits of the digest before
+
+
+def picture_tokens(image: Image, count: int) -> list[int]:
+    """The negative numbers that stand for a picture of so many tokens, in every engine and process."""
+    first = int(image.sha256[:_DIGITS], 16) << _PLACE_BITS
+    return [-1 - (first | place) for place in range(count)]
+
+
+def picture_of(token: int) -> tuple[int, int]:
+    """A picture's number, by one of its tokens, and the token's place among them."""
+    return divmod(-1 - token, 1 << _PLACE_BITS)
+
+
 def check_logits(largest: Sequence[float]) -> None:
     """Raise ArithmeticError if some sequence's largest logit is no number: its answer would mean nothing."""
     if not all(map(math.isfinite, largest)):

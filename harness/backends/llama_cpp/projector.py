@@ -1,13 +1,11 @@
-"""The projector of a model that takes pictures: a second GGUF file, which llama.cpp's mtmd reads.
-
-A picture's tokens are negative numbers made from its digest, so they are the same in every process.
-"""
+"""The projector of a model that takes pictures: a second GGUF file, which llama.cpp's mtmd reads."""
 
 import ctypes
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
@@ -16,14 +14,14 @@ import llama_cpp as c
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.backends.engine import picture_of, picture_tokens
 from harness.backends.llama_cpp.model import LlamaModel, keep_errors, last_error, threads
 from harness.backends.vision import Vision
 from harness.core.errors import UserError, printable
 from harness.core.image import Image
 
 KEPT = 64  # pictures whose embeddings are kept: those of a chunk of requests, for a repair turn
-_BITS = 16  # of a token's number, which say its place among a picture's tokens
-_DIGITS = 10  # of a picture's digest, in the other bits
+MOST_TOKENS = 1 << 16  # of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
@@ -88,7 +86,7 @@ class Projector:
         if vision.scaled_to_px is None:
             square = (vision.patch_px * vision.merge) ** 2
             params.image_min_tokens = max(1, -(-(vision.least_px or 1) // square))
-            params.image_max_tokens = (vision.most_px or square << _BITS) // square
+            params.image_max_tokens = (vision.most_px or square * MOST_TOKENS) // square
         last_error()
         self._context = m.mtmd_init_from_file(bytes(file), model.pointer, params)
         if not self._context:
@@ -110,17 +108,11 @@ class Projector:
 
     def tokens(self, image: Image) -> list[int]:
         """What stands for a picture in a prompt; the picture must be there until it is read."""
-        key = int(image.sha256[:_DIGITS], 16)
-        self._images[key] = image
-        found: list[int] = []
-        place = 0
-        for part in self._layout(image.pixels.shape[:2]):
-            if isinstance(part, int):
-                found += [-1 - (key << _BITS | i) for i in range(place, place + part)]
-                place += part
-            else:
-                found += part
-        return found
+        layout = self._layout(image.pixels.shape[:2])
+        numbers = picture_tokens(image, sum(part for part in layout if isinstance(part, int)))
+        self._images[picture_of(numbers[0])[0]] = image
+        left = iter(numbers)
+        return [t for part in layout for t in (islice(left, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
         """The part of a picture that begins with a token.
@@ -128,7 +120,7 @@ class Projector:
         Raises:
             LookupError: none does, or its picture is gone.
         """
-        key, place = _of(token)
+        key, place = picture_of(token)
         if key not in self._encoded:
             if (image := self._images.get(key)) is None:
                 raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
@@ -140,7 +132,7 @@ class Projector:
 
     def forget(self, tokens: Sequence[int]) -> None:
         """Encode the pictures among some tokens again when they are read again."""
-        for key in {_of(token)[0] for token in tokens if token < 0}:
+        for key in {picture_of(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(key, None)
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
@@ -209,8 +201,3 @@ class Projector:
         finally:
             self._m.mtmd_input_chunks_free(chunks)
             self._m.mtmd_bitmap_free(bitmap)
-
-
-def _of(token: int) -> tuple[int, int]:
-    """A picture's key, and the place of a token in it."""
-    return divmod(-1 - token, 1 << _BITS)
