@@ -167,7 +167,8 @@ def check(
     if difference := taker and taker.difference:
         typer.echo(difference)
         raise typer.Exit(1)
-    count, picture = counter(tokenizer, taker and taker.card), taker.vision.tokens if taker else 0
+    card, picture = (taker.card, taker.vision.tokens) if taker else (None, 0)
+    count = counter(tokenizer, card)
     for role in prompts.ROLES:
         example_actions(prompt, role, data.actions)
     least, most = prompt.token_budget

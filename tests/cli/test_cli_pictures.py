@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.color import ColorTriplet
+from rich.color_triplet import ColorTriplet
 from rich.style import Style
 from tokenizers import Tokenizer, models
 
@@ -131,11 +131,9 @@ def test_a_picture_counts_in_every_prompt(
     assert (told["picture"]["tokens"], told["picture"]["checked"]) == (tokens, False)
     _, out, _ = harness("prompt", "check", *args)
     assert f"{tokens} tokens with {model}, its processor is not here to ask\n" in out
-    args = ("--dataset", small_path, "--tokenizer", one_word, "--model", model, "--limit", "1")
+    eval_v7 = ("eval", "--prompt", "v7", "--dataset", small_path, "--tokenizer", one_word, "--model", model)
     for image, counted in (("own", 2 + tokens), ("blank", 2 + tokens), ("none", 2)):
-        told = json.loads(
-            harness("eval", "--prompt", "v7", "--image", image, *args, "--dry-run", "--json")[1]
-        )
+        told = json.loads(harness(*eval_v7, "--limit", "1", "--image", image, "--dry-run", "--json")[1])
         assert {(n["least"], n["most"]) for n in told["prompt_tokens"].values()} == {(counted, counted)}
 
 
