@@ -94,6 +94,45 @@ def test_a_model_that_sees_has_its_picture_on_every_engine_and_its_projector_on_
         assert bool(card.projector) == (card.engine == "llama-cpp") == bool(card.sha256)
 
 
+SEES = """\
+engine = "transformers"
+description = "d"
+weights = "a/b"
+[vision]
+width_px = 512
+height_px = 256
+patch_px = 16
+merge = 2
+[latency]
+source = "paper"
+basis = "b"
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("= 256", "= 255"), "[vision]: height_px is 255, wants an even number: two cameras share it"),
+        (("= 512", "= 0"), "[vision]: width_px = 0; allowed: 1 or more"),
+        (("= 512", "= 5000"), "[vision]: a picture of 5000 x 256 pixels; allowed: 4096 a side"),
+        (("merge = 2", ""), "[vision] has no merge; add it"),
+        (("merge = 2", "merg = 2"), "unknown key in "),
+        (('"transformers"', '"llama-cpp"'), "[vision] and projector go together on llama-cpp: give the name "
+         "of its mmproj file, or leave both out"),
+        (("merge = 2", 'merge = 2\n[engines.llama-cpp]\nweights = "a/b"\nfile = "f.gguf"'), "go together on"),
+        (("[vision]", 'projector = "p.gguf"\n[vision]'), "projector goes with engine = llama-cpp"),
+        (('"transformers"\n', '"proxy"\n'), "goes with engine = "),
+    ],
+)  # fmt: skip
+def test_a_mistake_about_pictures_is_one_line(shelf: Path, change: tuple[str, str], said: str) -> None:
+    assert change[0] in SEES
+    write_card(shelf, SEES.replace(*change, 1))
+    with pytest.raises(UserError) as refused:
+        cards.load("mine")
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_server_may_be_one_of_a_model_that_sees(shelf: Path) -> None:
     example = (Path(__file__).parents[1] / "models" / "openai-example.toml").read_text()
     write_card(shelf, re.sub(r"^# (?=\[vision|\w+ = )", "", example, flags=re.M))
