@@ -214,7 +214,7 @@ def _differ(a: Request, b: Request) -> bool:
 
 
 def _digest(request: Request) -> str | None:
-    return request.image and request.image.sha256
+    return request.image.sha256 if request.image else None
 
 
 def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
