@@ -12,6 +12,7 @@ import pytest
 from evaluating import decisions, run, says, spec_of
 from run_on_disk import answers_of
 
+from harness.backends import cards
 from harness.backends.base import Completion, Request
 from harness.coordination.consensus import RULES, Fused, linear_pool
 from harness.coordination.operating_point import named_point
@@ -19,6 +20,7 @@ from harness.core.errors import UserError
 from harness.core.files import canonical_json
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
+from harness.evaluate.agent import Agent
 from harness.prompts.versions import load as prompt
 from harness.prompts.versions import shown as listed
 from harness.report.decisions import Decisions
@@ -295,6 +297,17 @@ def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Pat
         attribute(Stored(truth), "single-local", 5, 0)
     with pytest.raises(UserError, match="unknown condition '6g'"):
         attribute(Stored(proxy), "6g", 5, 0)
+
+
+def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, judging: Judging) -> None:
+    points, card = (named_point("single-local"),), cards.load("smolvlm-256m")
+    spec = spec_of(small, "swarm-tiny", "v4", points=points, seeds=(0,), latency="paper")
+    ego = Agent(card, prompt("v7"))
+    seen = run(replace(spec, ego=ego), tmp_path / "seen").out
+    with pytest.raises(UserError, match="smolvlm-256m was shown pictures by prompt v7, and no object can be"):
+        attribute(Stored(seen), "single-local", 2, 0)
+    text = run(replace(spec, ego=replace(ego, image="none")), tmp_path / "text").out
+    assert attribute(Stored(text), "single-local", 2, 0).left_out
 
 
 def test_typed_it_says_what_moves_most_in_eighty_columns(

@@ -1,6 +1,7 @@
 """Model cards: what a user may write after --model, and what a card file may say."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -59,8 +60,8 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_every_shipped_card_loads_under_its_file_name() -> None:
     assert cards.names() == [
         "brake", "cruise", "full-view", "gemma-3-1b", "llama-3.2-3b", "local-view", "openai-example",
-        "phi-4-mini", "proxy", "proxy-faulty", "qwen3-0.6b", "qwen3-1.7b", "qwen3-4b", "qwen3-8b",
-        "smollm3-3b", "swarm-tiny",
+        "phi-4-mini", "proxy", "proxy-faulty", "qwen2.5-vl-3b", "qwen3-0.6b", "qwen3-1.7b", "qwen3-4b",
+        "qwen3-8b", "qwen3-vl-2b", "qwen3-vl-4b", "smollm3-3b", "smolvlm-256m", "swarm-tiny",
     ]  # fmt: skip
     assert [cards.load(name).name for name in cards.names()] == cards.names()
     assert [cards.load(card.name) for card in cards.load_all()] == cards.load_all()
@@ -72,6 +73,72 @@ def test_language_models_declare_no_latency_that_was_not_measured() -> None:
             assert (card.latency.source, card.latency.inference_s) == ("paper", None), card.name
             from_hub = capabilities(card.engine).has_weights and "/" in str(card.weights)
             assert card.licence or not from_hub, card.name
+
+
+@pytest.mark.parametrize(
+    ("name", "size_px", "tokens"),
+    [
+        ("qwen2.5-vl-3b", (448, 224), 128),
+        ("qwen3-vl-2b", (512, 256), 128),
+        ("qwen3-vl-4b", (512, 256), 128),
+        ("smolvlm-256m", (512, 256), 64),
+    ],
+)
+def test_a_model_that_sees_has_its_picture_on_every_engine_and_its_projector_on_one(
+    name: str, size_px: tuple[int, int], tokens: int
+) -> None:
+    for card in (cards.load(name), cards.load(f"{name}:llama-cpp")):
+        assert card.vision is not None
+        assert (card.vision.size_px, card.vision.tokens) == (size_px, tokens)
+        assert card.revision is not None
+        assert bool(card.projector) == (card.engine == "llama-cpp") == bool(card.sha256)
+
+
+SEES = """\
+engine = "transformers"
+description = "d"
+weights = "a/b"
+[vision]
+width_px = 512
+height_px = 256
+patch_px = 16
+merge = 2
+[latency]
+source = "paper"
+basis = "b"
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("= 256", "= 255"), "[vision]: height_px is 255, wants an even number: two cameras share it"),
+        (("= 512", "= 0"), "[vision]: width_px = 0; allowed: 1 or more"),
+        (("= 512", "= 5000"), "[vision]: a picture of 5000 x 256 pixels; allowed: 4096 a side"),
+        (("merge = 2", ""), "[vision] has no merge; add it"),
+        (("merge = 2", "merg = 2"), "unknown key in "),
+        (('"transformers"', '"llama-cpp"'), "[vision] and projector go together on llama-cpp: give the name "
+         "of its mmproj file, or leave both out"),
+        (("merge = 2", 'merge = 2\n[engines.llama-cpp]\nweights = "a/b"\nfile = "f.gguf"'), "go together on"),
+        (("[vision]", 'projector = "p.gguf"\n[vision]'), "projector goes with engine = llama-cpp"),
+        (('"transformers"\n', '"proxy"\n'), "goes with engine = "),
+    ],
+)  # fmt: skip
+def test_a_mistake_about_pictures_is_one_line(shelf: Path, change: tuple[str, str], said: str) -> None:
+    assert change[0] in SEES
+    write_card(shelf, SEES.replace(*change, 1))
+    with pytest.raises(UserError) as refused:
+        cards.load("mine")
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_server_may_be_one_of_a_model_that_sees(shelf: Path) -> None:
+    example = (Path(__file__).parents[1] / "models" / "openai-example.toml").read_text()
+    write_card(shelf, re.sub(r"^# (?=\[vision|\w+ = )", "", example, flags=re.M))
+    vision = cards.load("mine").vision
+    assert vision is not None
+    assert vision.tokens == 128
 
 
 def test_only_full_view_sees_the_truth() -> None:

@@ -20,6 +20,9 @@ from harness.evaluate.live_world import LiveSource
 from harness.evaluate.pictures import GREY, another
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.studies.twins.asking import _twins as twins_of
+from harness.studies.twins.asking import lack
+from harness.studies.twins.declared import TWINS
 from harness.world.perception.camera import frame
 
 QWEN3 = Vision(512, 256, patch_px=16, merge=2, least_px=65536, most_px=16777216)
@@ -98,6 +101,28 @@ def test_image_alone_says_nothing_of_anybody_around(crossing: Dataset):
             assert not named & set(user["content"].replace(":", " ").replace(",", " ").split())
 
 
+# -- twins ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", ["v7", "v8"])
+def test_only_a_mirrored_scene_has_another_picture_which_is_mirrored(crossing: Dataset, version: str):
+    of, mirrored = spec(crossing, version=version), 0
+    for scene in crossing.scenes(crossing.forest.ids[:12:3]):
+        questions = list(requests(of, [scene]))
+        for twin in TWINS.values():
+            if twin.senders or lack(of, twin):
+                continue
+            for _, _, question, other in twins_of(of, twin, scene, questions):
+                assert question.image
+                assert other.image
+                same = question.image.pixels
+                if twin.name == "mirrored":
+                    mirrored += 1
+                    same = same[:, ::-1]
+                assert np.array_equal(other.image.pixels, same), twin.name
+    assert mirrored > 4
+
+
 # -- what is refused -----------------------------------------------------------------------------------------
 
 
@@ -112,6 +137,12 @@ def test_image_alone_says_nothing_of_anybody_around(crossing: Dataset):
 def test_what_cannot_be_shown_is_one_line(image: Any, version: str, vision: Any, said: str):
     with pytest.raises(UserError, match=said):
         Agent(replace(SEES, vision=vision), prompts.load(version), image=image)
+
+
+@pytest.mark.parametrize("name", ["qwen3-4b", "qwen3-4b:llama-cpp", "openai-example"])
+def test_no_engine_shows_a_picture_to_a_model_of_texts(name: str):
+    with pytest.raises(UserError, match=r"v7: it shows a picture, and .* reads texts alone"):
+        Agent(cards.load(name), prompts.load("v7"))
 
 
 def test_a_model_of_texts_takes_the_text_of_an_image_prompt():

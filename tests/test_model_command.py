@@ -1,11 +1,15 @@
 """`harness model list` and `harness model check`, as typed."""
 
 import json
+import re
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from misbehaving import Asked, completion, read_out, serving
 
 from harness import cli
 from harness.backends import cards
@@ -187,3 +191,135 @@ def test_what_a_model_has_not_is_one_line(
     code, out, err = harness(monkeypatch, capsys, "model", *arguments)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
+
+
+# -- models that see -----------------------------------------------------------------------------------------
+
+SERVED = """\
+engine = "openai"
+description = "d"
+weights = "m"
+[vision]
+width_px = 64
+height_px = 32
+patch_px = 16
+merge = 2
+[latency]
+source = "paper"
+basis = "b"
+[server]
+base_url = "{url}"
+retries = 0
+"""
+ANSWER = '{"action_distribution":{"SLOWER":0.%d,"IDLE":0.20,"FASTER":0.%d}}'
+
+
+def pictures_of(body: Any) -> list[str]:
+    """The pictures of a request, as they were sent."""
+    return [
+        part["image_url"]["url"]
+        for message in body["messages"] if isinstance(message["content"], list)
+        for part in message["content"] if part["type"] == "image_url"
+    ]  # fmt: skip
+
+
+def looks(asked: Asked) -> None:
+    """A server that answers by what it is shown, and counts its tokens."""
+    pictures = pictures_of(asked.body)
+    share = zlib.crc32("".join(pictures).encode()) % 70 + 5
+    made = completion(ANSWER % (share, 80 - share))
+    made["usage"]["prompt_tokens"] = 300 + 2 * len(pictures)
+    asked.reply(made)
+
+
+def ignores(asked: Asked) -> None:
+    """One whose program leaves the picture out."""
+    letters = asked.body.get("logprobs")
+    asked.reply(read_out(("A", -0.5), ("B", -1.5), ("C", -2.0)) if letters else completion(ANSWER % (70, 10)))
+
+
+def ignores_uncounted(asked: Asked) -> None:
+    asked.reply({**completion(ANSWER % (70, 10)), "usage": None})
+
+
+def answers_all_alike(asked: Asked) -> None:
+    """One whose model reads pictures, and always says the same."""
+    made = completion(ANSWER % (70, 10))
+    made["usage"]["prompt_tokens"] = 300 + 2 * len(pictures_of(asked.body))
+    asked.reply(made)
+
+
+def refuses(asked: Asked) -> None:
+    if pictures_of(asked.body):
+        asked.reply({"error": {"message": "image input is not supported"}}, 400)
+    else:
+        ignores(asked)
+
+
+@pytest.mark.parametrize(
+    ("play", "fault"),
+    [
+        (looks, None),
+        (answers_all_alike, None),
+        (ignores, "ignores pictures: the same answers to a frame and to a blank one, and as many prompt "
+         "tokens as without any; start it with its projector, or leave [vision] out of its card"),
+        (ignores_uncounted, "ignores pictures: the same answers to a frame and to a blank one; start it"),
+        (refuses, "answers no prompt with a picture: "),
+    ],
+)  # fmt: skip
+def test_a_server_that_ignores_pictures_is_told_from_one_that_looks(
+    play: Any,
+    fault: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.chdir(tmp_path)
+    harness(monkeypatch, capsys, "init", "mine")
+    monkeypatch.chdir("mine")
+    with serving(play) as there:
+        Path("models/served.toml").write_text(SERVED.format(url=there.url))
+        code, out, err = harness(monkeypatch, capsys, "model", "check", "served")
+    assert code == (fault is not None)
+    assert "picture      v7 of the same scene, 64 x 32 pixels, 2 tokens by the card\n" in out
+    if fault is None:
+        assert err == ""
+    else:
+        assert err.count("\n") == 1
+        assert err.startswith(f"harness: the server of served {fault}")
+    sent = {url for asked in there.asked for url in pictures_of(asked.body)}
+    assert len(sent) == 2  # a frame and a blank one
+
+
+def test_a_model_of_texts_is_asked_no_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.chdir(tmp_path)
+    harness(monkeypatch, capsys, "init", "mine")
+    monkeypatch.chdir("mine")
+    texts = re.sub(r"\[vision\].*?(?=\[latency)", "", SERVED, flags=re.S)
+    with serving(ignores) as there:
+        Path("models/served.toml").write_text(texts.format(url=there.url))
+        code, out, err = harness(monkeypatch, capsys, "model", "check", "served")
+    assert (code, err) == (0, "")
+    assert "picture" not in out
+    assert len(there.asked) == 2 * 3
+
+
+def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    import tiny_vl
+
+    folder = tiny_vl.build(tmp_path / "vl")
+    capsys.readouterr()
+    code, out, err = harness(monkeypatch, capsys, "model", "check", str(folder), "--device", "cpu", "--json")
+    assert (code, err) == (0, "")
+    seen = json.loads(out)["looks"]
+    own, blank = seen["answers"]["readout"], seen["blank"]["readout"]
+    assert own["text"] != blank["text"]
+    # Two markers of the template stand around the picture's tokens.
+    assert own["prompt_tokens"] == blank["prompt_tokens"] == seen["text"]["prompt_tokens"] + 128 + 2

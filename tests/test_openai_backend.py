@@ -6,12 +6,15 @@ import re
 import socket
 import sys
 import threading
+from base64 import b64decode
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from time import sleep
-from typing import Any
+from typing import Any, get_args
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,6 +29,7 @@ from harness.backends.openai.shapes import body, read
 from harness.backends.servers import KINDS, Kind, Server
 from harness.core import resources
 from harness.core.errors import UserError
+from harness.core.image import Image
 from harness.parsing.parse import parse
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
@@ -83,6 +87,34 @@ def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.Mon
         "engine": "openai", "server": "generic", "base_url": there.url + "/", "model": "m",
         "listed": {"id": "m", "owned_by": "tests"},
     }  # fmt: skip
+
+
+SHOWN = (MESSAGES[0], {**MESSAGES[1], "image": "camera"})
+PICTURE = Image(np.arange(96, dtype=np.uint8).reshape(4, 8, 3))
+
+
+@pytest.mark.parametrize("answer", get_args(AnswerMode))
+def test_a_picture_is_sent_before_the_text_of_its_message_and_shown_by_its_digest(answer: AnswerMode) -> None:
+    asking = replace(request(answer=answer), messages=SHOWN, image=PICTURE)
+    with serving(lambda asked: asked.reply(completion(GOOD))) as there:
+        backend = openai_backend.open(card(there.url), batch_size=1)
+        backend.complete([asking])
+        [shown] = backend.rendered([asking])
+        plain = json.loads(backend.rendered([request(answer=answer)])[0])
+    [asked] = there.asked
+    system, user = asked.body["messages"]
+    assert system == MESSAGES[0]
+    assert user.keys() == {"role", "content"}
+    [picture, text] = user["content"]
+    assert text == {"type": "text", "text": MESSAGES[1]["content"]}
+    kind, _, data = picture["image_url"]["url"].partition("base64,")
+    assert (picture["type"], kind) == ("image_url", "data:image/png;")
+    assert b64decode(data, validate=True) == PICTURE.png()
+    assert shown == json.dumps(asked.body, sort_keys=True, separators=(",", ":")).replace(
+        picture["image_url"]["url"], f"sha256:{PICTURE.sha256}"
+    )
+    # Nothing else of the question is another's than of one without a picture.
+    assert {**asked.body, "messages": None} == {**plain, "messages": None}
 
 
 @pytest.mark.parametrize("thinking", [True, False])

@@ -289,10 +289,12 @@ def test_reordered_json_says_the_same(value: dict[str, Any], around: str) -> Non
 
 @pytest.mark.parametrize("version", versions.names(folder("prompts")))
 def test_every_prompt_that_ships_has_twins_of_its_text(crossing: Dataset, version: str) -> None:
-    spec = spec_of(crossing, "swarm-tiny", version, points=(), seeds=(0,))
+    model = "smolvlm-256m" if versions.load(version).image else "swarm-tiny"
+    spec = spec_of(crossing, model, version, points=(), seeds=(0,))
     scene = scenes_in(crossing)[1]
     in_metres = spec.ego.prompt.examples is not None  # whose numbers stay, so that no unit may change
-    for name in ("units", "paraphrase", "key-order", "order", "ids", "far-vehicle")[in_metres:]:
+    listing = ("order", "far-vehicle") if version != "v8" else ()  # which lists nobody
+    for name in ("units", "paraphrase", "key-order", "ids", *listing)[in_metres:]:
         changed_by = [texts(spec, name, scene, viewer) for viewer in scene.viewers]
         assert any(old != new for old, new in changed_by), name
 

@@ -66,6 +66,8 @@ class Registration:
         install: the command that installs them.
         finds: `module:function`, which returns where a card's weights lie and raises UserError if nowhere;
             for an engine that has weights.
+        sees: `module:function`, which returns the tokens that a card's own image processor makes of a picture
+            of the card's size, without loading its weights; empty where there is no such way.
     """
 
     opens: str
@@ -75,6 +77,7 @@ class Registration:
     packages: Mapping[str, str] = field(default_factory=dict)
     install: str = ""
     finds: str = ""
+    sees: str = ""
 
     @property
     def allowed_keys(self) -> tuple[str, ...]:
@@ -102,6 +105,7 @@ BUILT_IN: Mapping[str, Registration] = {
         packages={"torch": "torch", "transformers": "transformers"},
         install=extras.install("transformers"),
         finds="harness.backends.weights:find_checkpoint",
+        sees="harness.backends.transformers.processor:tokens",
     ),
     "llama-cpp": Registration(
         "harness.backends.llama_cpp.backend:open",
@@ -232,3 +236,11 @@ def missing(card: "Card") -> str | None:
     except UserError:
         return "weights"
     return None
+
+
+def picture_tokens(card: "Card") -> int | None:
+    """Tokens that a card's own image processor makes of a picture of the card's size; None if not here."""
+    if missing(card) or not (sees := registration(card.engine).sees):
+        return None
+    tokens: int = resolve(sees)(card)
+    return tokens

@@ -53,6 +53,15 @@ class Vision:
         width, height = self.scaled_to_px or self._whole_squares(square)
         return (width // square) * (height // square)
 
+    def difference(self, tokens: int) -> str | None:
+        """What to say of a model that makes this many tokens of such a picture; None if as stated here."""
+        if tokens == self.tokens:
+            return None
+        return (
+            f"its processor makes {tokens} tokens of {self.width_px} x {self.height_px} pixels, and its card "
+            f"says {self.tokens}; mend [vision]"
+        )
+
     def _whole_squares(self, square: int) -> tuple[int, int]:
         sides = self.width_px, self.height_px
         width, height = (max(square, round(side / square) * square) for side in sides)

@@ -181,7 +181,9 @@ def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[st
     for request in chain(requests(spec, scenes), requests(spec, scenes, blind=True) if blind else ()):
         asked += 1
         if count:
-            sizes.setdefault(request.role, []).append(count(request.messages))
+            vision = spec.agents[request.agent].card.vision if request.image else None
+            tokens = count(request.messages) + (vision.tokens if vision else 0)
+            sizes.setdefault(request.role, []).append(tokens)
     stats = {role: spread_of(n) for role, n in sizes.items()}
     return {**spec.settings(), "requests": asked, "scenes": len(scenes), "prompt_tokens": stats or None}
 

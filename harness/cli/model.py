@@ -12,13 +12,16 @@ from harness.core.errors import printable
 from harness.core.resources import DATASET
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from harness.backends.base import AnswerMode, Completion, Request
     from harness.backends.cards import Card
     from harness.backends.checkup import Checkup
     from harness.evaluate.spec import Spec
 
 app = typer.Typer(help="List models, fetch one, or look at one before a run.", no_args_is_help=True)
 
-PROMPT = "v2"  # what a check asks
+PROMPT, IMAGE_PROMPT = "v2", "v7"  # what a check asks
 _WIDTH = 100  # of lines of tokens
 
 
@@ -70,7 +73,11 @@ def check(
     dtype: options.Dtype = None,
     as_json: options.Json = False,
 ) -> None:
-    """Load a model, show its prompt and time one decision. Does so in each answer mode."""
+    """Load a model, show its prompt and time one decision. Does so in each answer mode.
+
+    A model that sees is asked with a picture as well, and with a blank one. Exit code 1 if it answers in no
+    mode, or ignores pictures.
+    """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
 
@@ -91,14 +98,20 @@ def check(
                 {**head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen)}, indent=2
             )
         )
-        raise typer.Exit(_failed(seen))
-    _show(spec, seen)
-    raise typer.Exit(_failed(seen))
+    else:
+        _show(spec, seen)
+    if seen.looks and seen.looks.fault:
+        typer.echo(f"harness: {_blind(card, seen.looks.fault)}", err=True)
+        raise typer.Exit(1)
+    raise typer.Exit(int(all(answer.error is not None for answer in seen.answers.values())))
 
 
-def _failed(seen: "Checkup") -> int:
-    """Exit code: 1 if the model answered in no way at all."""
-    return int(all(answer.error is not None for answer in seen.answers.values()))
+def _blind(card: "Card", fault: str) -> str:
+    """What to say of a model that does not see, though its card says so."""
+    who, remedy = printable(card.name), "leave [vision] out of its card"
+    if card.server:
+        who, remedy = f"the server of {who}", f"start it with its projector, or {remedy}"
+    return f"{who} {printable(fault, 300)}; {remedy}"
 
 
 def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -> "tuple[Spec, Checkup]":
@@ -114,13 +127,22 @@ def _seen(card: "Card", thinking: bool, device: str | None, dtype: str | None) -
 
     data = load.load(load.find(DATASET), 1)
     ego = Agent(card, prompts.load(PROMPT), thinking=thinking)
+    sees = Agent(card, prompts.load(IMAGE_PROMPT), thinking=thinking) if card.vision else None
     spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
     ways = ("json",) if ego.thinking else get_args(AnswerMode)
     scenes = data.scenes(data.forest.ids[:1])
-    # The first of a scene's questions is the ego's.
-    asked = [next(requests(replace(spec, ego=replace(ego, answer=way)), scenes)) for way in ways]
+
+    def question(who: Agent) -> "Request":
+        return next(requests(replace(spec, ego=who), scenes))  # the first of a scene's is the ego's
+
+    asked = [question(replace(ego, answer=way)) for way in ways]
+    shown = [
+        (question(replace(sees, answer=way)), question(replace(sees, answer=way, image="blank")),
+         question(replace(sees, answer=way, image="none")))
+        for way in ways if sees
+    ]  # fmt: skip
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    return spec, look(cast("Rendering", backend), asked)
+    return spec, look(cast("Rendering", backend), asked, shown)
 
 
 def _show(spec: "Spec", seen: "Checkup") -> None:
@@ -139,7 +161,17 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
         typer.echo(f"  | {printable(line, 1000)}")
     for line in _token_lines(seen.tokens or []):
         typer.echo(f"  # {line}")
-    for way, answer in seen.answers.items():
+    _show_answers(seen.answers)
+    if seen.looks and (vision := card.vision):
+        size = f"{vision.width_px} x {vision.height_px} pixels, {vision.tokens} tokens by the card"
+        typer.echo(f"picture      {IMAGE_PROMPT} of the same scene, {size}")
+        _show_answers(seen.looks.answers)
+        typer.echo("picture      a blank one in its place")
+        _show_answers(seen.looks.blank)
+
+
+def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:
+    for way, answer in answers.items():
         if answer.error:
             typer.echo(f"{way:<13}no answer: {printable(answer.error, 300)}")
             continue

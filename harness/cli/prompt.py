@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from harness.cli import options
+from harness.cli import options, pictures
 from harness.cli.estimates import console, echo_json
 from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
@@ -29,6 +29,10 @@ app = typer.Typer(help="List prompt versions; show, check, compare or release th
 
 Version = Annotated[str, typer.Argument(help="Prompt version.")]
 Tokenizer = Annotated[Path | None, typer.Option(help="tokenizer.json, its folder, or a Qwen2 GGUF.")]
+Model = Annotated[
+    str | None,
+    typer.Option(help=f"Card of the model that takes an image prompt's picture. Default: {pictures.MODEL}."),
+]
 
 
 @app.command("list")
@@ -62,11 +66,17 @@ def show(
     scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
     viewer: str | None = typer.Option(None, help="Vehicle id. Default: every viewer."),
     dataset: options.Dataset = resources.DATASET,
+    model: Model = None,
+    out: Path | None = typer.Option(None, help="Folder for an image prompt's pictures, as PNG files."),
     as_json: options.Json = False,
 ) -> None:
-    """Print exactly what a model is sent for a scene. Its own chat template is not applied."""
+    """Print exactly what a model is sent for a scene. Its own chat template is not applied.
+
+    A picture is drawn where the terminal has colours.
+    """
     from harness.dataset import load
     from harness.prompts import versions as prompts
+    from harness.world.perception.camera import Sight
 
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     at = data.scene(scene)
@@ -74,13 +84,28 @@ def show(
         raise unknown("viewer", viewer, at.viewers)
     viewers = at.viewers if viewer is None else [viewer]
     words = data.scenario.prompt_words
+    taker = pictures.taker(prompt, model)
+    if taker is None and (given := "--model" if model else "--out" if out else ""):
+        raise UserError(f"{given}: prompt {version} shows no picture; leave it out")
     sent = {v: prompt.render(at.record["graphs"][v], data.actions, words=words) for v in viewers}
+    seen = {v: Sight(data.scenario, at.state, v, taker.vision.size_px) for v in viewers if taker}
+    wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:
-        echo_json(sent)
+        said = {v: {**taker.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if taker}
+        echo_json({
+            v: [{**m, "image": said[v]} if "image" in m else m for m in messages]
+            for v, messages in sent.items()
+        })  # fmt: skip
         return
     for v, messages in sent.items():
         for message in messages:
             typer.echo(f"--- {v} {message['role']}")
+            if taker and "image" in message:
+                typer.echo(f"picture: {taker.picture}, sha256 {seen[v].sha256[:8]}")
+                if not pictures.draw(seen[v]) and not out:
+                    typer.echo("not drawn: no terminal with colours here; --out FOLDER writes PNG files")
+                if out:
+                    typer.echo(wrote[v])
             for line in message["content"].split("\n"):
                 typer.echo(printable(line, len(line) * 10))
 
@@ -118,12 +143,14 @@ def check(
     version: Version,
     dataset: options.Dataset = resources.DATASET,
     tokenizer: Tokenizer = None,
+    model: Model = None,
     as_json: options.Json = False,
 ) -> None:
     """Render every prompt of every scene and count tokens. Exit code 1 if one is outside the budget.
 
     The ego's fusion call is rendered with the messages of one helper, of two, and of all. A repair turn is
-    counted with the longest answer that a role may give.
+    counted with the longest answer that a role may give. A picture counts as the model's card says; exit code
+    1, too, if the model's own image processor is here and makes other tokens of it.
     """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
@@ -134,7 +161,14 @@ def check(
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     words = data.scenario.prompt_words
     scenes = data.scenes(data.courses())
-    count = counter(tokenizer)
+    taker = pictures.taker(prompt, model, checked=True)
+    if taker is None and model:
+        raise UserError(f"--model: prompt {version} shows no picture; leave it out")
+    if difference := taker and taker.difference:
+        typer.echo(difference)
+        raise typer.Exit(1)
+    card, picture = (taker.card, taker.vision.tokens) if taker else (None, 0)
+    count = counter(tokenizer, card)
     for role in prompts.ROLES:
         example_actions(prompt, role, data.actions)
     least, most = prompt.token_budget
@@ -148,7 +182,7 @@ def check(
         role, rendered = graph["role"], prompt.render(graph, data.actions, messages, words)
         if not count:
             return
-        n = count(rendered)
+        n = count(rendered) + picture
         calls = {FUSION if messages else role: n, **({REPAIR: n + added[role]} if role in added else {})}
         for call, tokens in calls.items():
             sizes[call].append(tokens)
@@ -168,11 +202,15 @@ def check(
     stats = {role: spread_of(n) for role, n in sizes.items() if n}
     if as_json:
         figures = {"version": version, "budget": [least, most], "tokens": stats, "outside": outside}
-        echo_json(figures, indent=None)
+        seen = {"picture": {**taker.as_mapping(), "checked": taker.checked}} if taker else {}
+        echo_json({**figures, **seen}, indent=None)
     else:
         typer.echo(
             f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
         )
+        if taker:
+            here = "as its processor says" if taker.checked else "its processor is not here to ask"
+            typer.echo(f"picture {taker.picture}, {here}")
         for role, s in stats.items():
             typer.echo(f"{role:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
         if not count:

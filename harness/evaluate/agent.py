@@ -67,6 +67,11 @@ class Agent:
         return capabilities(self.card.engine)
 
     @property
+    def sees(self) -> bool:
+        """Whether its questions show a picture."""
+        return bool(self.prompt.image and self.card.vision) and self.image != "none"
+
+    @property
     def samples(self) -> bool:
         """Whether a temperature draws its answers: a read-out is a distribution already."""
         return self.can.samples and self.answer != "readout"

@@ -29,7 +29,7 @@ def picture(spec: Spec, who: int, scene: Scene, viewer: str, blind: bool = False
     """
     agent = spec.agents[who]
     vision = agent.card.vision
-    if agent.prompt.image is None or vision is None or agent.image == "none":
+    if not agent.sees or vision is None:
         return None
     if blind or agent.image == "blank":
         return blank(vision.size_px)

@@ -80,6 +80,11 @@ def attribute(stored: Stored, condition: str, sample: int, seed: int) -> Attribu
             raise UserError(f"{name} has no answers to other questions; give the run that it replays")
         if agent.card.privileged:
             raise UserError(f"{name} reads the truth and no prompt; give a run of local-view or of a model")
+        if agent.sees:
+            raise UserError(
+                f"{name} was shown pictures by prompt {agent.prompt.version}, and no object can be left out "
+                "of one; give a run with --image none, or of another prompt"
+            )
     if condition not in stored.points:
         raise unknown("condition", condition, stored.points)
     drawn, of = draw(stored, condition, sample, seed)

@@ -9,7 +9,7 @@ from typing import Any
 from harness.backends.base import Completion, Request, per_token_s
 from harness.backends.cards import Card
 from harness.backends.openai.http import Client, Reply
-from harness.backends.openai.shapes import Said, body, read
+from harness.backends.openai.shapes import Said, body, digest_url, read
 from harness.backends.openai.stream import ASKED
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
@@ -52,8 +52,8 @@ class OpenAIBackend:
         return asyncio.run(self._all(requests))
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """What the server is sent for each request; it renders the messages itself."""
-        return [canonical_json(body(self._card, self._server, request)) for request in requests]
+        """What the server is sent for each request, its picture by digest; it renders the messages itself."""
+        return [canonical_json(body(self._card, self._server, r, digest_url)) for r in requests]
 
     def identity(self) -> dict[str, Any]:
         """The server and its model, by what it says of it. Weights that it changes unsaid are not seen."""

@@ -7,14 +7,17 @@ the judge.
 import json
 import math
 import re
+from base64 import b64encode
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from harness.backends.base import FinishReason, Request
 from harness.backends.cards import Card
+from harness.backends.chat import in_parts
 from harness.backends.servers import Kind, Server
 from harness.core.files import canonical_json
+from harness.core.image import Image
 from harness.prompts.answer_schema import answer_schema
 from harness.prompts.readout import letters, stated
 
@@ -45,11 +48,28 @@ class Said:
     error: str | None = None
 
 
-def body(card: Card, server: Server, request: Request) -> dict[str, Any]:
-    """The JSON of one chat completion, in one piece."""
+def data_url(image: Image) -> str:
+    """A picture as a server is sent it."""
+    return f"data:image/png;base64,{b64encode(image.png()).decode()}"
+
+
+def digest_url(image: Image) -> str:
+    """What stands for a picture where a request is shown or kept."""
+    return f"sha256:{image.sha256}"
+
+
+def body(
+    card: Card, server: Server, request: Request, url: Callable[[Image], str] = data_url
+) -> dict[str, Any]:
+    """The JSON of one chat completion, in one piece; `url` says where its picture is."""
+    picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
     asked: dict[str, Any] = {
         "model": card.weights,
-        "messages": [dict(message) for message in request.messages],
+        # Texts stay texts: not every server and chat template takes parts.
+        "messages": [
+            in_parts([message], picture)[0] if picture and "image" in message else dict(message)
+            for message in request.messages
+        ],
         "max_tokens": request.max_tokens,
         "temperature": request.temperature or 0,
         "seed": request.sample,

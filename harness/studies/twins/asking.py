@@ -181,6 +181,9 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
     for question, other in zip(questions, others, strict=True):
         if spec.ego.can.language_model:
             other = twin.text(spec, other) if twin.text else other
+            viewer = question.id.rpartition("/")[2]
+            if twin.image and other.image and graphs[viewer] != scene.record["graphs"][viewer]:
+                other = replace(other, image=twin.image(other.image))
             differ = _differ(question, other)
         else:
             other = replace(other, view=twin.view(other.view or {})) if twin.view else other
@@ -207,7 +210,11 @@ def _named(scene: Scene, twin: Twin, **others: Any) -> Scene:
 
 def _differ(a: Request, b: Request) -> bool:
     """Whether a language model is asked otherwise."""
-    return (a.messages, a.actions) != (b.messages, b.actions)
+    return (a.messages, a.actions) != (b.messages, b.actions) or _digest(a) != _digest(b)
+
+
+def _digest(request: Request) -> str | None:
+    return request.image.sha256 if request.image else None
 
 
 def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
@@ -225,4 +232,8 @@ def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer])
 
 
 def _text(request: Request) -> str:
-    return "\n".join(f"--- {message['role']}\n{message['content']}" for message in request.messages)
+    lines = []
+    for message in request.messages:
+        picture = [f"picture {_digest(request)}"] if "image" in message else []
+        lines += [f"--- {message['role']}", *picture, message["content"]]
+    return "\n".join(lines)

@@ -12,8 +12,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from harness.backends.base import AnswerMode, Request
 from harness.core import noise
+from harness.core.image import Image
 from harness.dataset.load import Scene
 from harness.evaluate.spec import Spec
 from harness.prompts import readout
@@ -44,6 +47,7 @@ class Twin:
         graph: the twin's scene graph, `(spec, scene, graph)`.
         text: the twin's request, `(spec, request)`, of a language model.
         view: the same for who reads the graph and no text.
+        image: the twin's picture, where the graph is another; None where it is the same.
         senders: whose messages a fusion call has, `(senders)`, in the place of these.
         actions: the question's name for an action of the twin, where it is another.
         modes: answer modes in which it applies.
@@ -56,6 +60,7 @@ class Twin:
     graph: Callable[[Spec, Scene, Graph], Graph] | None = None
     text: Callable[[Spec, Request], Request] | None = None
     view: Callable[[Graph], Graph] | None = None
+    image: Callable[[Image], Image] | None = None
     senders: Callable[[Sequence[str]], Sequence[str]] | None = None
     actions: Mapping[str, str] | None = None
     modes: tuple[str, ...] = get_args(AnswerMode)
@@ -107,6 +112,11 @@ def swapped(graph: Graph) -> Graph:
     if {sector["sector"] for sector in twin["sectors"]} == set(order):
         twin["sectors"].sort(key=lambda sector: order.index(sector["sector"]))
     return dict(twin)
+
+
+def flipped(image: Image) -> Image:
+    """What the cameras would see in a mirror, which is what those of the mirrored scene see."""
+    return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
 def permuted_ids(spec: Spec, scene: Scene, graph: Graph) -> Graph:
@@ -294,7 +304,7 @@ def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
 _DECLARED = (
     Twin(
         "mirrored", "left and right swapped", "a scenario whose scenes may be mirrored",
-        graph=mirrored, actions=LANES,
+        graph=mirrored, image=flipped, actions=LANES,
     ),
     Twin("ids", "vehicles have each other's names", graph=permuted_ids),
     Twin(

@@ -1,0 +1,89 @@
+"""A checkpoint's image processor, held to the limits of its card: pictures in, a model's inputs out.
+
+Importing this imports neither torch nor transformers; making a processor imports both, and reads no weights.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.backends.cards import Card
+from harness.backends.vision import Vision
+from harness.backends.weights import find_checkpoint
+from harness.core.errors import UserError, printable
+from harness.core.image import Pixels
+
+if TYPE_CHECKING:
+    import torch
+
+
+class Processor:
+    """A checkpoint's image processor.
+
+    Attributes:
+        tokens: what it makes of a picture of the card's size.
+    """
+
+    def __init__(self, name: str, where: Path, vision: Vision) -> None:
+        """Load it.
+
+        Raises:
+            UserError: there is none.
+        """
+        from transformers import AutoConfig, AutoImageProcessor
+
+        side = vision.scaled_to_px and {"longest_edge": max(vision.scaled_to_px)}
+        limits = {"shortest_edge": vision.least_px or 1, "longest_edge": vision.most_px or 1 << 30}
+        self._options = (
+            {"size": side, "max_image_size": side, "do_image_splitting": False} if side else {"size": limits}
+        )
+        files = {"local_files_only": True, "trust_remote_code": False}
+        try:
+            # Pillow, so that pictures are scaled alike wherever torchvision is installed or not.
+            self._processor = AutoImageProcessor.from_pretrained(where, backend="pil", **files)
+            self._config = AutoConfig.from_pretrained(where, **files)
+        except Exception as error:  # a broken file surfaces as any of a dozen exception types
+            reason = printable(" ".join(str(error).split()), 200)
+            raise UserError(
+                f"model {name!r} in {where} has no image processor ({reason}); copy its "
+                "preprocessor_config.json there, or leave [vision] out of its card"
+            ) from error
+        self._of_size = dict[tuple[int, ...], tuple[int, Any]]()
+        blank = np.zeros((vision.height_px, vision.width_px, 3), dtype=np.uint8)
+        self.tokens = self.measured(blank)[0]
+
+    def __call__(self, pictures: list[Pixels]) -> "Mapping[str, torch.Tensor]":
+        """What the model's vision encoder reads."""
+        # A model that scales to one size takes a list for each row, of one.
+        images = [[pixels] for pixels in pictures] if "max_image_size" in self._options else pictures
+        found: Mapping[str, torch.Tensor] = self._processor(
+            images=images, return_tensors="pt", **self._options
+        )
+        return found
+
+    def measured(self, pixels: Pixels) -> tuple[int, Any]:
+        """Tokens of a picture of this size, and its grid of patches, where the model has one."""
+        if pixels.shape not in self._of_size:
+            made, eyes = self([pixels]), self._config.vision_config
+            grid = made.get("image_grid_thw")
+            if grid is None:
+                square = eyes.patch_size * self._config.scale_factor
+                patches = [side // square for side in made["pixel_values"].shape[-2:]]
+            else:
+                patches = [int(side) // eyes.spatial_merge_size for side in grid[0, 1:]]
+            self._of_size[pixels.shape] = math.prod(patches), grid
+        return self._of_size[pixels.shape]
+
+
+def tokens(card: Card) -> int:
+    """Tokens that the processor of a card's checkpoint makes of a picture of the card's size.
+
+    Raises:
+        UserError: the checkpoint or its processor is not here.
+    """
+    if card.vision is None:
+        raise ValueError(f"card {card.name} takes no pictures")
+    return Processor(card.name, find_checkpoint(card), card.vision).tokens

@@ -1,0 +1,137 @@
+"""The picture of an image prompt: the model that it is drawn for, its tokens, its looks in a terminal."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.cli.estimates import console
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from harness.backends.card import Card
+    from harness.backends.vision import Vision
+    from harness.core.image import Image, Pixels
+    from harness.prompts.versions import Prompt
+
+MODEL = "qwen3-vl-2b"  # unasked
+COLUMNS = 64  # of a picture in a terminal
+
+
+@dataclass(frozen=True)
+class Taker:
+    """A model that takes an image prompt's picture, by its card.
+
+    Attributes:
+        card: the model's.
+        vision: how it takes pictures.
+        processor_tokens: what its own image processor makes of one; None where that is not here.
+    """
+
+    card: "Card"
+    vision: "Vision"
+    processor_tokens: int | None = None
+
+    @property
+    def picture(self) -> str:
+        """Its pictures, in a line."""
+        name, (width, height) = printable(self.card.name), self.vision.size_px
+        return f"{width} x {height} pixels, front above rear; {self.vision.tokens} tokens with {name}"
+
+    @property
+    def checked(self) -> bool:
+        """Whether its own image processor was asked."""
+        return self.processor_tokens is not None
+
+    @property
+    def difference(self) -> str | None:
+        """What to say where its processor makes other tokens of a picture than its card says."""
+        n = self.processor_tokens
+        difference = None if n is None else self.vision.difference(n)
+        return difference and f"model {printable(self.card.name)!r}: {difference}"
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The same as plain values."""
+        width, height = self.vision.size_px
+        return {"model": self.card.name, "width_px": width, "height_px": height, "tokens": self.vision.tokens}
+
+
+def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker | None:
+    """The model that an image prompt's picture is drawn for; None if the prompt shows none.
+
+    Args:
+        prompt: the prompt.
+        model: as given to `--model`.
+        checked: whether to ask the model's own image processor, where it is here.
+
+    Raises:
+        UserError: it reads texts alone.
+    """
+    from harness.backends.cards import resolve
+    from harness.backends.registry import picture_tokens
+
+    if prompt.image is None:
+        return None
+    card = resolve(model or MODEL)
+    if card.vision is None:
+        raise UserError(
+            f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this model reads "
+            f"texts alone (its card has no [vision]); give another, such as {MODEL}"
+        )
+    return Taker(card, card.vision, picture_tokens(card) if checked else None)
+
+
+def write(image: "Image", file: Path) -> str:
+    """Write a picture as a PNG file, its folder made where it is not there; returns what to say of it."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, image.png())
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(file.parent)} cannot be written ({error.strerror}); give another folder"
+        ) from None
+    return f"wrote {printable(file)}"
+
+
+def draw(image: "Image") -> bool:
+    """Draw a picture in the terminal. False, and nothing drawn, where there is none, or none with colours."""
+    screen = console()
+    if not screen.is_terminal or screen.color_system in (None, "standard"):
+        return False
+    screen.print(half_blocks(image.pixels))
+    return True
+
+
+def half_blocks(pixels: "Pixels") -> "Text":
+    """A picture in characters: each is an upper half block of one pixel's colour on the colour of another."""
+    from rich.color import Color
+    from rich.style import Style
+    from rich.text import Text
+
+    height, width, _ = pixels.shape
+    columns = min(COLUMNS, width)
+    lines = max(1, min(round(columns * height / width / 2), height // 2))
+    small = _shrunk(_shrunk(pixels, 2 * lines, 0), columns, 1).round().astype(int).tolist()
+    return Text("\n").join(
+        Text.assemble(
+            *(
+                ("▀", Style(color=Color.from_rgb(*upper), bgcolor=Color.from_rgb(*lower)))
+                for upper, lower in zip(above, below, strict=True)
+            )
+        )
+        for above, below in zip(small[::2], small[1::2], strict=True)
+    )
+
+
+def _shrunk(pixels: Any, n: int, axis: int) -> Any:
+    """The means of n parts of an axis, each as long as another or longer by a pixel."""
+    import numpy as np
+
+    size = pixels.shape[axis]
+    starts = np.arange(n) * size // n
+    shape = [1, 1, 1]
+    shape[axis] = n
+    counts = np.diff(np.append(starts, size)).reshape(shape)
+    return np.add.reduceat(pixels.astype(float), starts, axis) / counts
