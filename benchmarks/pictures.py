@@ -97,11 +97,11 @@ def encoded(backend: Any, asked: Sequence[Request]) -> float:
     pictures = [request.image.pixels for request in asked if request.image]
     if not pictures:
         return 0.0
-    eyes, model = backend.engine.eyes, backend.engine.model
+    processor, model = backend.engine.eyes._processor, backend.engine.model
     begun_s = process_time()
     with torch.inference_mode():
         for start in range(0, len(pictures), 8):
-            made = eyes._processed(pictures[start : start + 8])
+            made = processor(pictures[start : start + 8])
             model.model.get_image_features(made["pixel_values"], made["image_grid_thw"])
     return process_time() - begun_s
 

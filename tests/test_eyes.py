@@ -59,10 +59,11 @@ def test_a_prompt_is_read_as_the_model_itself_reads_it(model: Any) -> None:
     more = model.chat.encode('{"action_distribution":')
     with torch.inference_mode():
         whole = torch.tensor([[*ids, *more]])
-        options: dict[str, Any] = {}
-        if eyes.positions(ids) is not None:
-            options = {"mm_token_type_ids": (whole < 0).int()}
-        logits = net(**eyes.inputs(whole), **options).logits[0].log_softmax(-1)
+        made = dict(eyes._processor([asked.image.pixels]))
+        if "image_grid_thw" in made:
+            made["mm_token_type_ids"] = (whole < 0).int()
+        filled = torch.where(whole < 0, net.config.image_token_id, whole)
+        logits = net(input_ids=filled, **made).logits[0].log_softmax(-1)
     session = model.engine.begin([ids])
     first = session.log_probs()[0]
     session.advance([more])
@@ -95,6 +96,24 @@ def test_a_batch_answers_as_each_alone(model: Any, answer: str) -> None:
             continue
         p, *same = (json.loads(text)["action_distribution"] for text in (one, *others))
         assert all(p == pytest.approx(q, abs=1e-5) for q in same)
+
+
+def test_a_picture_is_encoded_once_unless_the_same_question_comes_again_alone(
+    model: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded, real = [], model.engine.model.model.get_image_features
+    monkeypatch.setattr(
+        model.engine.model.model, "get_image_features",
+        lambda **made: encoded.append(len(made["pixel_values"])) or real(**made),
+    )  # fmt: skip
+    asked = [question(model, n, 11 + n % 2, "readout", f"Scene {n}") for n in range(4)]
+    model.complete(asked)
+    model.complete(asked)
+    assert len(encoded) == 1, "two pictures, in four questions, twice"
+    model.complete(asked[:1])
+    assert len(encoded) == 1, "the question is not one that was read alone"
+    model.complete(asked[:1])
+    assert len(encoded) == 2, "its time would be no answer's time"
 
 
 def test_the_picture_is_looked_at_and_only_its_own(model: Any) -> None:

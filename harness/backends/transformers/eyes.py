@@ -6,20 +6,23 @@ Importing this imports torch.
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import torch
 
+from harness.backends.engine import picture_of, picture_tokens
 from harness.backends.transformers.processor import Processor
 from harness.backends.vision import Vision
 from harness.core.errors import UserError
-from harness.core.image import Image, Pixels
+from harness.core.image import Image
 
-KEPT = 128  # pictures that prompts may hold at once: more than one call asks about
+KEPT = 64  # pictures whose encoding is kept: those of a chunk of requests, for the ego's fusion calls
 
 
 class Eyes:
-    """A loaded model's image processor, with the pictures that prompts hold.
+    """A loaded model's image processor and vision encoder.
 
     Attributes:
         image_token: what its chat template writes for a picture.
@@ -38,36 +41,38 @@ class Eyes:
         self._filled: int = model.config.image_token_id
         self.image_token: str = tokenizer.convert_ids_to_tokens(self._filled)
         self._before, self._after = _markers(tokenizer, vision.scaled_to_px is not None)
-        self._next = -1
-        self._seen = OrderedDict[str, tuple[range, Pixels]]()  # by digest, those asked for longest ago first
+        self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
+        self._encoded = OrderedDict[
+            int, list[torch.Tensor]
+        ]()  # what each layer gets, those used last at the end
 
     def look(self, image: Image) -> list[int]:
-        """What stands for a picture in a prompt; see `harness.backends.engine.Engine.look`."""
-        if image.sha256 not in self._seen:
-            tokens, _ = self._processor.measured(image.pixels)
-            self._seen[image.sha256] = range(self._next, self._next - tokens, -1), image.pixels
-            self._next -= tokens
-            while len(self._seen) > KEPT:
-                self._seen.popitem(last=False)
-        self._seen.move_to_end(image.sha256)
-        return [*self._before, *self._seen[image.sha256][0], *self._after]
+        """What stands for a picture in a prompt; it must be there until that is read."""
+        tokens = picture_tokens(image, self._processor.measured(image.pixels)[0])
+        self._images[picture_of(tokens[0])[0]] = image
+        return [*self._before, *tokens, *self._after]
+
+    def forget(self, prompt: Sequence[int]) -> None:
+        """Encode a prompt's pictures again when they are read again."""
+        for key in _pictures(prompt):
+            self._encoded.pop(key, None)
 
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
         """The model's inputs for tokens (n, width): their ids, and the pictures among them in their order."""
-        found = self._pictures(ids.flatten().tolist())
-        pictures = self._processor(found) if found else {}
-        device = self._model.device
-        return {
-            "input_ids": torch.where(ids < 0, self._filled, ids).to(device),
-            **{key: value.to(device) for key, value in pictures.items()},
-        }
+        keys = _pictures(ids.flatten().tolist())
+        told: dict[str, Any] = {"input_ids": torch.where(ids < 0, self._filled, ids).to(self._model.device)}
+        if keys:
+            first, *deeper = zip(*self._encodings(keys), strict=True)
+            seen = SimpleNamespace(pooler_output=first, deepstack_features=deeper)
+            told["mm_encoder_outputs"] = {"image": seen}
+        return told
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
         """Where a prompt's tokens stand, (3, tokens): in time, height and width; None if in one row."""
         if not hasattr(self._model.model, "get_rope_index"):
             return None
         ids = torch.tensor([list(prompt)])
-        grids = [self._processor.measured(pixels)[1] for pixels in self._pictures(list(prompt))]
+        grids = [self._processor.measured(self._images[key].pixels)[1] for key in _pictures(prompt)]
         place, _ = self._model.model.get_rope_index(
             torch.where(ids < 0, self._filled, ids), mm_token_type_ids=(ids < 0).int(),
             image_grid_thw=torch.cat(grids) if grids else None,
@@ -75,10 +80,28 @@ class Eyes:
         found: torch.Tensor = place[:, 0]
         return found
 
-    def _pictures(self, ids: list[int]) -> list[Pixels]:
-        """Pixels of the pictures whose first token is among these, in order."""
-        first = {tokens[0]: pixels for tokens, pixels in self._seen.values()}
-        return [first[token] for token in ids if token in first]
+    def _encodings(self, keys: Sequence[int]) -> list[list[torch.Tensor]]:
+        """What each layer gets of some pictures, which are encoded together where they are not yet."""
+        owed = [key for key in dict.fromkeys(keys) if key not in self._encoded]
+        if owed:
+            made = self._processor([self._images[key].pixels for key in owed])
+            seen = self._model.model.get_image_features(
+                **{name: value.to(self._model.device) for name, value in made.items()}, return_dict=True
+            )
+            layers = [seen.pooler_output, *getattr(seen, "deepstack_features", ())]
+            self._encoded |= {key: [layer[i] for layer in layers] for i, key in enumerate(owed)}
+        for key in keys:
+            self._encoded.move_to_end(key)
+        found = [self._encoded[key] for key in keys]
+        while len(self._encoded) > KEPT:
+            self._encoded.popitem(last=False)
+        return found
+
+
+def _pictures(tokens: Sequence[int]) -> list[int]:
+    """The pictures whose first token is among these, in order."""
+    found = (picture_of(token) for token in tokens if token < 0)
+    return [key for key, place in found if place == 0]
 
 
 def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:

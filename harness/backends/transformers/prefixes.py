@@ -47,6 +47,10 @@ class Prefixes:
         layers = [(keys[..., :most, :], values[..., :most, :]) for keys, values in found.layers]
         return Prefix(found.ids[:most], layers)
 
+    def holds(self, ids: list[int]) -> bool:
+        """Whether a whole prompt was read lately."""
+        return any(kept.ids == ids for kept in self._kept)
+
     def keep(self, prefix: Prefix) -> None:
         """Remember a beginning, and forget old ones that would be too much with it."""
         self._kept = [*(kept for kept in self._kept if kept.ids != prefix.ids), prefix]

@@ -54,6 +54,8 @@ class Reader:
         # Each prompt's last token is left to be read, for what comes after it.
         shared = common([list(prompt[:-1]) for prompt in prompts])
         # A prompt that is asked again, alone, is read again: else its time would be no answer's time.
+        if self._eyes and len(prompts) == 1 and self._prefixes.holds(list(prompts[0])):
+            self._eyes.forget(prompts[0])
         prefix = self._prefixes.longest(shared, but=prompts[0] if len(prompts) == 1 else ())
         if len(prompts) > 1 and len(shared) - len(prefix.ids) >= LEAST_TOKENS:
             prefix = Prefix(shared, Rows(self, prefix, [shared]).layers())
@@ -89,9 +91,9 @@ class Reader:
             options["position_ids"] = places.to(device)
         elif self._positions:
             options["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)[:, -ids.shape[1] :].to(device)
-        options |= self._eyes.inputs(ids) if self._eyes else {"input_ids": ids.to(device)}
         try:
             with torch.inference_mode():
+                options |= self._eyes.inputs(ids) if self._eyes else {"input_ids": ids.to(device)}
                 return self._model(logits_to_keep=1, **options).logits[:, -1]
         except Exception:
             self._failed = True
