@@ -238,7 +238,7 @@ def missing(card: "Card") -> str | None:
     return None
 
 
-def picture_tokens(card: "Card") -> int | None:
+def processor_tokens(card: "Card") -> int | None:
     """Tokens that a card's own image processor makes of a picture of the card's size; None if not here."""
     if missing(card) or not (sees := registration(card.engine).sees):
         return None

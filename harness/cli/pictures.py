@@ -70,7 +70,7 @@ def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker |
         UserError: it reads texts alone.
     """
     from harness.backends.cards import resolve
-    from harness.backends.registry import picture_tokens
+    from harness.backends.registry import processor_tokens
 
     if prompt.image is None:
         return None
@@ -80,7 +80,7 @@ def taker(prompt: "Prompt", model: str | None, checked: bool = False) -> Taker |
             f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this model reads "
             f"texts alone (its card has no [vision]); give another, such as {MODEL}"
         )
-    return Taker(card, card.vision, picture_tokens(card) if checked else None)
+    return Taker(card, card.vision, processor_tokens(card) if checked else None)
 
 
 def write(image: "Image", file: Path) -> str:
