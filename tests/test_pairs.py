@@ -118,6 +118,15 @@ def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, 
     assert not Path("pairs.jsonl").exists()
 
 
+def test_a_run_whose_prompts_showed_pictures_is_one_line(run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())["prompt"]
+    configure(run, prompt={**stated, "version": "v7", "sha256": prompts.load("v7").sha256})
+    code, out, err = harness("export", run, "--sft", "pairs.jsonl")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "showed pictures by prompt v7" in err
+    assert not Path("pairs.jsonl").exists()
+
+
 @pytest.mark.parametrize(
     ("name", "changed", "said"),
     [

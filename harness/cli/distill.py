@@ -31,7 +31,10 @@ def command(
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
     workers: options.Workers = 2,
 ) -> None:
-    """Train a small Qwen3 in some scenarios. The same command again continues training that was stopped."""
+    """Train a small Qwen3 in some scenarios. The same command again continues training that was stopped.
+
+    With an image prompt among them it is a Qwen3-VL, which takes pictures and texts.
+    """
     from harness.prompts import versions as prompts
 
     extras.need("harness distill", "torch", "transformers", "highway_env")

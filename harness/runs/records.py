@@ -419,5 +419,5 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def agent(self, place: int) -> dict[str, Any]:
         """Who answers for a scene's viewer at this place, as `helpers` has it; the ego is at 0."""
         if place and self.helpers:
-            return self.helpers[(place - 1) % len(self.helpers)]
+            return {"image": "own", **self.helpers[(place - 1) % len(self.helpers)]}
         return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking", "image")}

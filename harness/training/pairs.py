@@ -14,7 +14,7 @@ import numpy as np
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
-from harness.evaluate.agent import in_mode
+from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of
 from harness.prompts import readout
 from harness.prompts.versions import as_it_was
@@ -68,6 +68,11 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
                 f"--sft: {printable(run.path)} was made with prompt {printable(version)} with sha256 "
                 f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
             )
+        if prompt.image and agent["image"] != "none":
+            raise UserError(
+                f"--sft: {printable(run.path)} showed pictures by prompt {printable(version)}, and the file "
+                "holds texts alone; give a run with --image none, or of another prompt"
+            )
         prompts[version] = prompt
     dataset = dataset_of(run)
     check_scenes(run, dataset)
@@ -90,7 +95,8 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
             agent = run.agent(one)
             prompt = prompts[agent["prompt"]["version"]]
             q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
-            messages = in_mode(agent["answer"], prompt, q.messages, q.graph["role"], q.actions)
+            texts = shown(agent["image"], q.messages)
+            messages = in_mode(agent["answer"], prompt, texts, q.graph["role"], q.actions)
             said = answer(prompt, q.graph, q.label, q.actions)
             if agent["answer"] == "readout":
                 said = readout.letters(q.actions)[int(q.label.argmax())]
