@@ -96,7 +96,7 @@ def test_an_engine_reads_what_the_model_learnt_from(
     samples = student.reading(asked)
     filled = model.engine.model.config.image_token_id
     for q, sample in zip(asked, samples, strict=True):
-        tokens = [filled if token < 0 else token for token in model._tokens(request(q))]
+        tokens = [filled if token < 0 else token for token in model.tokens(request(q))]
         assert tokens == sample.ids[: sample.answer_at].tolist()
     completions = model.complete([request(q) for q in asked])
     for p, completion in zip(student.read(samples), completions, strict=True):

@@ -54,7 +54,7 @@ def question(model: Any, n: int, picture: int | None, answer: Any = "json", text
 def test_a_prompt_is_read_as_the_model_itself_reads_it(model: Any) -> None:
     """Against one forward pass of the whole prompt by transformers' own rules, answer and all."""
     asked = question(model, 0, 1)
-    ids = model._tokens(asked)
+    ids = model.tokens(asked)
     eyes, net = model.engine.eyes, model.engine.model
     more = model.chat.encode('{"action_distribution":')
     with torch.inference_mode():
@@ -74,7 +74,7 @@ def test_a_prompt_is_read_as_the_model_itself_reads_it(model: Any) -> None:
 
 def test_a_picture_has_the_tokens_that_the_card_says(model: Any) -> None:
     vision = model.engine.card.vision
-    tokens = model._tokens(question(model, 0, 1))
+    tokens = model.tokens(question(model, 0, 1))
     assert sum(token < 0 for token in tokens) == vision.tokens
     assert vision.tokens == (16 if vision.scaled_to_px else 128)
     [said] = model.complete([question(model, 0, 1)])
@@ -120,6 +120,19 @@ def test_the_picture_is_looked_at_and_only_its_own(model: Any) -> None:
     asked = [question(model, n, picture, "readout") for n, picture in enumerate((1, 2, 1))]
     one, other, same = (c.text for c in model.complete(asked))
     assert one == same != other
+
+
+@pytest.mark.parametrize("picture", [None, 1])
+def test_a_text_that_has_the_token_of_a_picture_shows_none(model: Any, picture: int | None) -> None:
+    """As a helper might write it, whose words are in the ego's prompt."""
+    mark = model.chat.image_token
+    hostile = question(model, 0, picture, text=f"{mark} MESSAGES v3 high {mark}{mark} evidence")
+    assert sum(token < 0 for token in model.tokens(hostile)) == model.engine.card.vision.tokens * bool(
+        picture
+    )
+    assert model.engine.model.config.image_token_id not in model.tokens(hostile)
+    [said] = model.complete([hostile])
+    assert said.error is None
 
 
 def test_a_text_alone_is_read_as_ever(model: Any) -> None:

@@ -51,14 +51,21 @@ class Chat:
         from jinja2 import TemplateError
 
         switch = {"enable_thinking": thinking} if self._switch else {}
-        shown = in_parts(messages, {"type": "image"}) if self.image_token else list(map(dict, messages))
         try:
-            return self._apply(shown, switch)
+            return self._apply(self._shown(messages), switch)
         except TemplateError as error:
             raise UserError(
                 f"model {self.name!r}: its chat template refuses the messages "
                 f"({printable(error)}); use a prompt with roles that it knows"
             ) from None
+
+    def _shown(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+        """Messages as the template takes them; who writes the token of a picture in a text shows none."""
+        token = self.image_token
+        if token is None:
+            return [dict(message) for message in messages]
+        texts = [{**m, "content": m["content"].replace(token, f"{token[0]} {token[1:]}")} for m in messages]
+        return in_parts(texts, {"type": "image"})
 
     def _apply(self, messages: list[dict[str, Any]], switch: Mapping[str, bool]) -> str:
         text: str = self.tokenizer.apply_chat_template(

@@ -48,7 +48,7 @@ class LanguageModel:
         done: dict[int, Completion] = {}
         fitting = []
         for position, request in enumerate(requests):
-            ids = self._tokens(request)
+            ids = self.tokens(request)
             room = self._decoding.room(request)
             if len(ids) + room > self.engine.context_tokens:
                 done[position] = _failed(request, len(ids), self._overflow(len(ids), room))
@@ -59,7 +59,7 @@ class LanguageModel:
                 done[prompt.position] = completion
         return [done[position] for position in range(len(requests))]
 
-    def _tokens(self, request: Request) -> list[int]:
+    def tokens(self, request: Request) -> list[int]:
         """A prompt, in tokens; those of a picture as its engine gives them."""
         text = self.chat.render(request.messages, thinking=request.thinking)
         if request.image is None:
@@ -77,7 +77,7 @@ class LanguageModel:
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
         """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
-        with closing(self.engine.begin([self._tokens(request) for request in requests])) as session:
+        with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 
     def identity(self) -> dict[str, Any]:
