@@ -14,13 +14,22 @@ pytest.importorskip("highway_env", reason="needs the sim extra")
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
+from harness.core.errors import UserError
 from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.training.distill import Curriculum, distill
 from harness.training.examples import Question, alone
 from harness.training.lessons import Lessons, draw
-from harness.training.model import VISION
+from harness.training.model import (
+    MARKS,
+    VISION,
+    new_model,
+    read_tokenizer,
+    save_tokenizer,
+    take_over,
+    train_tokenizer,
+)
 from harness.training.student import Student
 from harness.training.train import STAGES, Plan
 from harness.world.scenarios.occluded_intersection import SCENARIO
@@ -102,6 +111,29 @@ def test_an_engine_reads_what_the_model_learnt_from(
     for p, completion in zip(student.read(samples), completions, strict=True):
         said = json.loads(completion.text)["action_distribution"]
         assert p == pytest.approx([said[a] for a in SCENARIO.actions], abs=2e-5)
+
+
+def test_one_that_begins_as_a_model_of_texts_reads_texts_as_that_does(asked: list[Question], tmp_path: Path):
+    import torch
+
+    tokenizer = train_tokenizer([m["content"] for q in asked for m in q.messages])
+    base = new_model(tokenizer, 1)
+    base.save_pretrained(tmp_path)
+    save_tokenizer(tokenizer, tmp_path)
+    more = read_tokenizer(tmp_path, sees=True)
+    assert more.get_vocab_size() == tokenizer.get_vocab_size() + len(MARKS)
+    seer = new_model(more, 2, sees=True)
+    take_over(seer, tmp_path)
+    ids = torch.tensor([more.encode(asked[0].messages[-1]["content"]).ids])
+    with torch.inference_mode():
+        one, other = base(ids).logits, seer(input_ids=ids).logits
+    assert torch.allclose(one, other[..., : one.shape[-1]], atol=1e-5)
+
+
+def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
+    model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
+    with pytest.raises(UserError, match=r"--base .*give the folder of a model that `harness distill` made"):
+        take_over(model, folder)
 
 
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):

@@ -22,6 +22,9 @@ def command(
     prompt: list[str] = typer.Option(
         ["v2", "v4"], help="Prompt version to learn, in the scenarios it fits; repeat for several."
     ),
+    base: Path | None = typer.Option(
+        None, help="Folder of a distilled model of texts to begin as, tokenizer included."
+    ),
     layouts: int = typer.Option(240, help="Layouts of each scenario."),
     first_seed: int = typer.Option(FIRST["train"], help="Layout seed of the first."),
     samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
@@ -41,6 +44,11 @@ def command(
     for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
+    if base and not all((base / name).is_file() for name in ("model.safetensors", "tokenizer.json")):
+        raise UserError(
+            f"--base {printable(base)}: no model.safetensors with a tokenizer.json; give the folder of a "
+            "model that `harness distill` made"
+        )
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
     driven = [ready_to_drive(name, layouts, first_seed, workers) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
@@ -74,8 +82,8 @@ def command(
             progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
         facts = run(
-            Curriculum(learnt, layouts, first_seed), plan, out, progress, show, device_of(device), threads,
-            workers,
+            Curriculum(learnt, layouts, first_seed, base), plan, out, progress, show, device_of(device),
+            threads, workers,
         )  # fmt: skip
     for apart in facts["held_out"]:
         typer.echo(

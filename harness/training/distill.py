@@ -10,11 +10,11 @@ import torch
 import transformers
 
 from harness.core import work
-from harness.core.files import canonical_json, sha256_bytes, write_whole
+from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
 from harness.prompts.versions import Prompt
 from harness.training.gguf_export import export
 from harness.training.lessons import draw
-from harness.training.model import save_tokenizer
+from harness.training.model import WEIGHTS, save_tokenizer
 from harness.training.student import Progress, Student
 from harness.training.train import STAGES, Plan
 from harness.world.scenario import Scenario
@@ -28,11 +28,13 @@ class Curriculum:
         prompts: of each scenario, the versions that are learnt.
         layouts: how many of each scenario.
         seed: layout seed of the first.
+        base: folder of the model of texts that it begins as; None begins with random weights.
     """
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]
     layouts: int
     seed: int
+    base: Path | None = None
 
     def settings(self) -> dict[str, Any]:
         """What a run that goes on must have in common with what it began as, as plain values."""
@@ -44,6 +46,7 @@ class Curriculum:
             "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},
             "layouts": self.layouts,
             "first_seed": self.seed,
+            "base_sha256": self.base and sha256_file(self.base / WEIGHTS),
         }
 
 
@@ -88,7 +91,8 @@ def distill(
                  workers, drawing)
             for scenario, prompts in curriculum.prompts.items()
         ]  # fmt: skip
-        facts = _trained(curriculum, Student(lessons, plan, place, device), out, progress)
+        student = Student(lessons, plan, place, device, curriculum.base)
+        facts = _trained(curriculum, student, out, progress)
         work.tidy(out)
     return facts
 
@@ -104,6 +108,7 @@ def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Prog
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),
         "vocabulary": student.tokenizer.get_vocab_size(),
+        "sees": hasattr(student.model.config, "vision_config"),
         "held_out": student.held_out_kl(),
         "curves": curves,
     }  # fmt: skip
@@ -119,7 +124,9 @@ def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Prog
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
-    plan = facts["plan"]
+    plan, base = facts["plan"], facts["base_sha256"]
+    begins = f"from the weights with sha256 `{base}`" if base else "from random weights"
+    kind = "Qwen3-VL" if facts["sees"] else "Qwen3"
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
         for stage, curve in facts["curves"].items()
@@ -131,7 +138,7 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     )
     return f"""# {name}
 
-A Qwen3 of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained from random weights
+A {kind} of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained {begins}
 by `harness distill` to imitate one planner in the scenarios below. It shows the harness with a real language
 model that fits beside the source; it says nothing about Qwen3-4B or any other model.
 

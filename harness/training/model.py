@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from harness.backends.tokens import byte_level
+from harness.backends.tokens import tokenizer as tokenizer_of
 from harness.backends.vision import Vision
+from harness.core.errors import UserError, printable
 
 CONTEXT_TOKENS = 2048
 # 512 entries leave a prompt a third longer (371 tokens against 282, prompt v2, ego); merges end at 819.
 VOCABULARY = 768
 END, START, PAD = "<|im_end|>", "<|im_start|>", "<|endoftext|>"
 PICTURE, VIDEO, BEGINS, ENDS = "<|image_pad|>", "<|video_pad|>", "<|vision_start|>", "<|vision_end|>"
+MARKS = (PICTURE, VIDEO, BEGINS, ENDS)
+WEIGHTS = "model.safetensors"
 TEMPLATE = (
     "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content }}<|im_end|>\n{% endfor %}"
     "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
@@ -86,6 +90,31 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
     return model
 
 
+def take_over(model: Any, base: Path) -> None:
+    """Give a model the weights of a model of texts, in whose vocabulary its own begins.
+
+    Raises:
+        UserError: the folder has no such weights, or those of another size.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    file, own = base / WEIGHTS, model.state_dict()
+    within = "model.language_model." if hasattr(model.config, "vision_config") else "model."
+    try:
+        weights = load_file(file)
+        for name, values in weights.items():
+            place = own[name.replace("model.", within, 1)]
+            if place.shape[1:] != values.shape[1:] or len(place) < len(values):
+                raise ValueError(f"{name} is {tuple(values.shape)}, and {tuple(place.shape)} here")
+            place[: len(values)] = values
+    except (OSError, KeyError, ValueError, SafetensorError) as error:
+        raise UserError(
+            f"--base {printable(base)}: {printable(str(error), 160)}; give the folder of a model that "
+            "`harness distill` made of text prompts"
+        ) from None
+
+
 @lru_cache(maxsize=1)
 def image_processor() -> Any:
     """What turns pictures into the model's patches."""
@@ -95,13 +124,22 @@ def image_processor() -> Any:
     return Qwen2VLImageProcessorPil(patch_size=VISION.patch_px, merge_size=VISION.merge, size=pixels)
 
 
+def read_tokenizer(base: Path, sees: bool) -> Any:
+    """A model's tokenizer, with the tokens around pictures behind its own for one that `sees`."""
+    from tokenizers import Tokenizer
+
+    built = Tokenizer.from_str(tokenizer_of(base).to_str())  # of its own: that one is kept for others
+    if sees:
+        built.add_special_tokens(_special(MARKS))
+    return built
+
+
 def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
     """A byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
-    from tokenizers import AddedToken, models, pre_tokenizers, trainers
+    from tokenizers import models, pre_tokenizers, trainers
 
     tokenizer = byte_level(models.BPE())
-    marks = (PICTURE, VIDEO, BEGINS, ENDS) if sees else ()
-    special = [AddedToken(t, special=True, normalized=False) for t in (PAD, START, END, *marks)]
+    special = _special((PAD, START, END, *(MARKS if sees else ())))
     trainer = trainers.BpeTrainer(
         vocab_size=VOCABULARY - len(special),
         initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
@@ -110,6 +148,12 @@ def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
     tokenizer.train_from_iterator(texts, trainer)
     tokenizer.add_special_tokens(special)
     return tokenizer
+
+
+def _special(texts: Sequence[str]) -> list[Any]:
+    from tokenizers import AddedToken
+
+    return [AddedToken(text, special=True, normalized=False) for text in texts]
 
 
 def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:

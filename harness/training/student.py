@@ -15,7 +15,7 @@ from harness.prompts import readout
 from harness.training.answers import answer, evidence
 from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.lessons import Lessons
-from harness.training.model import END, chat, new_model, train_tokenizer
+from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
@@ -30,15 +30,20 @@ T = TypeVar("T")
 class Student:
     """The lessons as questions, the tokenizer, and the model as it grows."""
 
-    def __init__(self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str) -> None:
+    def __init__(
+        self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str, base: Path | None = None
+    ) -> None:
         self.plan, self.work = plan, work
         self.lessons, self.held_out = zip(*(each.split(HELD_OUT) for each in lessons), strict=True)
         self.questions = [q for each in self.lessons for q in alone(each)]
         sees = any(p.image for each in lessons for p in each.prompts)
-        self.tokenizer = self._tokenizer(sees)
+        self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         most = max((each.scenario.actions for each in lessons), key=len)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
-        self.model = new_model(self.tokenizer, plan.seed, sees).to(device)
+        self.model = new_model(self.tokenizer, plan.seed, sees)
+        if base:
+            take_over(self.model, base)
+        self.model.to(device)
         self._shared: dict[str, Any] = {}
 
     def reading(self, questions: Sequence[Question]) -> list[Sample]:
