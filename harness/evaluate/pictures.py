@@ -7,7 +7,8 @@ import numpy as np
 from harness.core import noise
 from harness.core.errors import UserError
 from harness.core.image import Image
-from harness.dataset.load import Dataset, Scene
+from harness.dataset.load import Scene
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.world.perception.camera import Sight
 
@@ -15,7 +16,7 @@ GREY = 127
 
 
 def picture(spec: Spec, who: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
-    """The picture that a viewer's agent is shown; None where its prompt has none, or it is no model of them.
+    """The picture that a viewer's agent is shown; None where its questions have none.
 
     Args:
         spec: the evaluation.
@@ -49,7 +50,8 @@ def blank(size_px: tuple[int, int]) -> Image:
 
 def another(spec: Spec, scene: Scene) -> Scene:
     """A decision point of the same step in another episode, drawn by the scene's id."""
-    dataset: Dataset = getattr(spec.source, "dataset")  # noqa: B009 closed loops are refused before
+    assert isinstance(spec.source, FrozenSource), "a closed loop is refused before"
+    dataset = spec.source.dataset
     forest = dataset.forest
     n = forest.place[scene.id]
     others = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
