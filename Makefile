@@ -6,6 +6,9 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # x86-64 of the last ten years; SOURCE_DATE_EPOCH would take AVX2 from it as well.
 LLAMA_CPP := env -u SOURCE_DATE_EPOCH CMAKE_ARGS="-DMTMD_VIDEO=OFF -DGGML_NATIVE=OFF \
 	-DCMAKE_PROJECT_llama.cpp_INCLUDE=$(CURDIR)/llama-cpp.cmake"
+# pip keeps the wheels that it built, whatever they were built with: an older one may read no pictures.
+SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP) $(INSTALL) \
+	--no-cache-dir --force-reinstall --no-deps llama-cpp-python
 
 .PHONY: eval test check light browser docs bench clean
 
@@ -57,6 +60,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 
 .venv/llama-cpp: .venv/base
 	$(LLAMA_CPP) $(INSTALL) --editable '.[llama-cpp]'
+	$(SEES)
 	touch $@
 
 .venv/docs: .venv/bin/python pyproject.toml requirements.lock
@@ -65,6 +69,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 
 .venv/dev: .venv/bin/python pyproject.toml requirements.lock
 	$(LLAMA_CPP) $(INSTALL) --editable '.[transformers,llama-cpp,dev]'
+	$(SEES)
 	touch .venv/base .venv/llama-cpp .venv/docs $@
 
 .venv-light/test: pyproject.toml requirements.lock
