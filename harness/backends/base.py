@@ -66,6 +66,11 @@ class Request:
     truth: Mapping[str, Any] | None = None
     scenario: "Scenario | None" = None
 
+    @property
+    def image_sha256(self) -> str | None:
+        """Digest of its picture's pixels; None where there is none."""
+        return self.image.sha256 if self.image else None
+
 
 @dataclass(frozen=True)
 class Completion:

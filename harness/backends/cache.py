@@ -55,7 +55,7 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
     16 bits it may move one by rounding, with a cache or without; the identity holds the number format.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
-    asked["image"] = request.image and request.image.sha256
+    asked["image"] = request.image_sha256
     return digest({"identity": identity, "prompt": prompt, "asked": asked, "code": kept.code_sha256(*_CODE)})
 
 

@@ -102,18 +102,8 @@ class _File(Card):
 _OF_SOME = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation", "failures",
             "privileged", "vision", "projector")  # fmt: skip
 # Keys that a model may have anew for each engine that it runs on.
-_ANEW = (
-    "latency",
-    "weights",
-    "file",
-    "revision",
-    "sha256",
-    "gated",
-    "dtype",
-    "quantisation",
-    "server",
-    "projector",
-)
+_ANEW = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation", "server",
+         "projector")  # fmt: skip
 
 
 def read(path: Path) -> list[Card]:

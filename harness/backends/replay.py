@@ -115,7 +115,7 @@ class Replay:
         agent = self._run.agent(answer)
         self._check(request, agent)
         again = request.id.endswith(AGAIN)
-        asked = digest(request.messages[: -2 if again else None]), request.image and request.image.sha256
+        asked = digest(request.messages[: -2 if again else None]), request.image_sha256
         if asked != (answer.prompt_sha256, answer.image_sha256 or None):
             raise UserError(
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "

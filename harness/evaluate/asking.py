@@ -103,7 +103,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
         first_token_s=completion.first_token_s, token_s=completion.token_s,
         prompt_sha256=digest(request.messages),
-        image_sha256=request.image.sha256 if request.image else UNSET,
+        image_sha256=request.image_sha256 or UNSET,
         status=str(said.status), verdict=said.verdict,
         repairs=tuple(map(str, said.repairs)), intent=said.intent, mass=said.mass, message=said.message,
         detail=said.detail,

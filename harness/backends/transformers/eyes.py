@@ -42,9 +42,8 @@ class Eyes:
         self.image_token: str = tokenizer.convert_ids_to_tokens(self._filled)
         self._before, self._after = _markers(tokenizer, vision.scaled_to_px is not None)
         self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
-        self._encoded = OrderedDict[
-            int, list[torch.Tensor]
-        ]()  # what each layer gets, those used last at the end
+        # What each layer gets of a picture; those used last are at the end.
+        self._encoded: OrderedDict[int, list[torch.Tensor]] = OrderedDict()
 
     def look(self, image: Image) -> list[int]:
         """What stands for a picture in a prompt; it must be there until that is read."""

@@ -210,11 +210,7 @@ def _named(scene: Scene, twin: Twin, **others: Any) -> Scene:
 
 def _differ(a: Request, b: Request) -> bool:
     """Whether a language model is asked otherwise."""
-    return (a.messages, a.actions) != (b.messages, b.actions) or _digest(a) != _digest(b)
-
-
-def _digest(request: Request) -> str | None:
-    return request.image.sha256 if request.image else None
+    return (a.messages, a.actions) != (b.messages, b.actions) or a.image_sha256 != b.image_sha256
 
 
 def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
@@ -234,6 +230,6 @@ def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer])
 def _text(request: Request) -> str:
     lines = []
     for message in request.messages:
-        picture = [f"picture {_digest(request)}"] if "image" in message else []
+        picture = [f"picture {request.image_sha256}"] if "image" in message else []
         lines += [f"--- {message['role']}", *picture, message["content"]]
     return "\n".join(lines)
