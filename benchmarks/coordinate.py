@@ -12,10 +12,10 @@ from time import process_time
 
 import numpy as np
 
-from harness.coordination.channel import Draws
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS
+from harness.radio.channel import Draws
 
 AIM_S = 1.0
 HELPERS, ACTIONS = 3, 3

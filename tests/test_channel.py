@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.channel import CHANNELS, NO_CHANNEL, Draws, Links, density_coupled_loss, link_up
 from harness.core.noise import uniforms
+from harness.radio.channel import Draws, Links
+from harness.radio.constant import density_coupled_loss, link_up
+from harness.radio.profiles import CHANNELS, NO_CHANNEL
 
 V2X: Any = CHANNELS["v2x"]
 SIXG: Any = CHANNELS["6g"]

@@ -10,10 +10,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from harness.coordination.channel import Draws
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.radio.channel import Draws
 
 DOUBT = (0.3, 0.4, 0.3)
 ALONE, V2X, SIXG = POINTS["single-local"], POINTS["v2x"], POINTS["6g"]

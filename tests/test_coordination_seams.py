@@ -11,13 +11,15 @@ import pytest
 from packaged import register
 from swarm_extras import FOG, SMOOTHING, Fog
 
-from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel, Draws, Links, Radio
 from harness.coordination.consensus import RULES, Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
+from harness.radio.channel import Channel, Draws, Links
+from harness.radio.constant import Radio
+from harness.radio.profiles import CHANNELS, NO_CHANNEL
 
 
 @pytest.fixture(autouse=True)
@@ -199,7 +201,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         tmp_path,
         "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
         "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\n",
-        radios="from harness.coordination.channel import Radio\n"
+        radios="from harness.radio.constant import Radio\n"
         "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
         "ODD = 7\n",
     )

@@ -29,7 +29,6 @@ from evaluating import (
 from run_on_disk import UNTIMED, answers_of, configure
 
 from harness.backends.base import Completion, Request
-from harness.coordination.channel import Draws
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -41,6 +40,7 @@ from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Due, heard_codes
 from harness.prompts.versions import load as prompt
+from harness.radio.channel import Draws
 from harness.runs.records import Latency
 from harness.studies.stored import Stored
 

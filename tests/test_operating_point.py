@@ -5,9 +5,9 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from harness.coordination.channel import CHANNELS
 from harness.coordination.operating_point import POINTS, SHORT, OperatingPoint, named_point
 from harness.core.errors import UserError
+from harness.radio.profiles import CHANNELS
 from harness.studies.axes import AXES
 
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from harness.coordination.channel import Draws
 from harness.coordination.consensus import EGO_PROMPT, RULES, Messages, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
+from harness.radio.channel import Draws
 
 # Who was heard, `(..., H)`, to the answer of the fusion call: the ego's intent `(..., A)`, where it failed or
 # nobody was heard NaN, and the seconds `(...)` it took.

@@ -25,12 +25,12 @@ from functools import cached_property
 
 import numpy as np
 
-from harness.coordination.channel import Draws, Links
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.statistics import known_mean
+from harness.radio.channel import Draws, Links
 
 
 @dataclass(frozen=True)

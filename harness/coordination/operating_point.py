@@ -5,9 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from harness.coordination.channel import CHANNELS, NO_CHANNEL, Channel
 from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
+from harness.radio.channel import Channel
+from harness.radio.profiles import CHANNELS, NO_CHANNEL
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")

@@ -12,7 +12,6 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.coordination.channel import Draws
 from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
@@ -21,6 +20,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import codes_of
+from harness.radio.channel import Draws
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 Moment = TypeVar("Moment")

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.channel import Draws
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.walk import Decided, Due
+from harness.radio.channel import Draws
 from harness.studies.play import Walked, walk_through
 
 VERSION = "3"
@@ -86,8 +86,8 @@ FITTED_ON: Mapping[str, tuple[str, ...]] = {
     "CUT (harness/studies/calibrated.py)": ("B20",),  # no decision is above .95 nats
     "STEPS (harness/studies/calibrated.py)": ("A8", "A9"),
     "WITNESS_M, EGO_M, OTHERS_M (harness/studies/calibrated.py)": ("B9",),  # the witness decides
-    "6g jitter (harness/coordination/channel.py)": ("A6",),
-    "density-coupled loss (harness/coordination/channel.py)": ("B6", "B7", "B8"),
+    "6g jitter (harness/radio/profiles.py)": ("A6",),
+    "density-coupled loss (harness/radio/constant.py)": ("B6", "B7", "B8"),
 }
 
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.coordination.channel import density_coupled_loss
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.work import tidy
 from harness.evaluate.run import Evaluated, evaluate, finished
 from harness.evaluate.spec import Spec
+from harness.radio.constant import density_coupled_loss
 from harness.runs.records import Score
 from harness.studies import figures
 from harness.studies.axes import AXES, CORE, Setting, described, grid

@@ -9,7 +9,7 @@ part of the dangers that helpers watch.
 
 import numpy as np
 
-from harness.coordination.channel import density_coupled_loss
+from harness.radio.constant import density_coupled_loss
 from harness.studies.calibrated import CUT, FITTED_ON, Parameters
 from harness.studies.ledger import paper_numbers
 

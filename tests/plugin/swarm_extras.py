@@ -10,9 +10,10 @@ import numpy as np
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
-from harness.coordination.channel import Delivery, Draws, Links, link_up
 from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.core.arrays import Floats
+from harness.radio.channel import Delivery, Draws, Links
+from harness.radio.constant import link_up
 
 
 @dataclass(frozen=True)

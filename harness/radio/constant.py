@@ -1,0 +1,77 @@
+"""One latency and one loss for all links: the paper's declared assumptions, not a link budget.
+
+Nothing here was measured on a radio. Fading is block fading where the draws of a link are the same at every
+step of an episode: a blocked link then stays blocked.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.radio.channel import Delivery, Draws, Links, served_s
+
+
+@dataclass(frozen=True)
+class Radio:
+    """A channel with a nominal latency and one loss for all links.
+
+    Attributes:
+        latency_s: nominal seconds of one exchange, the request included, without serialisation.
+        loss: probability that one crossing is lost. Where helpers open rounds of their own, the loss under
+            so many active vehicles, if that is larger.
+        bandwidth_bps: bits per second while a message is on air.
+        access: `serial`, replies share one medium and are served one after another, so that the k-th
+            pays k slots; `parallel`, all replies are on air at once.
+        jitter_s: largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s).
+        density_coupled: the loss follows from the vehicles in the radius, the ego included, asked or not.
+        roadside_edge: replies also travel over a roadside edge node, in a second hop as long as the first,
+            its jitter included. The two paths are declared independent. Requests are direct.
+    """
+
+    latency_s: float
+    loss: float
+    bandwidth_bps: float
+    access: Literal["serial", "parallel"]
+    jitter_s: float
+    density_coupled: bool = False
+    roadside_edge: bool = False
+
+    def request_s(self, bits: float) -> float:
+        """Serialisation alone: the rest of a request's time is in the nominal latency."""
+        return bits / self.bandwidth_bps
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""
+        active = links.in_radius if self.density_coupled else links.rounds
+        loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
+        loss = loss if self.density_coupled else np.maximum(self.loss, loss)
+        hops = 2 if self.roadside_edge else 1
+        airtime_s = hops * links.payload_bits / self.bandwidth_bps
+        slot_s = hops * (self.latency_s + self.jitter_s * draws.jitter) + airtime_s
+        slot_s = np.where(links.asked, slot_s, 0.0)
+        ready_s = np.where(links.asked, links.ready_s, np.inf)
+        serial = self.access == "serial"
+        delay_s = served_s(ready_s, slot_s, links.range_m) if serial else ready_s + slot_s
+        return Delivery(link_up(draws.link, loss, self.roadside_edge), delay_s, loss, airtime_s)
+
+
+def density_coupled_loss(n_active: Ints) -> Floats:
+    """Loss of one crossing when `n_active` vehicles `(...)`, the ego included, share the channel.
+
+    The line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles), clipped
+    to [0, 1]; a vehicle alone loses nothing.
+    """
+    return np.where(n_active > 1, np.clip(0.006 + 0.03 * (n_active - 2), 0.0, 1.0), 0.0)
+
+
+def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
+    """Which helpers are reached and heard, `(..., H)`: both crossings succeed, probability (1 - loss)^2.
+
+    Args:
+        uniforms: draws in [0, 1), `(..., H, 2)`: the request's and the reply's.
+        loss: probability that one crossing is lost, `(..., H)` or `(..., 1)`.
+        roadside_edge: a reply has a second path, and so is lost with probability loss^2.
+    """
+    return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))
