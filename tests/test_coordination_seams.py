@@ -151,13 +151,15 @@ def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str)
     assert up.shape == delay_s.shape == (40, 4)
     assert loss.shape in ((40, 4), (40, 1))
     assert airtime_s.shape == (40, 4)
-    assert 0 <= channel.request_s(400.0) <= channel.request_s(800.0)
+    small, large = (channel.request(bits, draws) for bits in (400.0, 800.0))
+    assert np.all(np.asarray(small.heard_s) >= 0)
+    assert np.all(np.asarray(small.heard_s) <= np.asarray(large.heard_s))
+    assert 0 <= small.airtime_s <= large.airtime_s
     assert np.array_equal(np.isfinite(delay_s), links.asked)
     assert np.all((delay_s >= links.ready_s)[links.asked])
     assert np.nanmin(loss) >= 0
     assert np.nanmax(loss) <= 1
-    row = Links(**{field: getattr(links, field)[7] for field in links.__dataclass_fields__})
-    alone = channel.deliver(row, draws.take(7))
+    alone = channel.deliver(links.take(7), draws.take(7))
     for batch, single in zip((up, delay_s, loss, airtime_s), alone, strict=True):
         assert np.array_equal(batch[7], single, equal_nan=True)
 

@@ -5,8 +5,8 @@ In seconds from the start of the decision:
     0                     every vehicle sees the scene; the ego infers, and the helpers in parallel with it
     inference_s[0]        the ego has its own intent. Sure enough, or nobody to ask: it acts now.
                           Unsure: it broadcasts one request to the nearest helpers in its radius
-    heard                 the request has been on air for request_bits / bandwidth, and helpers have it. Where
-                          they infer on demand, they begin only now
+    heard                 the request has had its turn and been on air, and helpers have it. Where they infer
+                          on demand, they begin only now
     ready                 a helper has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
@@ -115,9 +115,13 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     inference_s = np.where(np.isnan(intents.inference_s), 0.0, intents.inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
     channel = point.channel()
-    air_s = channel.request_s(point.request_bits)
-    ready_s = air_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, air_s)
-    links = Links(asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure)
+    heard_s, air_s = channel.request(point.request_bits, draws)
+    heard_s = np.asarray(heard_s)[..., None]
+    ready_s = heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
+    links = Links(
+        asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
+        point.request_bits, intents.site,
+    )  # fmt: skip
     up, delay_s, loss, airtime_s = channel.deliver(links, draws)
     requested = np.any(asked, axis=-1)
     delivered = asked & up

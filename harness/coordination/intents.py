@@ -1,9 +1,10 @@
 """What coordination needs to know of a set of decisions."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from harness.core.arrays import Bools, Floats
+from harness.radio.channel import Site
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Intents:
         range_m: distance to the ego, `(..., H)`, as the ego knows it.
         payload_bits: size of the reply, `(..., H)`.
         inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
+        site: where the vehicles truly are, for a channel that needs it; else None.
     """
 
     own: Floats
@@ -29,7 +31,12 @@ class Intents:
     range_m: Floats
     payload_bits: Floats
     inference_s: Floats
+    site: Site | None = None
 
     def take(self, at: Any) -> "Intents":
         """The decisions at these places of the leading dimension."""
-        return Intents(*(getattr(self, field.name)[at] for field in fields(Intents)))
+        site = self.site and self.site.take(at)
+        return replace(self, **{name: getattr(self, name)[at] for name in ARRAYS}, site=site)
+
+
+ARRAYS = tuple(field.name for field in fields(Intents) if field.name != "site")

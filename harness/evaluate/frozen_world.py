@@ -11,10 +11,12 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.select import ALL, Selection
 from harness.evaluate.walk import Decided, Due, channel_draws
+from harness.radio.channel import Site
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.scenario import Scenario, frames
+from harness.world.sight_lines import site
 
 
 @dataclass(frozen=True)
@@ -95,9 +97,9 @@ class FrozenWorld:
         """Every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._moments = places[places >= 0]
-        scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
-        self._helpers = max((len(scene.viewers) for scene in scenes), default=1) - 1
-        return scenes
+        self._scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
+        self._helpers = max((len(scene.viewers) for scene in self._scenes), default=1) - 1
+        return self._scenes
 
     def due(self, point: OperatingPoint) -> Due:
         """Each walk of the condition that is not at its end."""
@@ -108,6 +110,10 @@ class FrozenWorld:
         seed, step = self._seeds[of_seed], forest.step[self._moments[at]]
         draws = channel_draws(seed, forest.seeds[tree], step, p.decisions, self._helpers)
         return Due(at, forest.episodes[tree], seed, draws)
+
+    def site(self) -> Site:
+        """Where the vehicles of each moment are."""
+        return site([(scene.state, scene.viewers) for scene in self._scenes])
 
     def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
         """End the walks that have come to these of the moments just shown, and count them no longer."""

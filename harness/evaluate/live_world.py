@@ -19,12 +19,14 @@ from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.walk import Decided, Due, channel_draws
+from harness.radio.channel import Site
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
 from harness.world.scenario import Scenario, frames
+from harness.world.sight_lines import site
 from harness.world.world import World
 
 
@@ -147,6 +149,10 @@ class LiveWorld:
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
         return Due(at, episode, seed, draws)
+
+    def site(self) -> Site:
+        """Where the vehicles of each moment are."""
+        return site([(scene.state, scene.viewers) for scene in self._moments])
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Open every decision, and simulate until the next are due."""

@@ -20,7 +20,8 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import codes_of
-from harness.radio.channel import Draws
+from harness.radio.channel import Draws, Site
+from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 Moment = TypeVar("Moment")
@@ -72,6 +73,10 @@ class World(Protocol[Moment]):
         """The decisions of a condition that are due in the moments just shown."""
         ...
 
+    def site(self) -> Site | None:
+        """Where the vehicles are in the moments just shown, (n, ...); None in a world without places."""
+        ...
+
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
@@ -106,6 +111,8 @@ def walk(
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
+        if any(point.channel().needs_site for point in due):
+            intents = replace(intents, site=world.site())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
         calls = _fusion_calls(due, moments, intents, blind, ask)
@@ -205,7 +212,8 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     pairs, place = np.unique(np.stack([seed, layout_seed]), axis=1, return_inverse=True)
     of_pairs = np.array([_channel(s, layout, steps, helpers) for s, layout in pairs.T.tolist()])
     of_pairs, place = of_pairs.reshape(pairs.shape[1], 2 + steps, helpers), place.reshape(-1)
-    return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step])
+    trips = Trips(seed, layout_seed, step, steps)
+    return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step], trips)
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:

@@ -1,15 +1,49 @@
 """The V2V channel: which replies cross it, and when they have arrived.
 
 A consultation is a round trip, so the request and the reply must both cross. A new model is a file beside
-this one, with a frozen record that has `request_s` and `deliver`; its profiles are in `profiles.py`.
+this one, with a frozen record that has `request` and `deliver`; its profiles are in `profiles.py`.
 """
 
 from dataclasses import Field, dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
+from harness.radio.fading import Trips
+
+# What stands between two antennas.
+CLEAR, VEHICLE, BUILDING = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where the ego and its helpers truly are, and what stands between them.
+
+    Attributes:
+        xy_m: places, `(..., 1+H, 2)`, the ego's first; NaN for a helper that is not there.
+        sight: what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING.
+        blocker_m: height of the tallest vehicle between them, `(..., H)`; 0 where there is none.
+        corner_m: distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN
+            where the streets do not cross.
+    """
+
+    xy_m: Floats
+    sight: Ints
+    blocker_m: Floats
+    corner_m: Floats
+
+    @property
+    def distance_m(self) -> Floats:
+        """Between the ego and each helper, `(..., H)`."""
+        apart: Floats = np.linalg.norm(self.xy_m[..., 1:, :] - self.xy_m[..., :1, :], axis=-1)
+        return apart
+
+    def take(self, at: Any) -> "Site":
+        """The sites at these places of the leading dimension."""
+        return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at])
 
 
 @dataclass(frozen=True)
@@ -20,14 +54,42 @@ class Draws:
         link: request and reply of each helper, `(..., H, 2)`. Equal for all steps of an episode under
             block fading.
         jitter: delay of each reply, `(..., H)`.
+        trips: whose the other draws are, which only physical radios make; None where there are none.
     """
 
     link: Floats
     jitter: Floats
+    trips: Trips | None = None
 
     def take(self, at: Any) -> "Draws":
         """The draws at these places of the leading dimension."""
-        return Draws(self.link[at], self.jitter[at])
+        return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at))
+
+    @cached_property
+    def packet(self) -> Floats:
+        """Request and reply of each helper, `(..., H, 2)`, anew at every step."""
+        return self._trips.uniforms(self.jitter.shape[-1])[..., 1:].reshape(*self.jitter.shape, 2)
+
+    @cached_property
+    def wait(self) -> Floats:
+        """The request's wait for its turn, `(...)`, anew at every step."""
+        return self._trips.uniforms(self.jitter.shape[-1])[..., 0]
+
+    def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
+        """Shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
+        return self._trips.shadow(xy_m, decorrelation_m)
+
+    @property
+    def _trips(self) -> Trips:
+        if self.trips is None:
+            raise UserError(NO_SITE)
+        return self.trips
+
+
+NO_SITE = (
+    "a physical radio needs vehicles that are somewhere, and the paper's study has none; "
+    "take v2x or 6g, or `harness eval` and `harness drive`"
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +104,8 @@ class Links:
         payload_bits: size of the reply, `(..., H)`.
         in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
+        request_bits: size of the request.
+        site: where they are; None where the channel does not need it, or the world has no places.
     """
 
     asked: Bools
@@ -50,6 +114,27 @@ class Links:
     payload_bits: Floats
     in_radius: Bools
     rounds: Bools
+    request_bits: float = 0.0
+    site: Site | None = None
+
+    def take(self, at: Any) -> "Links":
+        """The links of these places of the leading dimension."""
+        return Links(
+            self.asked[at], self.ready_s[at], self.range_m[at], self.payload_bits[at], self.in_radius[at],
+            self.rounds[at], self.request_bits, self.site and self.site.take(at),
+        )  # fmt: skip
+
+
+class Broadcast(NamedTuple):
+    """What the broadcast of a request takes.
+
+    Attributes:
+        heard_s: seconds from the decision to ask until the helpers have it, `(...)` or one number.
+        airtime_s: seconds that it occupies the medium.
+    """
+
+    heard_s: Floats | float
+    airtime_s: float
 
 
 class Delivery(NamedTuple):
@@ -76,9 +161,10 @@ class Channel(Protocol):
     """A frozen dataclass. The operating point's overrides replace the fields of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+    needs_site: ClassVar[bool]  # whether `Links.site` and the draws of trips are looked at
 
-    def request_s(self, bits: float) -> float:
-        """Seconds that a broadcast request of so many bits is on air; then the helpers have it."""
+    def request(self, bits: float, draws: Draws) -> Broadcast:
+        """When helpers have a request of so many bits."""
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """What happens to the request and the reply of each link."""

@@ -5,12 +5,12 @@ step of an episode: a blocked link then stays blocked.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.radio.channel import Delivery, Draws, Links, served_s
+from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,11 @@ class Radio:
     jitter_s: float
     density_coupled: bool = False
     roadside_edge: bool = False
+    needs_site: ClassVar[bool] = False
 
-    def request_s(self, bits: float) -> float:
+    def request(self, bits: float, draws: Draws) -> Broadcast:
         """Serialisation alone: the rest of a request's time is in the nominal latency."""
-        return bits / self.bandwidth_bps
+        return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""

@@ -14,14 +14,14 @@ and who reads it rightly, in its share to within one, and each link's luck is sp
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from harness.coordination.coordinate import FusionCall
-from harness.coordination.intents import Intents
+from harness.coordination.intents import ARRAYS, Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
@@ -33,7 +33,6 @@ VERSION = "3"
 ACTIONS = 3
 CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 STEPS = 6  # decisions an episode: 18 messages are three replies each
-INTENTS = tuple(field.name for field in fields(Intents))
 CHUNK = 2000  # episodes that are played together
 
 # Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
@@ -134,7 +133,7 @@ class CalibratedWorld:
 
     def __call__(self, moments: Sequence[int]) -> Intents:
         """What every vehicle intends at this step."""
-        now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in INTENTS))  # noqa: B023
+        now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in ARRAYS))  # noqa: B023
         return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
 
     def blind(self, moments: Sequence[int], at: Ints) -> Intents:
@@ -151,6 +150,9 @@ class CalibratedWorld:
         """Every episode."""
         draws = Draws(self._now(lambda d: d.draws.link), self._now(lambda d: d.draws.jitter))
         return Due(np.arange(len(self._knows)), self._episode, self._seed, draws)
+
+    def site(self) -> None:
+        """The study's vehicles are nowhere in particular."""
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""

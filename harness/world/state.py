@@ -15,6 +15,7 @@ Part = Literal["ego", "helper", "other"]
 
 # Length and width; a van's are those of SUMO's delivery van.
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
+HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 
 
 def indicator(route: str) -> str:

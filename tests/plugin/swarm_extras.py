@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
 from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.core.arrays import Floats
-from harness.radio.channel import Delivery, Draws, Links
+from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.constant import link_up
 
 
@@ -45,10 +45,11 @@ class Fog:
 
     latency_s: float = 0.01
     loss_per_m: float = 0.01
+    needs_site: ClassVar[bool] = False
 
-    def request_s(self, bits: float) -> float:
+    def request(self, bits: float, draws: Draws) -> Broadcast:
         """A message's time on air is not modelled."""
-        return 0.0
+        return Broadcast(0.0, 0.0)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Each link has a loss of its own."""

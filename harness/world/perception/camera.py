@@ -25,14 +25,13 @@ from harness.world.perception.rays import meetings, sweep, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
 from harness.world.road import NORTH
 from harness.world.scenario import Scenario
-from harness.world.state import VehicleState, WorldState
+from harness.world.state import HEIGHTS_M, VehicleState, WorldState
 
 Places = NDArray[np.int16]
 Lit = NDArray[np.bool_]
 
 SIZE_PX = (512, 256)  # width and height of both cameras' pictures together
 EYE_M = 1.4  # of a camera above the road
-HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 BUILDING_M = 6.0
 HORIZON = 0.36  # of a camera's rows that are above it
 REACH_M, CELL_M = 160.0, 0.2  # of the map of the ground, from the origin; beyond there is grass

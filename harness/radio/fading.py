@@ -1,0 +1,84 @@
+"""Draws of physical radios, keyed by the seed of the channel and by the layout: fading of links and packets.
+
+A world may be walked in any order and from any point, so a draw may not need the one before it. Shadowing
+is therefore a field over the places of both ends, and not a chain along the trip: a sum of waves whose
+directions and lengths are drawn once for a link. With wave vectors of a multivariate Cauchy distribution its
+correlation is exp(-moved / decorrelation), that of the usual chain S' = exp(-moved/D) S + noise, and it is
+nearly normal (kurtosis 3 - 1.5 / WAVES).
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Floats, Ints
+
+WAVES = 16
+
+
+@dataclass(frozen=True)
+class Trips:
+    """Which draws belong to each decision.
+
+    Attributes:
+        seed: of the channel, `(...)`.
+        layout_seed: of the episode's layout, `(...)`.
+        step: of the decision, `(...)`.
+        steps: how many an episode can have.
+    """
+
+    seed: Ints
+    layout_seed: Ints
+    step: Ints
+    steps: int
+
+    def take(self, at: Any) -> "Trips":
+        """The trips at these places of the leading dimension."""
+        return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps)
+
+    def uniforms(self, helpers: int) -> Floats:
+        """The draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
+        of_pairs, place = self._of_pairs(_packets, self.steps, helpers)
+        return of_pairs[place, self.step]
+
+    def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
+        """Shadowing of the link to each helper, `(..., H)`, standard normal.
+
+        Args:
+            xy_m: places of the ego and its helpers, `(..., 1+H, 2)`.
+            decorrelation_m: how far the two ends move, the root of the sum of squares, until the correlation
+                is 1/e.
+        """
+        helpers = xy_m.shape[-2] - 1
+        waves, place = self._of_pairs(_waves, helpers)
+        ego, other = xy_m[..., :1, :] / decorrelation_m, xy_m[..., 1:, :] / decorrelation_m
+        total: Floats = np.zeros(other.shape[:-1])
+        for wave in np.moveaxis(waves, (-2, -1), (0, 1)):
+            phase, *vector = (each[place] for each in wave)
+            along = (ego[..., 0], ego[..., 1], other[..., 0], other[..., 1])
+            total += np.cos(phase + sum(k * x for k, x in zip(vector, along, strict=True)))
+        return total * math.sqrt(2 / WAVES)
+
+    def _of_pairs(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
+        """What is drawn for each seed and layout, (P, ...), and each decision's place there, `(...)`."""
+        keys = np.stack([self.seed, self.layout_seed]).reshape(2, -1)
+        pairs, place = np.unique(keys, axis=1, return_inverse=True)
+        return np.array([drawn(*pair, *args) for pair in pairs.T.tolist()]), place.reshape(self.seed.shape)
+
+
+# Each helper's draws come after the last one's, so that a batch with more helpers changes nobody's.
+@lru_cache(maxsize=1 << 14)
+def _packets(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
+    return noise.uniforms((1 + 2 * helpers, steps), "packets", seed, layout_seed).T
+
+
+@lru_cache(maxsize=1 << 14)
+def _waves(seed: int, layout_seed: int, helpers: int) -> Floats:
+    """A phase and a wave vector in four dimensions, in radians a decorrelation distance, (H, WAVES, 5)."""
+    drawn = noise.generator("shadowing", seed, layout_seed).standard_normal((helpers, WAVES, 7))
+    phase = np.arctan2(drawn[..., :1], drawn[..., 1:2])
+    return np.concatenate([phase, drawn[..., 2:6] / np.abs(drawn[..., 6:])], axis=-1)

@@ -1,0 +1,81 @@
+"""What stands between two antennas, and the shadowing between places."""
+
+import numpy as np
+import pytest
+
+from harness.core.errors import UserError
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws
+from harness.radio.fading import Trips
+from harness.world.sight_lines import corner, site
+from harness.world.state import Building, VehicleState, WorldState
+
+
+def vehicle(name: str, x_m: float, y_m: float, heading_rad: float = 0.0, kind: str = "car") -> VehicleState:
+    part = {"v1": "ego"}.get(name, "helper")
+    return VehicleState(name, kind, part, x_m, y_m, heading_rad, 8.0, "west", "straight")  # type: ignore[arg-type]
+
+
+def state(*vehicles: VehicleState, buildings: tuple[Building, ...] = ()) -> WorldState:
+    return WorldState("any", 0, 0, 0.0, 8.0, vehicles, buildings)
+
+
+EGO = vehicle("v1", 0, 0)
+
+
+def test_a_truck_between_two_vehicles_hides_them_a_wall_more_so_and_what_is_beside_the_line_does_not():
+    truck, beside = vehicle("v9", 20, 0.5, kind="truck"), vehicle("v8", 20, 4)
+    wall = Building("b1", 35, -5, 36, 5)
+    ahead, behind = vehicle("v2", 40, 0), vehicle("v3", -30, 0)
+    links = site([
+        (state(EGO, ahead, behind, truck, beside), ["v1", "v2", "v3"]),
+        (state(EGO, ahead, truck, buildings=(wall,)), ["v1", "v2"]),
+        (state(EGO, ahead), ["v1", "v2"]),
+    ])  # fmt: skip
+    assert links.sight.tolist() == [[VEHICLE, CLEAR], [BUILDING, CLEAR], [CLEAR, CLEAR]]
+    assert links.blocker_m.tolist() == [[3.6, 0], [3.6, 0], [0, 0]]
+    assert links.distance_m[0].tolist() == [40, 30]
+    assert np.isnan(links.distance_m[1, 1]), "no second helper there"
+    assert links.take([2, 0]).xy_m[1, 2].tolist() == [-30, 0]
+
+
+def test_streets_cross_where_the_lines_along_the_headings_do():
+    assert corner(EGO, vehicle("v2", 30, 40, np.pi / 2)).tolist() == pytest.approx([30, 40])
+    assert corner(EGO, vehicle("v2", 30, -40, np.pi / 2)).tolist() == pytest.approx([30, 40])
+    assert np.isnan(corner(EGO, vehicle("v2", 30, 4, np.pi))).all(), "side by side"
+
+
+def trips(seeds: int, steps: int = 6) -> Trips:
+    seed = np.arange(seeds)
+    return Trips(seed, np.full(seeds, 7), np.zeros(seeds, dtype=int), steps)
+
+
+def test_shadowing_is_normal_and_forgets_with_the_distance_moved():
+    n, decorrelation_m = 20_000, 10.0
+    here = np.broadcast_to([[0.0, 0.0], [50.0, 10.0]], (n, 2, 2))
+    start = trips(n).shadow(here, decorrelation_m)[:, 0]
+    assert start.mean() == pytest.approx(0, abs=0.03)
+    assert start.std() == pytest.approx(1, abs=0.02)
+    for ego_m, helper_m in ((5, 0), (0, 10), (6, 8)):
+        moved = here + np.array([[ego_m, 0], [0, helper_m]])
+        later = trips(n).shadow(moved, decorrelation_m)[:, 0]
+        expected = np.exp(-np.hypot(ego_m, helper_m) / decorrelation_m)
+        assert np.corrcoef(start, later)[0, 1] == pytest.approx(expected, abs=0.03)
+
+
+def test_a_trips_draws_are_its_own_whoever_else_is_asked_for():
+    many = Trips(np.array([1, 2, 2]), np.array([5, 5, 6]), np.array([0, 3, 3]), 6)
+    xy = np.random.default_rng(0).uniform(-50, 50, (3, 4, 2))
+    for n in range(3):
+        alone = many.take(n)
+        assert np.array_equal(alone.shadow(xy[n], 10.0), many.shadow(xy, 10.0)[n])
+        assert np.array_equal(alone.shadow(xy[n, :3], 10.0), many.shadow(xy, 10.0)[n, :2]), "fewer helpers"
+        assert np.array_equal(alone.uniforms(2), many.uniforms(3)[n, :5])
+    draws = Draws(np.zeros((3, 3, 2)), np.zeros((3, 3)), many)
+    assert draws.packet.shape == (3, 3, 2)
+    assert draws.wait.shape == (3,)
+    assert np.array_equal(draws.take([2]).packet[0], draws.packet[2])
+
+
+def test_a_world_without_places_has_no_physical_radio():
+    with pytest.raises(UserError, match="the paper's study has none"):
+        Draws(np.zeros((1, 3, 2)), np.zeros((1, 3))).wait  # noqa: B018
