@@ -219,7 +219,7 @@ def test_a_package_adds_a_channel_and_replaces_none():
     assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)
     assert {"v2x", "6g", "slow-radio"} < set(CHANNELS)
     with pytest.raises(
-        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, odd, slow-radio, unmade, v2x"
+        UserError, match=r"did you mean 'slow-radio'\? known: 6g, broken, .*slow-radio, unmade, v2x"
     ):
         OperatingPoint("x", "slowradio")
 

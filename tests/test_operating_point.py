@@ -42,7 +42,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
     ("settings", "says"),
     [
         ({"tau_nat": 0.7}, "unknown operating point setting 'tau_nat'; did you mean 'tau_nats'?"),
-        ({"profile": "v2v"}, "unknown channel profile 'v2v'; did you mean 'v2x'? known: 6g, v2x"),
+        ({"profile": "v2v"}, "unknown channel profile 'v2v'; did you mean 'v2x'? known: 6g, "),
         ({"profile": ["v2x"]}, "unknown channel profile"),
         ({"fallback": "break"}, "unknown fallback 'break'; did you mean 'brake'?"),
         ({"consensus": "log"}, "unknown consensus 'log'"),

@@ -8,7 +8,7 @@ from typing import Any
 from harness.coordination.consensus import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel
-from harness.radio.profiles import CHANNELS, NO_CHANNEL
+from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
@@ -44,6 +44,8 @@ class OperatingPoint:
         messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
             (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
             gain of what helpers see.
+        radio: further settings of the profile's channel, in place of its own:
+            `density_per_km=200,power_dbm=23`.
     """
 
     name: str
@@ -64,6 +66,7 @@ class OperatingPoint:
     roadside_edge: bool = False
     on_demand: bool = False
     messages: str = "own"
+    radio: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -92,8 +95,6 @@ class OperatingPoint:
         for flag in ("density_coupled", "helper_rounds", "roadside_edge", "on_demand"):
             if type(getattr(self, flag)) is not bool:
                 raise self._wrong(flag, "true or false")
-        if self.density_coupled and self.loss is not None:
-            raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
         if self.messages == "shuffled" and self.consensus == EGO_PROMPT:
             raise self._wrong("messages", f"own or blind where consensus is {EGO_PROMPT}")
         self.channel()
@@ -116,15 +117,25 @@ class OperatingPoint:
         """The profile's, with the point's overrides. Raises UserError for one that the profile has not."""
         if self.profile is None:
             return NO_CHANNEL
-        profile = CHANNELS[self.profile]
+        channel = CHANNELS[self.profile]
         settings = {key: getattr(self, key) for key in OVERRIDES}
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
         for key in overrides:
-            if key not in {field.name for field in fields(profile)}:
+            if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
-        return replace(profile, **overrides)
+        if self.radio:
+            channel = changed(channel, pairs(self.radio), f"channel profile {self.profile}")
+        channel = replace(channel, **overrides)
+        if self.loss is not None and getattr(channel, "density_coupled", False):
+            raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+        return channel
+
+    def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
+        """The same with these settings of its channel. Raises UserError for one that it has not."""
+        texts = {**pairs(self.radio), **settings}
+        return replace(self, radio=",".join(f"{key}={value}" for key, value in texts.items()))
 
     @property
     def asks_again(self) -> bool:
@@ -163,47 +174,50 @@ POINTS = {
 def named_point(text: str) -> OperatingPoint:
     """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
 
-    A setting may go by its name in `SHORT`. Every channel profile of a package is a point of the profile's
-    name, with the defaults. The text is the point's name. Raises UserError if there is no such point or
-    setting, or a value is not allowed.
+    A setting may go by its name in `SHORT`, and may be one of the channel's own. Every channel profile is a
+    point of the profile's name, with the defaults. The text is the point's name. Raises UserError if there is
+    no such point or setting, or a value is not allowed.
     """
-    name, colon, settings = text.partition(":")
+    name, colon, rest = text.partition(":")
     if name not in POINTS and name not in CHANNELS:
         raise unknown("operating point", name, {*POINTS, *CHANNELS})
     point = POINTS.get(name) or OperatingPoint(name, name)
-    changed: dict[str, Any] = {}
-    for setting in settings.split(",") if colon else ():
+    its_own = [key for key in settable(point.channel()) if key not in OVERRIDES] if point.profile else []
+    settings: dict[str, Any] = {}
+    radio: dict[str, str] = {}
+    for setting in rest.split(",") if colon else ():
         key, _, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
-        if field not in SETTINGS:
-            known = (*SETTINGS, *SHORT)
+        if field not in SETTINGS and field not in its_own:
+            known = (*SETTINGS, *SHORT, *its_own)
             raise unknown(f"setting of operating point {name}", key, known, f"; as in {name}:window_s=0.3")
-        if field in changed:
+        if field in settings or field in radio:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
+        if field not in SETTINGS:
+            radio[field] = value
+            continue
         given = setting_of(field, value)
-        changed[field] = given * scale if isinstance(given, float) else given
+        settings[field] = given * scale if isinstance(given, float) else given
     for key in OVERRIDES:
-        if key in changed and point.profile is None:
+        if key in settings and point.profile is None:
             raise UserError(
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes nothing; "
                 "leave it out"
             )
-    return replace(point, name=text, **changed) if changed else point
+    point = point.of_radio(radio) if radio else point
+    return replace(point, name=text, **settings) if settings or radio else point
+
+
+def pairs(text: str) -> dict[str, str]:
+    """Names and values in `density_per_km=200,power_dbm=23`; of a name without a value, an empty one."""
+    return {key: value for key, _, value in (each.partition("=") for each in text.split(",") if each)}
 
 
 # Settings by another name, as `harness sweep --over` has them, each with what makes its unit the setting's.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
-SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile"))
+SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile", "radio"))
 
 
 def setting_of(key: str, text: str) -> object:
     """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
-    usual = getattr(POINTS["6g"], key)
-    if isinstance(usual, bool):
-        return {"true": True, "false": False}.get(text, text)
-    if isinstance(usual, str):
-        return text
-    try:
-        return int(text) if isinstance(usual, int) else float(text)
-    except ValueError:
-        return text
+    return value_of(getattr(POINTS["6g"], key), text)

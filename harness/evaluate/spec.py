@@ -19,6 +19,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
+from harness.radio.profiles import CHANNELS
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.world.scenario import Scenario
@@ -263,6 +264,7 @@ class Spec:
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
             "conditions": [asdict(point) for point in self.points],
+            "channels": {name: CHANNELS.record(name) for point in self.points if (name := point.profile)},
             "seeds": list(self.seeds),
             "batch_size": self.batch_size,
             "dtype": self.dtype,

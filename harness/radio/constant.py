@@ -5,11 +5,13 @@ step of an episode: a blocked link then stays blocked.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.config import Seconds
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 
 
@@ -30,11 +32,11 @@ class Radio:
             its jitter included. The two paths are declared independent. Requests are direct.
     """
 
-    latency_s: float
-    loss: float
-    bandwidth_bps: float
+    latency_s: Seconds
+    loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
+    bandwidth_bps: Annotated[float, Meta(gt=0, description="bits per second above 0")]
     access: Literal["serial", "parallel"]
-    jitter_s: float
+    jitter_s: Seconds = 0.0
     density_coupled: bool = False
     roadside_edge: bool = False
     needs_site: ClassVar[bool] = False

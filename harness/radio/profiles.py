@@ -1,24 +1,139 @@
-"""Channel profiles by name.
+"""Channel profiles by name: files `channels/*.toml`, shipped and a project's, and what packages add.
 
-A profile is an entry of `CHANNELS`. A package adds one by an entry point in the group `swarmdrive.channels`.
+A file names a model and its parameters, and says what they rest on. A package adds a profile by an entry
+point in the group `swarmdrive.channels`.
 """
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+import msgspec
 import numpy as np
 
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
+from harness.core.resources import entries, find
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 
-CHANNELS: Plugins[Channel] = Plugins(
-    "swarmdrive.channels",
-    Channel,
-    {
-        "v2x": Radio(latency_s=0.025, loss=0.08, bandwidth_bps=10e6, access="serial", jitter_s=0.0),
-        # Jitter is declared, not measured: the slowest of three replies waits 3/4 of it on average, which
-        # puts the mean decision at 145 + 5 + 1.4 = 151.4 ms, the paper's figure.
-        "6g": Radio(latency_s=0.005, loss=0.012, bandwidth_bps=200e6, access="parallel", jitter_s=0.0019),
-    },
-)
+# Name of a model to what makes a channel of a file's parameters, its folder, and what to call it in messages.
+MODELS: dict[str, Callable[[Mapping[str, Any], Path, str], Channel]] = {
+    "constant": lambda parameters, folder, where: convert(parameters, Radio, where),
+}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a file of `channels/` says.
+
+    Attributes:
+        model: one of `MODELS`.
+        description: one sentence for lists.
+        source: where model and parameters come from.
+        status: what they are: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`.
+        parameters: of the model.
+    """
+
+    model: str
+    description: str
+    source: str
+    status: Literal["measured", "cited", "modelled", "assumed"]
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+class Profiles(Plugins[Channel]):
+    """The channels of all profiles, by name."""
+
+    def __getitem__(self, name: str) -> Channel:
+        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
+        return _read(*_stamp(name))[1] if name in _files() else super().__getitem__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**dict.fromkeys(_files()), **dict.fromkeys(super().__iter__())})
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def profile(self, name: str) -> Profile:
+        """What the file says; of a package's channel, what it is."""
+        if name in _files():
+            return _read(*_stamp(name))[0]
+        kind = type(self[name])
+        doc = (kind.__doc__ or "").strip().partition("\n")[0]
+        return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
+
+    def record(self, name: str) -> dict[str, Any]:
+        """All that decides what the channel does, as plain values."""
+        profile = self.profile(name)
+        return {**asdict(profile), "parameters": msgspec.to_builtins(asdict(self[name]))}
+
+
+def changed(channel: Channel, settings: Mapping[str, str], where: str) -> Channel:
+    """The channel with some of its fields from their texts.
+
+    Args:
+        channel: of a profile.
+        settings: fields' names and values.
+        where: what to call it in messages.
+
+    Raises:
+        UserError: a field that it has not, or a value that is not allowed.
+    """
+    hints = get_type_hints(type(channel), include_extras=True)
+    known = {name: getattr(channel, name) for name in settable(channel)}
+    for key in settings:
+        if key not in known:
+            raise unknown(f"setting of {where}", key, known)
+    values = {key: value_of(known[key], text) for key, text in settings.items()}
+    kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
+    convert(values, kind, where)
+    try:
+        return replace(channel, **values)
+    except ValueError as problem:
+        raise UserError(f"{where}: {printable(problem)}") from None
+
+
+def settable(channel: Channel) -> list[str]:
+    """Names of the fields that are one number, switch or text."""
+    values = {field.name: getattr(channel, field.name) for field in fields(channel)}
+    return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
+
+
+def value_of(usual: object, text: str) -> object:
+    """A value of the kind that is usual; what is none stays text, which no setting of that kind allows."""
+    if isinstance(usual, bool):
+        return {"true": True, "false": False}.get(text, text)
+    if isinstance(usual, str):
+        return text
+    try:
+        return int(text) if isinstance(usual, int) else float(text)
+    except ValueError:
+        return text
+
+
+def _files() -> list[str]:
+    return [path.stem for path in entries("channels", "*.toml")]
+
+
+def _stamp(name: str) -> tuple[Path, int]:
+    path = find("channels", f"{name}.toml")
+    return path, path.stat().st_mtime_ns
+
+
+@lru_cache(maxsize=64)
+def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
+    where = f"channel file {printable(path)}"
+    profile = convert(toml(path, where), Profile, where)
+    if profile.model not in MODELS:
+        raise unknown(f"model in {where}", profile.model, MODELS)
+    return profile, MODELS[profile.model](profile.parameters, path.parent, f"{where} [parameters]")
+
+
+CHANNELS = Profiles("swarmdrive.channels", Channel, {})
 
 # A vehicle without a radio: no comparison with a NaN loss holds, so nothing ever crosses.
 NO_CHANNEL = Radio(latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0)

@@ -374,6 +374,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     world: FrozenScenes | ClosedLoop
     actions: tuple[str, ...]
     conditions: tuple[dict[str, Any], ...]
+    channels: dict[str, dict[str, Any]] = {}
     seeds: tuple[int, ...]
     thinking: bool
     answer: str

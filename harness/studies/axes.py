@@ -9,6 +9,7 @@ import numpy as np
 from harness.coordination.consensus import POOLS, names
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.core.errors import UserError, printable, unknown
+from harness.radio.profiles import CHANNELS, settable
 
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
@@ -38,6 +39,8 @@ class Axis:
         """The operating point with this setting. Raises UserError where it is not allowed."""
         if self.field is None:
             return point
+        if self.field not in SETTINGS:
+            return point.of_radio({self.field: value if isinstance(value, str) else f"{value:.10g}"})
         setting: object
         if isinstance(value, str):
             setting = setting_of(self.field, value)
@@ -67,8 +70,9 @@ def axis_of(name: str) -> Axis:
     """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
     if name in AXES:
         return AXES[name]
-    if name not in SETTINGS:
-        raise unknown("--over", name, {*AXES, *SETTINGS})
+    of_radios = {field for channel in CHANNELS.values() for field in settable(channel)}
+    if name not in SETTINGS and name not in of_radios:
+        raise unknown("--over", name, {*AXES, *SETTINGS, *of_radios})
     return Axis(name, name.replace("_", " "), name, 1.0, "")
 
 
@@ -83,7 +87,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     if not text and not axis.usual:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
-    if axis.field and isinstance(getattr(POINTS["6g"], axis.field), str | bool):
+    if axis.field and isinstance(usual_of(axis.field), str | bool):
         for part in parts:
             if axis.field == "consensus" and part not in names():
                 raise unknown("--grid", part, names())
@@ -94,6 +98,13 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     if axis.field is None and any(value != int(value) or value < 1 for value in values):
         raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
     return tuple(dict.fromkeys(values))
+
+
+def usual_of(field: str) -> object:
+    """What a setting of an operating point or of a channel usually is."""
+    if field in SETTINGS:
+        return getattr(POINTS["6g"], field)
+    return next(getattr(channel, field) for channel in CHANNELS.values() if field in settable(channel))
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:

@@ -30,6 +30,7 @@ from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
+from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
 from harness.studies.play import Walked, walk_through
@@ -76,6 +77,12 @@ class Stored:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
+        for profile, recorded in manifest.channels.items():
+            if profile not in CHANNELS or CHANNELS.record(profile) != recorded:
+                raise UserError(
+                    f"{printable(folder)}: channel profile {printable(profile)} has changed since; restore "
+                    "it or run again"
+                )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
