@@ -22,7 +22,7 @@ from harness.core.errors import UserError, printable
 PANELS = {
     "Evaluate": ("eval", "drive", "grid", "sweep", "compare", "twins", "attribute", "fidelity", "campaign"),
     "Look": ("ls", "history", "view", "report", "export", "video", "parse"),
-    "Data": ("init", "prompt", "dataset", "scenario"),
+    "Data": ("init", "prompt", "dataset", "scenario", "channel"),
     "Models": ("model", "distill", "parity", "doctor"),
 }
 

@@ -120,17 +120,14 @@ def ready_to_drive(
 
 
 def _parameters(scenario: "Scenario") -> dict[str, dict[str, Any]]:
-    """Value of each parameter, and its meaning out of the docstrings of its dataclasses."""
-    import inspect
-    import re
+    """Value of each parameter, and its meaning."""
     from dataclasses import asdict
 
-    meanings: dict[str, str] = {}
-    for kind in reversed(type(scenario.parameters).__mro__[:-1]):
-        attributes = str(inspect.getdoc(kind)).partition("Attributes:\n")[2]
-        meanings |= re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE)
+    from harness.cli.docstrings import attributes
+
+    meanings = attributes(type(scenario.parameters))
     return {
-        name: {"value": value, "meaning": " ".join(meanings[name].split())}
+        name: {"value": value, "meaning": meanings[name]}
         for name, value in asdict(scenario.parameters).items()
     }
 

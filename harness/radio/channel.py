@@ -170,6 +170,23 @@ class Channel(Protocol):
         """What happens to the request and the reply of each link."""
 
 
+@runtime_checkable
+class Physical(Channel, Protocol):
+    """A channel whose losses follow from where vehicles are and what stands between them."""
+
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
+        """Share of packets of the background's size that are received at these distances `(n,)`.
+
+        Averaged over shadowing; without `sight`, over what stands between as the model's source has it.
+        """
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """Probability that a message of so many bits is lost, `(..., H)`, given each link's shadowing."""
+
+    def busy_ratio(self) -> float:
+        """Channel busy ratio under the background load; NaN where the model does not say."""
+
+
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
     """When each slot `(..., H)` on a serial medium ends: first come, first served; of equals, the nearest."""
     order = np.lexsort((range_m, ready_s), axis=-1)

@@ -36,6 +36,8 @@ class Profile:
         source: where model and parameters come from.
         status: what they are: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`.
         parameters: of the model.
+        limits: least and largest value of some of them within which the source held the model against
+            something.
     """
 
     model: str
@@ -43,6 +45,7 @@ class Profile:
     source: str
     status: Literal["measured", "cited", "modelled", "assumed"]
     parameters: dict[str, Any] = field(default_factory=dict)
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class Profiles(Plugins[Channel]):
@@ -70,6 +73,15 @@ class Profiles(Plugins[Channel]):
         """All that decides what the channel does, as plain values."""
         profile = self.profile(name)
         return {**asdict(profile), "parameters": msgspec.to_builtins(asdict(self[name]))}
+
+
+def outside(profile: Profile, channel: Channel) -> list[str]:
+    """Where a channel's settings leave what the profile's source held the model against, a line each."""
+    return [
+        f"{name} = {getattr(channel, name):g}; it was held against something from {low:g} to {high:g}"
+        for name, (low, high) in profile.limits.items()
+        if not low <= getattr(channel, name) <= high
+    ]
 
 
 def changed(channel: Channel, settings: Mapping[str, str], where: str) -> Channel:
@@ -130,7 +142,11 @@ def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
     profile = convert(toml(path, where), Profile, where)
     if profile.model not in MODELS:
         raise unknown(f"model in {where}", profile.model, MODELS)
-    return profile, MODELS[profile.model](profile.parameters, path.parent, f"{where} [parameters]")
+    channel = MODELS[profile.model](profile.parameters, path.parent, f"{where} [parameters]")
+    for name in profile.limits:
+        if name not in settable(channel):
+            raise unknown(f"key in {where} [limits]", name, settable(channel))
+    return profile, channel
 
 
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})
