@@ -1,0 +1,170 @@
+"""What a signal loses on its way: path loss, blockage, shadowing, noise.
+
+Sources: 3GPP TR 37.885 (tables 6.2-1, 6.2.1-1 and 6.2.1-2) for highway and urban links, WINNER+ D5.3 B1 as
+Gonzalez-Martin et al. (IEEE TVT 68(2), 2019) use it, and Mangel, Klemp and Hartenstein (EURASIP JWCN
+2011:182), as Abbas et al. (2015, equation 6) print it, for links round a corner.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtr
+
+from harness.core.arrays import Floats, Ints
+
+Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
+
+# What stands between two vehicles.
+CLEAR, VEHICLE, BUILDING = 0, 1, 2
+
+LIGHT_M_PER_S = 3e8
+NEAREST_M = 3.0
+"""No formula here holds nearer; a link that is shorter has the loss of this distance."""
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Which laws hold, and the heights and widths in them. A radio model inherits these as settings.
+
+    Attributes:
+        environment: law of links without a building between; LOS probabilities and decorrelation as well.
+        frequency_ghz: carrier.
+        antenna_m: height of every antenna.
+        environment_height_m: average height of what surrounds the vehicles, for `winner-b1` alone. The
+            effective antenna height is `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m
+            with 1 (TR 36.885), 12 dB more at 100 m.
+        blocker_m: height of a vehicle that stands between: 1.6 m is a car, 3.0 m a lorry (TR 37.885, 6.1.2).
+        street_m: width of the receiver's street, in the law of the corner.
+        wall_m: distance of the transmitter from its wall, in the law of the corner.
+        suburban: adds 2.94 dB round a corner.
+    """
+
+    environment: Environment = "winner-b1"
+    frequency_ghz: float = 5.91
+    antenna_m: float = 1.5
+    environment_height_m: float = 0.0
+    blocker_m: float = 1.6
+    street_m: float = 14.0
+    wall_m: float = 7.0
+    suburban: bool = False
+
+    def path_loss_db(
+        self, distance_m: Floats, sight: Ints | int = CLEAR, corner_m: Floats | None = None
+    ) -> Floats:
+        """Mean loss `(...)` of links `(...)` with what stands between them, a vehicle's blockage included.
+
+        Args:
+            distance_m: straight distance.
+            sight: `CLEAR`, `VEHICLE` or `BUILDING`.
+            corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN where a building
+                does not stand at a corner. Then it is the NLOS law of TR 37.885, on the straight distance.
+        """
+        distance_m = np.maximum(distance_m, NEAREST_M)
+        clear_db = self.clear_db(distance_m)
+        if np.ndim(sight) == 0 and sight == CLEAR:
+            return clear_db
+        behind_db = nlos_db(distance_m, self.frequency_ghz)
+        if corner_m is not None:
+            round_db = self.corner_db(corner_m)
+            behind_db = np.where(np.isnan(round_db), behind_db, round_db)
+        return np.select(
+            [np.equal(sight, CLEAR), np.equal(sight, VEHICLE)],
+            [clear_db, clear_db + self.blockage_db(distance_m)[0]],
+            # Close to the corner the fitted law falls below that of the open street.
+            np.maximum(behind_db, clear_db),
+        )
+
+    def clear_db(self, distance_m: Floats) -> Floats:
+        """Loss in line of sight."""
+        if self.environment == "winner-b1":
+            return winner_b1_db(distance_m, self.frequency_ghz, self.antenna_m - self.environment_height_m)
+        if self.environment == "tr37885-highway":
+            return 32.4 + 20 * np.log10(distance_m) + 20 * math.log10(self.frequency_ghz)
+        return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
+
+    def blockage_db(self, distance_m: Floats) -> tuple[Floats, float]:
+        """What a vehicle between adds (TR 37.885, 6.2.1): mean `(...)` and standard deviation of max(0, X).
+
+        X is taken as normal in dB, of mean 9 and deviation 4.5 where both antennas are lower than the
+        blocker, and 5 and 4 where one is; from 541 m on its mean grows. Nothing where both are higher.
+        """
+        if self.antenna_m > self.blocker_m:
+            return np.zeros_like(distance_m), 0.0
+        mean_db, deviation_db = (9.0, 4.5) if self.antenna_m < self.blocker_m else (5.0, 4.0)
+        z = mean_db / deviation_db
+        above, at = float(ndtr(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
+        clipped_db = mean_db * above + deviation_db * at
+        square = (mean_db**2 + deviation_db**2) * above + mean_db * deviation_db * at
+        growth_db = np.maximum(0.0, 15 * np.log10(distance_m) - 41)
+        return clipped_db + growth_db, math.sqrt(square - clipped_db**2)
+
+    def corner_db(self, corner_m: Floats) -> Floats:
+        """Loss `(...)` round a corner, from the ends' distances to the crossing's centre, `(..., 2)`.
+
+        The law is not quite reciprocal, a radio link is: the mean of both directions, in dB.
+        """
+        one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
+        return 0.5 * (self._corner_one_way_db(one_m, other_m) + self._corner_one_way_db(other_m, one_m))
+
+    def _corner_one_way_db(self, transmitter_m: Floats, receiver_m: Floats) -> Floats:
+        # The breakpoint is that of two rays, which Abbas et al. write with the same symbol.
+        wave_m = LIGHT_M_PER_S / (self.frequency_ghz * 1e9)
+        break_m = 4 * self.antenna_m**2 / wave_m
+        spread: Floats = transmitter_m**0.957 / (self.wall_m * self.street_m) ** 0.81
+        ratio = spread * 4 * np.pi * receiver_m / wave_m * np.maximum(1.0, receiver_m / break_m)
+        return 3.75 + 2.94 * self.suburban + 26.9 * np.log10(ratio)
+
+    def shadowing_db(self, sight: Ints | int = CLEAR, corner_m: Floats | None = None) -> Floats:
+        """Standard deviation `(...)` of shadowing and blockage together.
+
+        3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a building
+        (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a corner (Mangel et al.).
+        """
+        behind: Floats | float = 4.0
+        if corner_m is not None:
+            behind = np.where(np.isnan(corner_m).any(axis=-1), 4.0, 4.1)
+        vehicle_db = math.hypot(3.0, self.blockage_db(np.array(NEAREST_M))[1])
+        return np.select([np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind)
+
+    def decorrelation_m(self, sight: int) -> float:
+        """Distance over which shadowing's correlation falls to 1/e: 25 m on a highway, else 10 and 13 m.
+
+        TR 37.885, 6.2.1. `winner-b1` has what TR 36.885 has with it in a town, 10 m.
+        """
+        if self.environment == "tr37885-highway":
+            return 25.0
+        return 10.0 if sight == CLEAR or self.environment == "winner-b1" else 13.0
+
+    def clear_probability(self, distance_m: Floats) -> Floats:
+        """Share of links without a building between that no vehicle blocks (TR 37.885, table 6.2-1).
+
+        `winner-b1` has none blocked.
+        """
+        if self.environment == "winner-b1":
+            return np.ones_like(distance_m)
+        if self.environment == "tr37885-urban":
+            return np.minimum(1.0, 1.05 * np.exp(-0.0114 * distance_m))
+        near = np.minimum(1.0, 2.1013e-6 * distance_m**2 - 0.002 * distance_m + 1.0193)
+        return np.where(distance_m <= 475, near, np.maximum(0.0, 0.54 - 0.001 * (distance_m - 475)))
+
+
+def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:
+    """WINNER+ B1 in line of sight, never below free space; `effective_m` is the effective antenna height."""
+    far = distance_m >= 4 * effective_m**2 * frequency_ghz * 1e9 / LIGHT_M_PER_S
+    log_m, log_ghz = np.log10(distance_m), math.log10(frequency_ghz)
+    near_db = 22.7 * log_m + 27 + 20 * log_ghz
+    far_db = 40 * log_m + 7.56 - 34.6 * math.log10(effective_m) + 2.7 * log_ghz
+    free_db = 20 * log_m + 46.4 + 20 * math.log10(frequency_ghz / 5)
+    return np.maximum(np.where(far, far_db, near_db), free_db)
+
+
+def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
+    """Behind a building (TR 37.885, table 6.2.1-1)."""
+    return 36.85 + 30 * np.log10(distance_m) + 18.9 * math.log10(frequency_ghz)
+
+
+def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
+    """Thermal noise at 290 K and the receiver's own: -95 dBm in 10 MHz with a noise figure of 9 dB."""
+    return -174 + 10 * math.log10(bandwidth_hz) + noise_figure_db
