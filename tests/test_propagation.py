@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.radio.propagation import BUILDING, CLEAR, VEHICLE, Propagation, noise_dbm
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE
+from harness.radio.propagation import Propagation, noise_dbm
 
 HIGHWAY = Propagation(environment="tr37885-highway", frequency_ghz=5.9)
 URBAN = Propagation(environment="tr37885-urban", frequency_ghz=5.9)
@@ -16,7 +17,7 @@ WINNER = Propagation()
 
 def at(law, metres, sight=CLEAR, corner_m=None):
     corner = None if corner_m is None else np.array(corner_m, float)
-    return float(law.path_loss_db(np.array(metres, float), np.array(sight), corner))
+    return float(law.path_loss_db(np.array(metres, float), np.array(sight), None, corner))
 
 
 def test_path_loss_by_hand():
@@ -82,11 +83,18 @@ def test_a_vehicle_between_adds_the_clipped_normal_of_its_heights(antenna_m, mea
         assert grown == pytest.approx(added + 4)
 
 
+def test_each_link_has_the_vehicle_that_stands_in_it():
+    heights, sight = np.array([1.4, 1.5, 3.0, 0.0]), np.array([VEHICLE, VEHICLE, VEHICLE, CLEAR])
+    added = URBAN.path_loss_db(np.full(4, 50.0), sight, heights) - at(URBAN, 50)
+    np.testing.assert_allclose(added, [0, 5.20, 9.04, 0], atol=0.01)
+    np.testing.assert_allclose(URBAN.shadowing_db(sight, heights)[[0, 3]], 3.0)
+
+
 def test_shadowing():
     corner = np.array([[20.0, 20.0], [np.nan, np.nan]])
-    np.testing.assert_allclose(URBAN.shadowing_db(np.array([BUILDING, BUILDING]), corner), [4.1, 4.0])
+    np.testing.assert_allclose(URBAN.shadowing_db(np.array([BUILDING, BUILDING]), None, corner), [4.1, 4.0])
     assert float(URBAN.shadowing_db()) == 3.0
-    assert [law.decorrelation_m(s) for law in (HIGHWAY, URBAN) for s in (CLEAR, BUILDING)] == [25, 25, 10, 13]
+    assert [law.decorrelation_m for law in (HIGHWAY, URBAN, WINNER)] == [25, 10, 10]
 
 
 def test_share_of_clear_links():

@@ -13,11 +13,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from harness.core.arrays import Floats, Ints
+from harness.radio.channel import CLEAR, VEHICLE
 
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
-
-# What stands between two vehicles.
-CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 LIGHT_M_PER_S = 3e8
 NEAREST_M = 3.0
@@ -35,7 +33,8 @@ class Propagation:
         environment_height_m: average height of what surrounds the vehicles, for `winner-b1` alone. The
             effective antenna height is `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m
             with 1 (TR 36.885), 12 dB more at 100 m.
-        blocker_m: height of a vehicle that stands between: 1.6 m is a car, 3.0 m a lorry (TR 37.885, 6.1.2).
+        blocker_m: height of a vehicle that stands between, where no scene has it: 1.6 m is a car, 3.0 m a
+            lorry (TR 37.885, 6.1.2).
         street_m: width of the receiver's street, in the law of the corner.
         wall_m: distance of the transmitter from its wall, in the law of the corner.
         suburban: adds 2.94 dB round a corner.
@@ -51,13 +50,18 @@ class Propagation:
     suburban: bool = False
 
     def path_loss_db(
-        self, distance_m: Floats, sight: Ints | int = CLEAR, corner_m: Floats | None = None
+        self,
+        distance_m: Floats,
+        sight: Ints | int = CLEAR,
+        blocker_m: Floats | float | None = None,
+        corner_m: Floats | None = None,
     ) -> Floats:
         """Mean loss `(...)` of links `(...)` with what stands between them, a vehicle's blockage included.
 
         Args:
             distance_m: straight distance.
             sight: `CLEAR`, `VEHICLE` or `BUILDING`.
+            blocker_m: height of the vehicle between; without, the model's own.
             corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN where a building
                 does not stand at a corner. Then it is the NLOS law of TR 37.885, on the straight distance.
         """
@@ -65,13 +69,15 @@ class Propagation:
         clear_db = self.clear_db(distance_m)
         if np.ndim(sight) == 0 and sight == CLEAR:
             return clear_db
+        growth_db = np.maximum(0.0, 15 * np.log10(distance_m) - 41)
+        blocked_db = np.where(self._blocks(blocker_m) > 0, self.blockage_db(blocker_m)[0] + growth_db, 0.0)
         behind_db = nlos_db(distance_m, self.frequency_ghz)
         if corner_m is not None:
             round_db = self.corner_db(corner_m)
             behind_db = np.where(np.isnan(round_db), behind_db, round_db)
         return np.select(
             [np.equal(sight, CLEAR), np.equal(sight, VEHICLE)],
-            [clear_db, clear_db + self.blockage_db(distance_m)[0]],
+            [clear_db, clear_db + blocked_db],
             # Close to the corner the fitted law falls below that of the open street.
             np.maximum(behind_db, clear_db),
         )
@@ -84,21 +90,21 @@ class Propagation:
             return 32.4 + 20 * np.log10(distance_m) + 20 * math.log10(self.frequency_ghz)
         return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
 
-    def blockage_db(self, distance_m: Floats) -> tuple[Floats, float]:
-        """What a vehicle between adds (TR 37.885, 6.2.1): mean `(...)` and standard deviation of max(0, X).
+    def _blocks(self, blocker_m: Floats | float | None) -> Ints:
+        """How many of two equally high antennas a vehicle's height reaches: 0, 1 (just as high) or 2."""
+        blocker_m = self.blocker_m if blocker_m is None else blocker_m
+        return np.asarray(1 + np.sign(np.subtract(blocker_m, self.antenna_m)), dtype=np.int64)
+
+    def blockage_db(self, blocker_m: Floats | float | None = None) -> tuple[Floats, Floats]:
+        """What a vehicle between adds (TR 37.885, 6.2.1): mean and deviation of max(0, X), `(...)`.
 
         X is taken as normal in dB, of mean 9 and deviation 4.5 where both antennas are lower than the
-        blocker, and 5 and 4 where one is; from 541 m on its mean grows. Nothing where both are higher.
+        blocker, and 5 and 4 where not both are. Nothing where both are higher. Beyond 541 m the mean grows by
+        15 log10 d - 41.
         """
-        if self.antenna_m > self.blocker_m:
-            return np.zeros_like(distance_m), 0.0
-        mean_db, deviation_db = (9.0, 4.5) if self.antenna_m < self.blocker_m else (5.0, 4.0)
-        z = mean_db / deviation_db
-        above, at = float(ndtr(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
-        clipped_db = mean_db * above + deviation_db * at
-        square = (mean_db**2 + deviation_db**2) * above + mean_db * deviation_db * at
-        growth_db = np.maximum(0.0, 15 * np.log10(distance_m) - 41)
-        return clipped_db + growth_db, math.sqrt(square - clipped_db**2)
+        blocks = self._blocks(blocker_m)
+        mean_db, deviation_db = np.array(_BLOCKAGE_DB).T
+        return mean_db[blocks], deviation_db[blocks]
 
     def corner_db(self, corner_m: Floats) -> Floats:
         """Loss `(...)` round a corner, from the ends' distances to the crossing's centre, `(..., 2)`.
@@ -116,7 +122,12 @@ class Propagation:
         ratio = spread * 4 * np.pi * receiver_m / wave_m * np.maximum(1.0, receiver_m / break_m)
         return 3.75 + 2.94 * self.suburban + 26.9 * np.log10(ratio)
 
-    def shadowing_db(self, sight: Ints | int = CLEAR, corner_m: Floats | None = None) -> Floats:
+    def shadowing_db(
+        self,
+        sight: Ints | int = CLEAR,
+        blocker_m: Floats | float | None = None,
+        corner_m: Floats | None = None,
+    ) -> Floats:
         """Standard deviation `(...)` of shadowing and blockage together.
 
         3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a building
@@ -125,17 +136,17 @@ class Propagation:
         behind: Floats | float = 4.0
         if corner_m is not None:
             behind = np.where(np.isnan(corner_m).any(axis=-1), 4.0, 4.1)
-        vehicle_db = math.hypot(3.0, self.blockage_db(np.array(NEAREST_M))[1])
+        vehicle_db = np.hypot(3.0, self.blockage_db(blocker_m)[1])
         return np.select([np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind)
 
-    def decorrelation_m(self, sight: int) -> float:
-        """Distance over which shadowing's correlation falls to 1/e: 25 m on a highway, else 10 and 13 m.
+    @property
+    def decorrelation_m(self) -> float:
+        """Distance over which shadowing's correlation falls to 1/e: 25 m on a highway and 10 m in a town.
 
-        TR 37.885, 6.2.1. `winner-b1` has what TR 36.885 has with it in a town, 10 m.
+        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links that are not
+        in line of sight; here these have 10 m as well, so that shadowing does not jump where sight is lost.
         """
-        if self.environment == "tr37885-highway":
-            return 25.0
-        return 10.0 if sight == CLEAR or self.environment == "winner-b1" else 13.0
+        return 25.0 if self.environment == "tr37885-highway" else 10.0
 
     def clear_probability(self, distance_m: Floats) -> Floats:
         """Share of links without a building between that no vehicle blocks (TR 37.885, table 6.2-1).
@@ -148,6 +159,17 @@ class Propagation:
             return np.minimum(1.0, 1.05 * np.exp(-0.0114 * distance_m))
         near = np.minimum(1.0, 2.1013e-6 * distance_m**2 - 0.002 * distance_m + 1.0193)
         return np.where(distance_m <= 475, near, np.maximum(0.0, 0.54 - 0.001 * (distance_m - 475)))
+
+
+def _clipped(mean: float, deviation: float) -> tuple[float, float]:
+    """Mean and standard deviation of max(0, X) of a normal X."""
+    z = mean / deviation
+    above, at = float(ndtr(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
+    first = mean * above + deviation * at
+    return first, math.sqrt((mean**2 + deviation**2) * above + mean * deviation * at - first**2)
+
+
+_BLOCKAGE_DB = [(0.0, 0.0), _clipped(5.0, 4.0), _clipped(9.0, 4.5)]
 
 
 def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:
