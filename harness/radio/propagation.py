@@ -69,8 +69,7 @@ class Propagation:
         clear_db = self.clear_db(distance_m)
         if np.ndim(sight) == 0 and sight == CLEAR:
             return clear_db
-        growth_db = np.maximum(0.0, 15 * np.log10(distance_m) - 41)
-        blocked_db = np.where(self._blocks(blocker_m) > 0, self.blockage_db(blocker_m)[0] + growth_db, 0.0)
+        blocked_db = self.blockage_db(distance_m, blocker_m)[0]
         behind_db = nlos_db(distance_m, self.frequency_ghz)
         if corner_m is not None:
             round_db = self.corner_db(corner_m)
@@ -90,21 +89,20 @@ class Propagation:
             return 32.4 + 20 * np.log10(distance_m) + 20 * math.log10(self.frequency_ghz)
         return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
 
-    def _blocks(self, blocker_m: Floats | float | None) -> Ints:
-        """How many of two equally high antennas a vehicle's height reaches: 0, 1 (just as high) or 2."""
-        blocker_m = self.blocker_m if blocker_m is None else blocker_m
-        return np.asarray(1 + np.sign(np.subtract(blocker_m, self.antenna_m)), dtype=np.int64)
-
-    def blockage_db(self, blocker_m: Floats | float | None = None) -> tuple[Floats, Floats]:
+    def blockage_db(
+        self, distance_m: Floats, blocker_m: Floats | float | None = None
+    ) -> tuple[Floats, Floats]:
         """What a vehicle between adds (TR 37.885, 6.2.1): mean and deviation of max(0, X), `(...)`.
 
         X is taken as normal in dB, of mean 9 and deviation 4.5 where both antennas are lower than the
         blocker, and 5 and 4 where not both are. Nothing where both are higher. Beyond 541 m the mean grows by
         15 log10 d - 41.
         """
-        blocks = self._blocks(blocker_m)
+        blocker_m = self.blocker_m if blocker_m is None else blocker_m
+        higher = np.sign(np.subtract(blocker_m, self.antenna_m)).astype(np.int64)  # 1, 0 or -1
         mean_db, deviation_db = np.array(_BLOCKAGE_DB).T
-        return mean_db[blocks], deviation_db[blocks]
+        growth_db = np.maximum(0.0, 15 * np.log10(np.maximum(distance_m, NEAREST_M)) - 41)
+        return np.where(higher < 0, 0.0, mean_db[higher] + growth_db), deviation_db[higher]
 
     def corner_db(self, corner_m: Floats) -> Floats:
         """Loss `(...)` round a corner, from the ends' distances to the crossing's centre, `(..., 2)`.
@@ -136,7 +134,7 @@ class Propagation:
         behind: Floats | float = 4.0
         if corner_m is not None:
             behind = np.where(np.isnan(corner_m).any(axis=-1), 4.0, 4.1)
-        vehicle_db = np.hypot(3.0, self.blockage_db(blocker_m)[1])
+        vehicle_db = np.hypot(3.0, self.blockage_db(np.array(NEAREST_M), blocker_m)[1])
         return np.select([np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind)
 
     @property
@@ -169,7 +167,8 @@ def _clipped(mean: float, deviation: float) -> tuple[float, float]:
     return first, math.sqrt((mean**2 + deviation**2) * above + mean * deviation * at - first**2)
 
 
-_BLOCKAGE_DB = [(0.0, 0.0), _clipped(5.0, 4.0), _clipped(9.0, 4.5)]
+# Of a blocker as high as the antennas, higher, and lower.
+_BLOCKAGE_DB = [_clipped(5.0, 4.0), _clipped(9.0, 4.5), (0.0, 0.0)]
 
 
 def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:

@@ -1,0 +1,272 @@
+"""Vehicles that broadcast on a sidelink under background load: what crosses, and when.
+
+The model of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019; equation numbers
+are theirs): a packet is lost because the receiver was sending (half duplex), because it came too faintly to
+be sensed, because of noise, or because others chose its resource. The paper averages over the shadowing of
+links in line of sight. `loss` is that of one link whose shadowing and obstacles are known; `reception`
+averages it again, and in line of sight is the paper's curve.
+
+Background vehicles stand evenly along a straight road through the receiver, with vehicles between them where
+the surroundings have a probability of that. Swarm messages add no load and do not collide with each other.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtr
+
+from harness.core.arrays import Floats
+from harness.core.errors import UserError
+from harness.radio.block_error import BlockError
+from harness.radio.channel import CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
+from harness.radio.propagation import Propagation
+from harness.radio.sps import Scheduling
+
+FURTHEST_M = 1000
+"""Interferers further from the receiver do not count, as in the source; beyond, links have its collisions."""
+
+STEP_M = 10
+CELL_DB, CELLS = 0.5, 160
+"""The grid on which success is computed once: distances, and powers from the sensing threshold on."""
+
+
+@dataclass(frozen=True)
+class Sidelink(Propagation):
+    """What LTE Mode 4 and NR Mode 2 have in common; its fields and `Propagation`'s are settings of both.
+
+    Attributes:
+        density_per_km: background vehicles on one kilometre of road, all lanes together.
+        rate_hz: packets a second of each of them.
+        power_dbm: transmit power of everyone.
+        gain_dbi: gain of each antenna.
+        noise_figure_db: of the receivers.
+        sensing_dbm: least power at which a packet is received or sensed; of the whole packet.
+        keep: probability that a vehicle keeps its resource when it might choose anew.
+        transmissions: how often each block is sent, blindly, everyone's. Copies are received independently
+            and not combined, given the link's shadowing.
+        t1_slots: first slot of the selection window.
+        t2_slots: its last slot. A message takes one of the window at random (one-shot), since what is
+            triggered has no reservation.
+    """
+
+    density_per_km: float = 100.0
+    rate_hz: float = 10.0
+    power_dbm: float = 23.0
+    gain_dbi: float = 0.0
+    noise_figure_db: float = 9.0
+    sensing_dbm: float = -90.5
+    keep: float = 0.0
+    transmissions: int = 1
+    t1_slots: int = 1
+    t2_slots: int = 100
+
+    needs_site: ClassVar[bool] = True
+    ranks: ClassVar[bool]
+    """Whether vehicles rank what they have left by received power (Step 3 of Mode 4)."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are no radio's."""
+        least = {
+            "density_per_km": 0.0, "rate_hz": 0.1, "keep": 0.0, "transmissions": 1, "t1_slots": 0,
+            "t2_slots": self.t1_slots, "antenna_m": self.environment_height_m + 0.1,
+        }  # fmt: skip
+        for name, bound in least.items():
+            if not getattr(self, name) >= bound:
+                raise UserError(f"{name} is {getattr(self, name)}: give {bound} or more")
+        if self.keep > 1:
+            raise UserError(f"keep is {self.keep}: give a probability, 0 to 1")
+
+    @property
+    @abstractmethod
+    def slot_s(self) -> float:
+        """Seconds of one slot, the time on air of one block."""
+
+    @property
+    @abstractmethod
+    def blocks_per_slot(self) -> int:
+        """How many blocks fit beside each other in one slot."""
+
+    @property
+    @abstractmethod
+    def block_bits(self) -> int:
+        """Size of a background packet; a larger message takes several such blocks, and each must cross."""
+
+    @property
+    @abstractmethod
+    def noise_dbm(self) -> float:
+        """Noise in the bandwidth of a block."""
+
+    @property
+    @abstractmethod
+    def block_error(self) -> BlockError:
+        """How often a block is lost at a signal-to-interference-and-noise ratio."""
+
+    def busy_ratio(self) -> float:
+        """Channel busy ratio under the background load (34)."""
+        return self._scheduling().busy_ratio
+
+    def reception(self, distance_m: Floats, sight: int | None = None) -> Floats:
+        """Share of background packets received over these distances, averaged over shadowing, `(n,)` (6).
+
+        Args:
+            distance_m: `(n,)`.
+            sight: what stands between; without, no building does, and vehicles do with the surroundings'
+                probability.
+        """
+        distance_m = np.asarray(distance_m, dtype=np.float64)
+        success = np.apply_along_axis(
+            lambda column: np.interp(distance_m, _DISTANCE_M, column), 0, _success(self)
+        )
+        received: Floats = 1 - (1 - success) ** self.transmissions
+        return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """Probability that a message of so many bits is lost on each link, `(..., H)`, given its shadowing.
+
+        Args:
+            site: where the links are; links to helpers that are not there have any loss.
+            shadow: standard normal, `(..., H)`.
+            bits: `(..., H)` or one number.
+        """
+        return self._lost(self._block_loss(site, shadow), bits)
+
+    def request(self, bits: float, draws: Draws) -> Broadcast:
+        """All helpers have it when its last block was sent."""
+        airtime_s = float(self._airtime_s(bits))
+        return Broadcast(self._wait_s(draws.wait) + airtime_s, airtime_s)
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """Each reply waits for a slot of its own; half duplex and collisions are in the loss."""
+        if links.site is None:
+            raise UserError(NO_SITE)
+        block_loss = self._block_loss(links.site, draws.shadow(links.site.xy_m, self.decorrelation_m))
+        loss = self._lost(block_loss, links.payload_bits)
+        request_loss = self._lost(block_loss, links.request_bits)
+        airtime_s = self._airtime_s(links.payload_bits)
+        delay_s = np.where(links.asked, links.ready_s + self._wait_s(draws.jitter) + airtime_s, np.inf)
+        up = (draws.packet[..., 0] >= request_loss) & (draws.packet[..., 1] >= loss)
+        return Delivery(up, delay_s, loss, airtime_s)
+
+    def _wait_s(self, uniform: Floats) -> Floats:
+        """From the wish to send to the start of the slot chosen."""
+        window = self.t2_slots - self.t1_slots + 1
+        return (self.t1_slots + np.floor(uniform * window)) * self.slot_s
+
+    def _blocks(self, bits: Floats | float) -> Floats:
+        return np.maximum(np.ceil(np.divide(bits, self.block_bits)), 1.0)
+
+    def _airtime_s(self, bits: Floats | float) -> Floats:
+        """One slot a block and copy, one after another."""
+        return self._blocks(bits) * (self.transmissions * self.slot_s)
+
+    def _lost(self, block_loss: Floats, bits: Floats | float) -> Floats:
+        return 1 - (1 - block_loss) ** self._blocks(bits)
+
+    def _block_loss(self, site: Site, shadow: Floats) -> Floats:
+        between = (site.sight, site.blocker_m, site.corner_m)
+        distance_m = site.distance_m
+        deviation_db = self.shadowing_db(*between)
+        power_dbm = self._received_dbm(self.path_loss_db(distance_m, *between)) + deviation_db * shadow
+        # A helper that is not there has no place, and the grid must be read somewhere.
+        place = [distance_m / STEP_M, (power_dbm - self.sensing_dbm) / CELL_DB - 0.5]
+        success = map_coordinates(_success(self), np.nan_to_num(place), order=1, mode="nearest")
+        copies = np.where(power_dbm >= self.sensing_dbm, (1 - success) ** self.transmissions, 1.0)
+        return np.clip(copies, 0.0, 1.0)
+
+    def _received_dbm(self, path_loss_db: Floats) -> Floats:
+        return self.power_dbm + 2 * self.gain_dbi - path_loss_db
+
+    def _scheduling(self) -> Scheduling:
+        return Scheduling(
+            per_m=self.density_per_km / 1000 * self.transmissions,
+            resources=self.blocks_per_slot / (self.slot_s * self.rate_hz),
+            # A vehicle chooses anew once a second (5 to 15 packets at 10 Hz, 10 to 30 at 20 Hz).
+            forgotten=min(1.0, (1 - self.keep) / self.rate_hz),
+            sensed=self._sensed,
+            threshold_dbm=self.sensing_dbm,
+        )
+
+    def _states(self, distance_m: Floats, sight: int | None) -> list[tuple[Floats, Floats, float]]:
+        """What may stand between: shares `(n,)`, mean received powers `(n,)` and their deviation in dB."""
+        clear = self.clear_probability(distance_m)
+        shares = {CLEAR: clear, VEHICLE: 1 - clear} if sight is None else {sight: np.ones_like(clear)}
+        return [
+            (share, self._received_dbm(self.path_loss_db(distance_m, state)), float(self.shadowing_db(state)))
+            for state, share in shares.items()
+            if share.any()
+        ]
+
+    def _sensed(self, distance_m: Floats, threshold_dbm: float) -> Floats:
+        """Share of the packets from so far away that are above a threshold (11)."""
+        states = self._states(distance_m, None)
+        return np.asarray(sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states))
+
+    def _shares(self, distance_m: Floats, sight: int | None) -> Floats:
+        """Shares of the power cells, `(n, CELLS)`; what is missing to 1 is below the threshold (10)."""
+        edges = self.sensing_dbm + CELL_DB * np.arange(CELLS + 1)
+        edges[-1] = np.inf
+        states = self._states(distance_m, sight)
+        below = [share[:, None] * ndtr((edges - mean[:, None]) / sd) for share, mean, sd in states]
+        return np.diff(np.sum(below, axis=0), axis=-1)
+
+
+_DISTANCE_M: Floats = np.arange(0.0, FURTHEST_M + STEP_M, STEP_M)
+
+
+@lru_cache(maxsize=64)
+def _success(radio: Sidelink) -> Floats:
+    """Share of packets received of those that are sensed, by distance and received power, `(D, CELLS)`."""
+    power_dbm: Floats = radio.sensing_dbm + CELL_DB * (np.arange(CELLS, dtype=np.float64) + 0.5)
+    noise_lost = radio.block_error(power_dbm - radio.noise_dbm)
+    shares = radio._shares(_DISTANCE_M, None) * (1 - noise_lost)
+    shares /= np.maximum(shares.sum(axis=-1, keepdims=True), 1e-300)
+    spacing_m = 1000 / radio.density_per_km if radio.density_per_km else np.inf
+    interferers_m: Floats = spacing_m * np.arange(1.0, round(FURTHEST_M / spacing_m) + 1)
+    hit = _hit(radio, power_dbm, noise_lost, interferers_m)
+
+    scheduling = radio._scheduling()
+    busy = min(max(2 * scheduling.busy_ratio - 0.4, 0.0), 1.0) if radio.ranks else 1.0  # (22)
+    free, free_on_average = np.zeros(shares.shape), np.zeros(len(shares))
+    for weight, same in ((busy, scheduling.same_by_exclusion), (1 - busy, scheduling.same_by_ranking)):
+        if weight:
+            # Interferers stand on both sides of the receiver (14, 15).
+            sides = [
+                radio.transmissions * same(np.abs(_DISTANCE_M[:, None] + side * interferers_m))
+                for side in (-1, 1)
+            ]
+            free += weight * np.array([_none(*(side[d] * hit for side in sides)) for d in range(len(shares))])
+            mean_hit = shares @ hit
+            free_on_average += weight * _none(*(side * mean_hit for side in sides))
+    # The source multiplies the interferers' average collisions. A link's own power is the same against all of
+    # them, so that the average of products is a little larger; the curve shall be the source's.
+    average_free = np.sum(shares * free, axis=-1)
+    free *= np.divide(free_on_average, average_free, out=np.ones(len(shares)), where=average_free > 0)[
+        :, None
+    ]
+    half_duplex = radio.rate_hz * radio.transmissions * radio.slot_s  # (7)
+    success: Floats = max(1 - half_duplex, 0.0) * (1 - noise_lost) * free
+    return success
+
+
+def _none(left: Floats, right: Floats) -> Floats:
+    """Probability that no interferer hits, over the last dimension."""
+    return np.asarray(np.prod((1 - np.minimum(left, 1.0)) * (1 - np.minimum(right, 1.0)), axis=-1))
+
+
+def _hit(radio: Sidelink, power_dbm: Floats, noise_lost: Floats, interferers_m: Floats) -> Floats:
+    """Probability that an interferer on the same resource destroys a packet that noise would not, `(P, K)`.
+
+    (17, 18), over the interferer's shadowing by 15 nodes.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    lost = np.zeros((len(power_dbm), len(interferers_m)))
+    for share, mean_dbm, deviation_db in radio._states(interferers_m, None):
+        interference_mw = 10 ** ((mean_dbm[:, None] + deviation_db * nodes) / 10)
+        noise_db = 10 * np.log10(interference_mw + 10 ** (radio.noise_dbm / 10))
+        lost += share * (radio.block_error(power_dbm[:, None, None] - noise_db) @ (weights / weights.sum()))
+    left = 1 - noise_lost[:, None]
+    return np.where(left > 0, (lost - noise_lost[:, None]) / np.where(left > 0, left, 1.0), 0.0)

@@ -1,0 +1,98 @@
+"""Semi-persistent scheduling on a sidelink: how many resources are taken, how often two choose the same.
+
+Vehicles stand evenly along a road, all send at one rate, and each chooses at random from the resources that
+it has not sensed as taken. Equation numbers are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and
+Gozalvez, "Analytical Models of the Performance of C-V2X Mode 4 Vehicular Communications", IEEE TVT 68(2),
+2019.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import correlate
+
+from harness.core.arrays import Floats
+
+REACH_M = 1500
+"""Vehicles further away are not sensed."""
+
+LEAST_SHARE = 0.2
+"""Share of the resources that must be left to choose from (TS 36.213, 14.1.1.6; TS 38.214, 8.1.4)."""
+
+STEP_DB = 0.1
+"""By which Step 3 raises the threshold until so many are left."""
+
+
+@dataclass(frozen=True)
+class Scheduling:
+    """What each vehicle knows of the resources of one period, and chooses by.
+
+    Attributes:
+        per_m: packets a period of the vehicles on one metre of road.
+        resources: how many there are in a period (28).
+        forgotten: share of the choices in which a vehicle that could sense another does not know of the
+            other's choice, since both were made anew within one period (24).
+        sensed: share of the packets of a vehicle so many metres away whose power is above a threshold in dBm
+            (11), for an array of metres; the second argument is the threshold.
+        threshold_dbm: what a receiver senses.
+    """
+
+    per_m: float
+    resources: float
+    forgotten: float
+    sensed: Callable[[Floats, float], Floats]
+    threshold_dbm: float
+
+    @property
+    def busy_ratio(self) -> float:
+        """Channel busy ratio (34)."""
+        return self._taken(self.threshold_dbm, 1) / self.resources
+
+    def same_by_exclusion(self, apart_m: Floats) -> Floats:
+        """Probability that another, `apart_m` away, takes one's own resource; both exclude what they sense.
+
+        Step 2, (23). The source does not bound what is excluded; no more than 80 % can be.
+        """
+        taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
+        return self._same(apart_m, taken, self.threshold_dbm)
+
+    def same_by_ranking(self, apart_m: Floats) -> Floats:
+        """The same where both then keep the fifth of the resources that was received most faintly.
+
+        Step 3, (31) to (33): as if the threshold had been raised until no more were left.
+        """
+        threshold_dbm = self.threshold_dbm
+        while (taken := self._taken(threshold_dbm, 2)) > (1 - LEAST_SHARE) * self.resources:
+            threshold_dbm += STEP_DB
+        return self._same(apart_m, taken, threshold_dbm)
+
+    def _taken(self, threshold_dbm: float, times: int) -> float:
+        """Resources taken for taken: those of `times` the packets sensed (29, 29.1; 32, 33)."""
+        metres = np.abs(np.arange(-REACH_M, REACH_M + 1.0))
+        return taken(times * self.per_m * float(self.sensed(metres, threshold_dbm).sum()), self.resources)
+
+    def _same(self, apart_m: Floats, taken: float, threshold_dbm: float) -> Floats:
+        """(24) to (27) and (30): they choose from what both have left, the nearer, the more in common."""
+        sensed = self.sensed(np.abs(np.arange(-REACH_M, REACH_M + 1.0)), self.threshold_dbm)
+        overlap = correlate(sensed, sensed, method="fft")[2 * REACH_M :]  # (30.2), by metre from 0 on
+        by_chance = taken**2 / self.resources
+        # In (30) the density cancels: beta / Spsr is 1 / the sum of `sensed`.
+        nearness = overlap / max(overlap[0], 1e-300)
+        both = taken * overlap / max(sensed.sum(), 1e-300) + (1 - nearness) * by_chance
+        common = np.interp(apart_m, np.arange(overlap.size), self.resources - 2 * taken + both)
+        unaware = 1 - (1 - self.forgotten) * self.sensed(apart_m, threshold_dbm)
+        return np.asarray(np.clip(unaware * common / (self.resources - taken) ** 2, 0.0, 1.0))
+
+
+def taken(packets: float, resources: float) -> float:
+    """Resources taken by packets (29): half of them lie apart, and the others fall at random.
+
+    Never more than there are, which the equation does not say and which holds where it was meant.
+    """
+    half = packets / 2
+    free = resources - half
+    if free <= 0:
+        return resources
+    later = min(int(half), int(free))
+    return min(half + later - later * (later + 1) / (2 * free), resources)

@@ -1,0 +1,243 @@
+"""LTE Mode 4: its factors against the equations, its collisions against a simulation, and its limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from harness.core.errors import UserError
+from harness.radio.block_error import block_error
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
+from harness.radio.fading import Trips
+from harness.radio.lte_mode4 import LteMode4
+from harness.radio.sps import Scheduling, taken
+
+QUIET = LteMode4(density_per_km=0.0)
+BUSY = LteMode4(density_per_km=200.0)
+NOISE_DBM = -95 + 10 * np.log10(10 / 50)
+LOST = block_error("lte-qpsk-0.7-190B")
+
+
+def place(distances_m, sight=CLEAR, corner_m=np.nan):
+    """One ego and a helper at each of these distances, straight ahead."""
+    distances_m = np.asarray(distances_m, float)
+    xy_m = np.zeros((1 + len(distances_m), 2))
+    xy_m[1:, 0] = distances_m
+    return Site(
+        xy_m=xy_m,
+        sight=np.full(len(distances_m), sight),
+        blocker_m=np.full(len(distances_m), 1.6 * (sight == VEHICLE)),
+        corner_m=np.full((len(distances_m), 2), corner_m),
+    )
+
+
+def draws(n, helpers):
+    trips = Trips(np.arange(n), np.zeros(n, int), np.zeros(n, int), steps=1)
+    uniform = np.random.default_rng(0).random
+    return Draws(uniform((n, helpers, 2)), uniform((n, helpers)), trips)
+
+
+def links(site, n, helpers, payload_bits=800.0):
+    shape = (n, helpers)
+    places = Site(
+        *(np.broadcast_to(a, (n, *a.shape)) for a in (site.xy_m, site.sight, site.blocker_m, site.corner_m))
+    )
+    return Links(
+        asked=np.ones(shape, bool), ready_s=np.full(shape, 0.1), range_m=np.full(shape, 50.0),
+        payload_bits=np.full(shape, payload_bits), in_radius=np.ones(shape, bool),
+        rounds=np.zeros(shape, bool), request_bits=400.0, site=places,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("distance_m", [50.0, 250.0, 300.0, 400.0])
+def test_without_others_it_is_half_duplex_sensing_and_noise(distance_m):
+    # (7), (10) and (13): 10 packets a second of 1 ms each; N(Pt - PL, 3 dB) above -90.5 dBm; block errors.
+    mean = 23 - float(QUIET.path_loss_db(np.array(distance_m)))
+    sensed = norm.sf(-90.5, mean, 3)
+    power = np.arange(-90.5, -30, 1e-3)
+    lost = np.trapezoid(norm.pdf(power, mean, 3) * LOST(power - NOISE_DBM), power)
+    by_hand = (1 - 0.01) * sensed * (1 - lost / sensed)
+    assert QUIET.reception(np.array([distance_m]))[0] == pytest.approx(by_hand, abs=1e-3)
+
+
+def test_near_and_alone_only_half_duplex_and_the_curve_s_floor_remain():
+    assert QUIET.loss(place([10]), np.zeros(1), 800.0)[0] == pytest.approx(1 - 0.99 * 0.999)
+    assert QUIET.busy_ratio() == 0
+    assert QUIET.reception(np.array([2000.0]))[0] < 1e-3
+
+
+@pytest.mark.parametrize("distance_m", [100.0, 250.0])
+def test_collisions_are_those_of_the_equations(distance_m):
+    """(14) to (18), with every interferer's shadowing drawn instead of integrated."""
+    rng = np.random.default_rng(1)
+    scheduling = BUSY._scheduling()
+    power = rng.normal(23 - float(BUSY.path_loss_db(np.array(distance_m))), 3, 4000)
+    power = power[power >= -90.5]
+    noise_lost = LOST(power - NOISE_DBM).mean()
+    free = {scheduling.same_by_exclusion: 1.0, scheduling.same_by_ranking: 1.0}
+    for place_m in np.concatenate([np.arange(-1000, 0, 5.0), np.arange(5, 1001, 5.0)]):
+        mean = 23 - float(BUSY.path_loss_db(np.array(abs(place_m))))
+        interference = 10 ** (rng.normal(mean, 3, power.size) / 10)
+        lost = LOST(power - 10 * np.log10(interference + 10 ** (NOISE_DBM / 10))).mean()
+        hit = max(0.0, (lost - noise_lost) / (1 - noise_lost))
+        for same in free:
+            free[same] *= 1 - float(same(np.array(abs(place_m + distance_m)))) * hit
+    by_exclusion, by_ranking = free.values()
+    weight = 2 * scheduling.busy_ratio - 0.4  # (22)
+    collided = weight * (1 - by_exclusion) + (1 - weight) * (1 - by_ranking)  # (21)
+    assert 0 < weight < 1
+    expected = QUIET.reception(np.array([distance_m]))[0] * (1 - collided)
+    assert BUSY.reception(np.array([distance_m]))[0] == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("radio", [BUSY, replace(BUSY, transmissions=2), replace(BUSY, subchannels=2)])
+@pytest.mark.parametrize("sight", [CLEAR, VEHICLE, BUILDING])
+def test_loss_averaged_over_shadowing_is_the_curve(radio, sight):
+    distances_m = np.array([20.0, 55, 100, 160, 250, 333, 450])
+    shadows = norm.ppf((np.arange(4000) + 0.5) / 4000)
+    site = place(distances_m, sight)
+    received = [1 - radio.loss(site, np.full(len(distances_m), z), 1520.0) for z in shadows]
+    np.testing.assert_allclose(np.mean(received, axis=0), radio.reception(distances_m, sight), atol=2e-3)
+
+
+def test_what_stands_between_and_the_corner_cost_reception():
+    far = np.array([150.0])
+    clear, vehicle, building = (BUSY.reception(far, sight)[0] for sight in (CLEAR, VEHICLE, BUILDING))
+    assert clear > vehicle > building
+    z = np.zeros(1)
+    corner = BUSY.loss(place([80 * np.sqrt(2)], BUILDING, 80.0), z, 800.0)
+    assert corner > BUSY.loss(place([80 * np.sqrt(2)], BUILDING), z, 800.0)
+    # 50 m before the crossing, both: 114 dB, 5 dB below what is sensed without luck.
+    assert QUIET.loss(place([50 * np.sqrt(2)], BUILDING, 50.0), z, 800.0)[0] == 1.0
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    density=st.floats(0, 400),
+    more=st.floats(1, 200),
+    rate=st.sampled_from([5.0, 10.0, 20.0]),
+    subchannels=st.sampled_from([2, 4]),
+)
+def test_more_load_never_helps_and_distance_never_helps(density, more, rate, subchannels):
+    distances_m = np.arange(20.0, 600, 20)
+    light, heavy = (
+        LteMode4(density_per_km=d, rate_hz=rate, subchannels=subchannels) for d in (density, density + more)
+    )
+    assert np.all(np.diff(light.reception(distances_m)) <= 2e-3)
+    # The evenly spaced interferers of two densities stand elsewhere: ripples of a point.
+    assert np.all(heavy.reception(distances_m) <= light.reception(distances_m) + 0.02)
+    assert heavy.busy_ratio() >= light.busy_ratio()
+
+
+def test_alone_more_power_never_hurts():
+    distances_m = np.arange(20.0, 600, 20)
+    received = [replace(QUIET, power_dbm=p).reception(distances_m) for p in (10.0, 17, 20, 23, 33)]
+    assert np.all(np.diff(received, axis=0) >= -1e-9)
+
+
+def test_a_message_waits_for_a_slot_and_takes_one_a_block():
+    n = 20_000
+    given_draws = draws(n, 1)
+    asked = BUSY.request(400.0, given_draws)
+    assert asked.airtime_s == pytest.approx(0.001)
+    # Uniform over the subframes 1 to 100: 50.5 ms, and the subframe itself.
+    assert np.min(asked.heard_s) == pytest.approx(0.002)
+    assert np.max(asked.heard_s) == pytest.approx(0.101)
+    assert np.mean(asked.heard_s) == pytest.approx(0.0515, abs=4e-4)
+    delivery = BUSY.deliver(links(place([50]), n, 1), given_draws)
+    assert np.mean(delivery.delay_s) == pytest.approx(0.1 + 0.0515, abs=4e-4)
+    both = np.mean(1 - delivery.loss) ** 2
+    assert np.mean(delivery.up) == pytest.approx(both, abs=0.01)
+
+
+def test_a_larger_message_takes_several_blocks_that_must_all_cross():
+    one, three = (BUSY.deliver(links(place([100]), 50, 1, bits), draws(50, 1)) for bits in (1520, 3041))
+    np.testing.assert_allclose(three.loss, 1 - (1 - one.loss) ** 3)
+    np.testing.assert_allclose(three.airtime_s, 0.003)
+    np.testing.assert_allclose(three.delay_s - one.delay_s, 0.002)
+    assert np.all(one.up >= three.up)
+
+
+def test_a_copy_helps_a_quiet_channel_and_not_what_is_too_faint():
+    twice = replace(QUIET, transmissions=2)
+    near, far = place([30]), place([900])
+    # Each of the two copies meets a receiver that now sends 20 ms a second.
+    assert twice.loss(near, np.zeros(1), 800.0)[0] == pytest.approx((1 - 0.98 * 0.999) ** 2)
+    assert twice.loss(far, np.full(1, -2.0), 800.0)[0] == 1.0
+
+
+def test_a_helper_that_is_not_there_changes_nobody():
+    alone = BUSY.deliver(links(place([50, 80]), 5, 2), draws(5, 2))
+    beside = BUSY.deliver(links(place([50, 80, np.nan]), 5, 3), draws(5, 3))
+    np.testing.assert_array_equal(beside.loss[:, :2], alone.loss)
+
+
+def test_settings_that_are_no_radio_s_are_refused():
+    with pytest.raises(UserError, match="subchannels is 3: block errors are known for 2 and 4"):
+        replace(QUIET, **{"subchannels": 3})
+    with pytest.raises(UserError, match="t2_slots is 0: give 1 or more"):
+        LteMode4(t2_slots=0)
+    with pytest.raises(UserError, match=r"density_per_km is nan: give 0\.0 or more"):
+        LteMode4(density_per_km=np.nan)
+    with pytest.raises(UserError, match="physical radio"):
+        BUSY.deliver(replace(links(place([50]), 1, 1), site=None), draws(1, 1))
+
+
+# Semi-persistent scheduling.
+
+
+def test_resources_taken_by_hand():
+    # 8 packets on 20 resources: 4 apart, and 4 more on 16 that are free: 1 - 1/16, 1 - 2/16, ...
+    assert taken(8, 20) == pytest.approx(4 + 4 - (1 + 2 + 3 + 4) / 16)
+    assert taken(0, 20) == 0
+    assert taken(1000, 20) == 20
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.5])
+def test_who_knows_nothing_of_each_other_meets_by_chance(threshold):
+    nobody = Scheduling(0.1, 100, 0.1, lambda metres, _: np.zeros_like(metres), threshold)
+    np.testing.assert_allclose(nobody.same_by_exclusion(np.array([10.0, 900])), 1 / 100)
+
+
+@pytest.mark.parametrize(("spacing_m", "vehicles"), [(10.0, 200), (20.0, 100)])
+def test_the_closed_forms_agree_with_100_000_slots_of_simulated_scheduling(spacing_m, vehicles):
+    """A ring of vehicles that sense all within 300 m, 2 sub-channels, 10 Hz, counters of 5 to 15."""
+    reach_m = 300.0
+    busy, same = simulated(vehicles, spacing_m, reach_m, subchannels=2)
+    model = Scheduling(1 / spacing_m, 200, 0.1, lambda metres, _: np.where(metres <= reach_m, 1.0, 0.0), 0.0)
+    apart_m = spacing_m * np.arange(1, vehicles // 2 + 1)
+    expected = model.same_by_exclusion(apart_m)
+    assert model.busy_ratio == pytest.approx(busy, rel=0.03)
+    hidden = apart_m > reach_m
+    assert expected[hidden].mean() == pytest.approx(same[hidden].mean(), rel=0.08)
+    # In reach the equation lets a collision last as long as a choice; it ends with the first of two.
+    assert 1.1 < expected[~hidden].mean() / same[~hidden].mean() < 1.5
+
+
+def simulated(vehicles, spacing_m, reach_m, subchannels, slots=100_000, period=100):
+    """Share of resources found taken; how often two that are so many places apart share one."""
+    rng = np.random.default_rng(0)
+    places = np.abs(np.arange(vehicles)[:, None] - np.arange(vehicles))
+    apart_m = spacing_m * np.minimum(places, vehicles - places)
+    near = [np.flatnonzero((row > 0) & (row <= reach_m)) for row in apart_m]
+    chosen = rng.integers(period * subchannels, size=vehicles)
+    heard, counter = chosen.copy(), rng.integers(1, 16, vehicles)
+    due = [set(np.flatnonzero(chosen // subchannels == slot)) for slot in range(period)]
+    busy, same, looks = [], np.zeros(vehicles // 2), 0
+    for slot in range(slots):
+        for v in list(due[slot % period]):
+            heard[v] = chosen[v]  # from now on the others know
+            counter[v] -= 1
+            if counter[v] == 0:
+                free = np.setdiff1d(np.arange(period * subchannels), heard[near[v]])
+                busy.append(1 - len(free) / (period * subchannels))
+                due[slot % period].remove(v)
+                chosen[v], counter[v] = rng.choice(free), rng.integers(5, 16)
+                due[chosen[v] // subchannels].add(v)
+        if slot > slots // 10 and slot % period == 0:
+            looks += 1
+            same += [np.sum(chosen == np.roll(chosen, k)) for k in range(1, vehicles // 2 + 1)]
+    return np.mean(busy), same / looks / vehicles
