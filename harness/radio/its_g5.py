@@ -1,0 +1,274 @@
+"""802.11p (ITS-G5, DSRC): broadcast under CSMA/CA in 10 MHz, beside the beacons of background traffic.
+
+Sepulcre, Gonzalez-Martín, Gozalvez, Molina-Masegosa, Coll-Perales, "Analytical Models of the Performance of
+IEEE 802.11p Vehicle to Vehicle Communications", IEEE TVT 71(1), 2022 (arXiv 2104.07923): numbers in brackets
+are its equations, and the defaults its own. A packet is lost below the sensing threshold (12), to a receiver
+that is locked to another one's packet (14), to noise (24) or to a collision (26): with a hidden node, or with
+one that hears the sender and ends its back-off in the same slot. What is done otherwise here:
+
+- A link keeps its shadowing: `loss` is that at the power received, and `reception` the mean over shadowing,
+  where the source multiplies means.
+- Background traffic is a line of equal density, so a product over vehicles is the exponential of an integral.
+- Nobody begins to send in the AIFS after a busy period either (`free_share`), where the source counts the
+  busy time alone in (16), (18) and (22); who waited for its end begins soon after, as others do (`crowding`).
+- A message of another size than the background's collides with who begins while it is on air, for as long as
+  it is, and with who was on air before, for as long as that is.
+- Replies that end their back-off in one slot are lost together; one that becomes ready while another is on
+  air waits for its end. All helpers of an ego are taken to hear each other. `loss` is without that.
+
+As in the source, a block error curve holds for frames of any size, a receiver does not leave a packet that it
+has locked to for a stronger one, and all vehicles of the background are in line of sight.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+from scipy.special import expit, ndtr, ndtri
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
+from harness.radio import back_off
+from harness.radio.back_off import SLOT_S, free_share
+from harness.radio.channel import NO_SITE, Broadcast, Delivery, Draws, Links, Site, served_s
+from harness.radio.propagation import CLEAR, VEHICLE, Propagation, noise_dbm
+
+BANDWIDTH_HZ = 10e6
+SIFS_S, SYMBOL_S, PREAMBLE_S = 32e-6, 8e-6, 40e-6  # IEEE 802.11-2012, 10 MHz OFDM
+SERVICE_AND_TAIL_BITS = 22
+REACH_M, SENSED_M = 1000.0, 1500.0  # of interferers round a receiver; of who is sensed
+CELL_M, STEP_DB, STRONGEST_DB = 10.0, 0.5, 80.0  # of the tables
+QUANTILES = 400  # of shadowing, in `reception`
+# Goubet, Baudais, Gautier, Berder, IEEE TVT 64(9), 2015, Fig. 14, L = 1, as the source has it (24).
+GOUBET_DB = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0)  # energy of a bit over noise density
+GOUBET = (1.0, 1.0, 0.4, 1.5e-2, 4e-3, 3e-3, 2e-3, 1e-3)
+# SINR in dB at which half are lost, and slope, fitted to WiLabV2Xsim's PERcurves of 6 Mb/s and 350 bytes.
+FITS = {"highway-los": (1.08, 1.15), "urban-los": (1.88, 1.19), "crossing-nlos": (4.02, 1.21)}
+IMPLEMENTATION = 0.37  # of Shannon's rate: Wu et al., arXiv 2203.17114
+
+
+class Hazards(NamedTuple):
+    """What a packet meets on average, by distance in CELL_M, and by power received in STEP_DB.
+
+    Attributes:
+        locked: packets that the receiver is locked to when it comes, `(D,)`.
+        collisions: with packets begun before it or with it; and with others, for each second that it is on
+            air, `(D, P, 2)`.
+    """
+
+    locked: Floats
+    collisions: Floats
+
+
+@dataclass(frozen=True)
+class ItsG5(Propagation):
+    """802.11p beside background traffic, which sends packets of one size at one rate.
+
+    Attributes:
+        frequency_ghz: carrier, here the control channel's.
+        environment_height_m: see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m.
+        density_per_km: vehicles of the background on a kilometre of road, all lanes and both ways.
+        rate_hz: packets a second of each of them.
+        packet_bytes: of these.
+        header_bytes: what the layers below add to a packet and to a message.
+        data_rate_mbps: of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
+        power_dbm: transmitted by everybody.
+        antenna_gain_db: of both antennas together.
+        noise_figure_db: of the receiver.
+        sensing_dbm: weakest packet that is sensed.
+        aifs_slots: slots after SIFS in which nobody begins; 6 is that of DENM and CAM of lowest priority.
+        contention_window: back-off is uniform from 0 to so many slots; a broadcast never doubles it.
+            There is always one, as after a packet of one's own.
+        block_error: of frames by SINR: `goubet`, the source's, by energy of a bit; or fits to WiLabV2Xsim's
+            curves of 350 bytes, `highway-los`, `urban-los` or `crossing-nlos`. Those of 6 Mb/s hold at other
+            rates by the implementation loss of Wu et al. (arXiv 2203.17114), 0.37 of Shannon's rate.
+    """
+
+    frequency_ghz: float = 5.89
+    environment_height_m: float = 0.5
+    density_per_km: float = 60.0
+    rate_hz: float = 10.0
+    packet_bytes: int = 190
+    header_bytes: int = 30
+    data_rate_mbps: float = 6.0
+    power_dbm: float = 23.0
+    antenna_gain_db: float = 0.0
+    noise_figure_db: float = 9.0
+    sensing_dbm: float = -85.0
+    aifs_slots: int = 6
+    contention_window: int = 15
+    block_error: Literal["goubet", "highway-los", "urban-los", "crossing-nlos"] = "goubet"
+    needs_site: ClassVar[bool] = True
+
+    @property
+    def aifs_s(self) -> float:
+        """How long the medium must be idle before anybody counts down."""
+        return SIFS_S + self.aifs_slots * SLOT_S
+
+    def airtime_s(self, size_bytes: Floats | float) -> Floats:
+        """How long frames of so many bytes, headers included, are on air (IEEE 802.11-2012, 18.4.3)."""
+        bits_per_symbol = self.data_rate_mbps * 1e6 * SYMBOL_S
+        symbols = np.ceil((8 * np.asarray(size_bytes) + SERVICE_AND_TAIL_BITS) / bits_per_symbol)
+        return PREAMBLE_S + SYMBOL_S * symbols
+
+    @property
+    def packet_s(self) -> float:
+        """How long a packet of the background is on air."""
+        return float(self.airtime_s(self.packet_bytes + self.header_bytes))
+
+    def message_s(self, bits: Floats | float) -> Floats:
+        """How long a message of so many bits is on air, its header included."""
+        return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
+
+    def busy_ratio(self) -> float:
+        """Channel busy ratio (35): a fit of the source to its simulations of a load (34) of up to 1.3.
+
+        It is held where the fit's parabola turns, 0.84 at a load of 1.84.
+        """
+        sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
+        load = min(self.density_per_km / 1000 * self.rate_hz * self.packet_s * sensed_m, 0.913 / 0.4962)
+        return (-0.2481 * load + 0.913) * load + 0.003844 * (load > 0)
+
+    def block_error_rate(self, sinr_db: Floats) -> Floats:
+        """Share of frames lost at these ratios of signal to interference and noise."""
+        if self.block_error == "goubet":
+            return np.interp(sinr_db + 10 * math.log10(10 / self.data_rate_mbps), GOUBET_DB, GOUBET)
+        middle_db, slope = FITS[self.block_error]
+        shift_db = _shannon_db(self.data_rate_mbps / 10) - _shannon_db(0.6)
+        return expit(slope * (middle_db + shift_db - sinr_db))
+
+    def reception(self, distance_m: Floats, sight: Ints | None = None) -> Floats:
+        """Share of the background's packets received at these distances `(n,)`, averaged over shadowing.
+
+        Without `sight` over links clear and blocked too, where the environment has shares of them.
+        """
+        shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
+        distance_m = np.asarray(distance_m, dtype=float)[:, None]
+
+        def received(sight: Ints | int) -> Floats:
+            found = self._received(distance_m, sight, None, shadow, self.packet_s)
+            return np.asarray(found.mean(axis=-1))
+
+        if sight is not None:
+            return received(np.asarray(sight)[:, None])
+        clear = self.clear_probability(distance_m[:, 0])
+        return clear * received(CLEAR) + (1 - clear) * received(VEHICLE)
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """Probability `(..., H)` that a message of so many bits is lost, given the link's shadowing."""
+        airtime_s = self.message_s(bits)
+        return 1 - self._received(site.distance_m, site.sight, site.corner_m, shadow, airtime_s)
+
+    def request(self, bits: float, draws: Draws) -> Broadcast:
+        """Heard when the medium was taken and the frame is through."""
+        airtime_s = float(self.message_s(bits))
+        return Broadcast(self.access_s(draws.wait) + airtime_s, airtime_s)
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """Each reply has an access delay of its own, and waits for those who were faster."""
+        site = links.site
+        if site is None:
+            raise UserError(NO_SITE)
+        shadow = draws.shadow(site.xy_m, self.decorrelation_m(CLEAR))
+        request_loss = self.loss(site, shadow, links.request_bits)
+        loss = self.loss(site, shadow, links.payload_bits)
+        airtime_s = self.message_s(links.payload_bits)
+        begins_s = np.where(links.asked, links.ready_s + self.access_s(draws.jitter), np.inf)
+        alone = np.sum(_near(begins_s, SLOT_S / 2), axis=-1) == 1
+        up = (draws.packet[..., 0] >= request_loss) & (draws.packet[..., 1] >= loss) & alone
+        on_air_s = np.where(links.asked, airtime_s, 0.0)
+        return Delivery(up, served_s(begins_s, on_air_s, links.range_m), loss, airtime_s)
+
+    def _received(
+        self, distance_m: Floats, sight: Ints | int, corner_m: Floats | None, shadow: Floats,
+        airtime_s: Floats | float,
+    ) -> Floats:  # fmt: skip
+        """Probability that a message so long on air crosses links with this shadowing, standard normal."""
+        mean_dbm = self.power_dbm + self.antenna_gain_db - self.path_loss_db(distance_m, sight, corner_m)
+        power_dbm = mean_dbm + self.shadowing_db(sight, corner_m) * shadow
+        sinr_db = power_dbm - noise_dbm(BANDWIDTH_HZ, self.noise_figure_db)
+        locked, collisions = _hazards(self)
+        place = np.broadcast_arrays(distance_m / CELL_M, (power_dbm - self.sensing_dbm) / STEP_DB)
+        met = _between(collisions, *place)
+        hazard = _between(locked, place[0]) + met[..., 0] + airtime_s * met[..., 1]
+        sensed = power_dbm >= self.sensing_dbm
+        return sensed * (1 - self.block_error_rate(sinr_db)) * np.exp(-hazard)
+
+    def access_s(self, uniforms: Floats) -> Floats:
+        """Seconds from the wish to send until the medium is taken: the quantiles at these draws."""
+        return np.interp(
+            uniforms, *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window)
+        )
+
+
+def _shannon_db(bits_per_s_hz: float) -> float:
+    """SINR that a rate needs under the implementation loss."""
+    return 10 * math.log10(2 ** (bits_per_s_hz / IMPLEMENTATION) - 1)
+
+
+def _sensed(radio: ItsG5, distance_m: Floats) -> Floats:
+    """Probability (13) that vehicles so far apart sense each other's packets."""
+    mean_dbm = radio.power_dbm + radio.antenna_gain_db - radio.path_loss_db(distance_m)
+    return ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db())
+
+
+@lru_cache(maxsize=64)
+def _hazards(radio: ItsG5) -> Hazards:
+    per_m, rate_hz, packet_s = radio.density_per_km / 1000, radio.rate_hz, radio.packet_s
+    distance_m = np.arange(0.0, REACH_M + CELL_M, CELL_M)
+    power_dbm = radio.sensing_dbm + np.arange(0.0, STRONGEST_DB + STEP_DB, STEP_DB)
+    from_receiver_m = np.arange(CELL_M / 2 - REACH_M, REACH_M, CELL_M)[:, None]
+    apart_m = np.abs(from_receiver_m + distance_m)  # of interferer and sender: (interferers, D)
+
+    heard, hears = _sensed(radio, np.abs(from_receiver_m)), _sensed(radio, apart_m)
+    busy = radio.busy_ratio()
+    alike = busy * _overlap(radio, apart_m)
+    begins_hz = rate_hz / free_share(alike, packet_s, radio.aifs_s) * per_m * CELL_M
+    slot_s = SLOT_S * back_off.crowding(busy, packet_s, radio.aifs_s, radio.contention_window)
+    same_slot, hidden = slot_s * begins_hz * hears, begins_hz * (1 - hears)  # (22), (18)
+    nearer = np.abs(from_receiver_m) < distance_m
+    locked = (same_slot * nearer + packet_s * hidden) * heard  # (21), (16)
+    before = same_slot * ~nearer + packet_s * hidden * (1 - heard)  # (32), (28)
+    spoils = _spoils(radio, power_dbm, np.abs(from_receiver_m))
+    collisions = np.stack([(spoils @ before).T, (spoils @ hidden).T], axis=-1)
+    return Hazards(locked.sum(axis=0), collisions)
+
+
+def _overlap(radio: ItsG5, apart_m: Floats) -> Floats:
+    """How much of what one vehicle senses another one senses, by the distance between them (20)."""
+    sensed = _sensed(radio, np.abs(np.arange(-SENSED_M, SENSED_M + 1)))
+    shared = np.correlate(sensed, sensed, "full")[sensed.size - 1 :]
+    return np.interp(apart_m, np.arange(shared.size), shared / shared[0])
+
+
+def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
+    """Probability (31) that a packet on air at once spoils one that noise would not, `(P, interferers)`."""
+    noise = noise_dbm(BANDWIDTH_HZ, radio.noise_figure_db)
+    shadow, weights = np.polynomial.hermite_e.hermegauss(15)
+    mean_dbm = radio.power_dbm + radio.antenna_gain_db - radio.path_loss_db(interferer_m)
+    others_dbm = 10 * np.log10(10 ** (noise / 10) + 10 ** ((mean_dbm + radio.shadowing_db() * shadow) / 10))
+    lost = radio.block_error_rate(power_dbm[:, None, None] - others_dbm) @ (weights / weights.sum())
+    survives = 1 - radio.block_error_rate(power_dbm - noise)[:, None]
+    return np.clip(1 - (1 - lost) / np.maximum(survives, 1e-12), 0.0, 1.0)
+
+
+def _near(at: Floats, within: float) -> Bools:
+    """Which of these times `(..., H)` are how near each other, `(..., H, H)`; infinite ones to nobody."""
+    finite = np.where(np.isfinite(at), at, np.nan)
+    return np.asarray(np.abs(finite[..., :, None] - finite[..., None, :]) < within)
+
+
+def _between(table: Floats, *place: Floats) -> Floats:
+    """A table's values between the whole numbers of its leading axes, linearly; beyond, those at its edge."""
+    found: Floats = np.zeros(())
+    lower = [np.fmin(np.fmax(at, 0.0), n - 1.000001) for at, n in zip(place, table.shape, strict=False)]
+    index = [at.astype(np.intp) for at in lower]
+    share = [at - i for at, i in zip(lower, index, strict=True)]
+    for corner in product((0, 1), repeat=len(place)):
+        weight = math.prod(s if up else 1 - s for s, up in zip(share, corner, strict=True))
+        value = table[tuple(i + up for i, up in zip(index, corner, strict=True))]
+        found = found + (weight[..., None] if value.ndim > weight.ndim else weight) * value
+    return found

@@ -1,0 +1,157 @@
+"""Packet reception by distance from a table of one's own, such as a run of ns-3 or Veins gives.
+
+A CSV file with the columns `distance_m` and `reception` (share of packets received), and if it has them
+`sight` (`clear`, `vehicle` or `building`: a curve for each) and `latency_ms`. Between two distances both are
+interpolated on a straight line; nearer than the first they are the first's.
+"""
+
+import csv
+import hashlib
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from harness.core.arrays import Floats, Ints
+from harness.core.errors import UserError, printable, unknown
+from harness.radio.channel import BUILDING, CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
+from harness.radio.constant import link_up
+
+SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
+COLUMNS = {"distance_m", "reception", "sight", "latency_ms"}
+
+
+class Point(NamedTuple):
+    """One row of the table.
+
+    Attributes:
+        distance_m: between sender and receiver.
+        reception: share of packets received.
+        sight: one of `SIGHTS`; None in a table that does not tell them apart.
+        latency_s: from the wish to send until received; None where the table does not say.
+    """
+
+    distance_m: float
+    reception: float
+    sight: str | None
+    latency_s: float | None
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A channel that receives as a table says.
+
+    The table has averaged over shadowing and knows one size, so a link's own shadowing and a message's bits
+    change nothing, and replies do not wait for each other. The helpers have a request when the table's
+    longest latency is over.
+
+    Attributes:
+        file: where the table was read.
+        sha256: of the file.
+        points: its rows.
+        latency_s: of each message, where the table has none.
+        beyond: reception farther away than the last distance: `zero`, since a table usually ends where
+            packets do and none was measured beyond, or `held`, the last row's, for one that ends early.
+    """
+
+    file: str
+    sha256: str
+    points: tuple[Point, ...]
+    latency_s: float = 0.025
+    beyond: Literal["zero", "held"] = "zero"
+    needs_site: ClassVar[bool] = True
+
+    def reception(self, distance_m: Floats, sight: Ints | None = None) -> Floats:
+        """Share of packets received at these distances; in clear sight if nothing else is said."""
+        return self._at(distance_m, CLEAR if sight is None else sight, "reception")
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """Probability that one crossing is lost, `(..., H)`."""
+        return 1 - self._at(site.distance_m, site.sight, "reception")
+
+    def busy_ratio(self) -> float:
+        """Channel busy ratio, of which a table of receptions says nothing."""
+        return math.nan
+
+    def request(self, bits: float, draws: Draws) -> Broadcast:
+        """Heard when the longest latency is over; how much of it is time on air is not known."""
+        return Broadcast(max(self._latency_s(p) for p in self.points), math.nan)
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """Each link has the loss and the latency of its distance."""
+        if links.site is None:
+            raise UserError(NO_SITE)
+        loss = self.loss(links.site, np.zeros(()), links.payload_bits)
+        latency_s = self._at(links.site.distance_m, links.site.sight, "latency_s")
+        delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
+        return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
+
+    def _latency_s(self, point: Point) -> float:
+        return self.latency_s if point.latency_s is None else point.latency_s
+
+    def _at(self, distance_m: Floats, sight: Ints | int, what: Literal["reception", "latency_s"]) -> Floats:
+        """A column of the table at these distances, under what stands between."""
+        found = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
+        for name, number in SIGHTS.items():
+            rows = [p for p in self.points if p.sight in (None, name)]
+            column = [p.reception if what == "reception" else self._latency_s(p) for p in rows]
+            last = 0.0 if (what, self.beyond) == ("reception", "zero") else None
+            curve = np.interp(distance_m, [p.distance_m for p in rows], column, right=last)
+            found = np.where(np.equal(sight, number), curve, found)
+        return found
+
+
+def load(path: Path, **settings: Any) -> Trace:
+    """The channel of a table, with other fields of `Trace` by name. Raises UserError."""
+    points = read(path)
+    return Trace(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), points, **settings)
+
+
+def read(path: Path) -> tuple[Point, ...]:
+    """The rows of a table, by sight and distance. Raises UserError: file, line, value and what is allowed."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
+                raise UserError(f"{path}: has no column {' or '.join(sorted(missing))}")
+            for name in rows.fieldnames or ():
+                if name not in COLUMNS:
+                    raise unknown(f"column of {path}", name, COLUMNS)
+            points = [_point(f"{path}, line {rows.line_num}", row) for row in rows]
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        raise UserError(f"{path}: cannot be read as a table ({problem})") from problem
+    if not points:
+        raise UserError(f"{path}: has no rows; give reception at one distance at least")
+    said = {p.sight for p in points}
+    if said != {None} and said != {*SIGHTS}:
+        lacks = next(name for name in SIGHTS if name not in said)
+        raise UserError(f"{path}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
+    points.sort(key=lambda p: (SIGHTS[p.sight] if p.sight else CLEAR, p.distance_m))
+    for a, b in pairwise(points):
+        if (a.sight, a.distance_m) == (b.sight, b.distance_m):
+            raise UserError(f"{path}: distance_m {a.distance_m:g} stands there twice; give each once")
+    return tuple(points)
+
+
+def _point(where: str, row: dict[str, str]) -> Point:
+    def number(column: str, most: float, allowed: str) -> float:
+        try:
+            value = float(row[column])
+        except (TypeError, ValueError):
+            value = math.nan
+        if not 0 <= value <= most:
+            raise UserError(f"{where}: {column} is {printable(row[column])!r}; it must be {allowed}")
+        return value
+
+    if None in row or None in row.values():
+        raise UserError(f"{where}: has other columns than the first line")
+    sight = row.get("sight")
+    if sight is not None and sight not in SIGHTS:
+        raise UserError(f"{where}: sight is {printable(sight)!r}; it must be {', '.join(SIGHTS)}")
+    distance_m = number("distance_m", 1e6, "metres, 0 or more")
+    reception = number("reception", 1.0, "a share from 0 to 1")
+    latency_s = number("latency_ms", 1e6, "milliseconds, 0 or more") / 1000 if "latency_ms" in row else None
+    return Point(distance_m, reception, sight, latency_s)

@@ -1,0 +1,112 @@
+"""Reception from a table: read, interpolated, refused, and driven through the seam."""
+
+import hashlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.core.errors import UserError
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
+from harness.radio.fading import Trips
+from harness.radio.trace import Trace, load, read
+
+PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"
+SIGHTED = (
+    "distance_m,reception,sight,latency_ms\n"
+    "0,1.0,clear,4\n200,0.9,clear,8\n0,0.8,vehicle,4\n200,0.4,vehicle,4\n0,0.5,building,4\n50,0,building,4\n"
+)
+
+
+def table(tmp_path: Path, text: str = PLAIN) -> Path:
+    path = tmp_path / "run.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def sites(distances_m: list[float], sight: list[int]) -> Site:
+    there = np.stack([np.array([0.0, *distances_m]), np.zeros(1 + len(distances_m))], axis=-1)
+    return Site(there, np.array(sight), np.zeros(len(sight)), np.full((len(sight), 2), np.nan))
+
+
+def test_reception_is_on_straight_lines_between_rows_held_before_them_and_zero_after(tmp_path):
+    trace = load(table(tmp_path))
+    at = np.array([0.0, 100.0, 150.0, 300.0, 301.0])
+    assert trace.reception(at).tolist() == pytest.approx([0.8, 0.8, 0.65, 0.2, 0.0])
+    held = load(table(tmp_path), beyond="held")
+    assert held.reception(at).tolist() == pytest.approx([0.8, 0.8, 0.65, 0.2, 0.2])
+    assert (trace.file, trace.sha256) == (
+        str(tmp_path / "run.csv"), hashlib.sha256(PLAIN.encode()).hexdigest()
+    )  # fmt: skip
+    assert math.isnan(trace.busy_ratio())
+
+
+def test_what_stands_between_has_a_curve_of_its_own_and_an_unknown_place_none(tmp_path):
+    trace = load(table(tmp_path, SIGHTED))
+    assert trace.reception(np.array([100.0])).tolist() == pytest.approx([0.95]), "clear, if nothing is said"
+    site = sites([100.0, 100.0, 25.0, np.nan], [CLEAR, VEHICLE, BUILDING, CLEAR])
+    loss = trace.loss(site, np.zeros(4), 800.0)
+    assert loss[:3].tolist() == pytest.approx([0.05, 0.4, 0.75])
+    assert np.isnan(loss[3])
+
+
+def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(tmp_path):
+    """At 100 m .95 cross in 6 ms. Draws are probabilities of loss that are just passed and just not."""
+    trace = load(table(tmp_path, SIGHTED))
+    assert isinstance(trace, Channel)
+    asked = np.array([True, True, False])
+    links = Links(
+        asked, np.array([0.15, 0.2, np.nan]), np.full(3, np.nan), np.full(3, 800.0), asked, asked, 400.0,
+        sites([100.0, 100.0, np.nan], [CLEAR] * 3),
+    )  # fmt: skip
+    draws = Draws(np.full((3, 2), 0.5), np.full(3, 0.5), Trips(np.array(0), np.array(0), np.array(0), 1))
+    object.__setattr__(draws, "packet", np.array([[0.06, 0.06], [0.06, 0.04], [0.9, 0.9]]))
+    assert trace.request(400.0, draws).heard_s == 0.008
+    up, delay_s, loss, airtime_s = trace.deliver(links, draws)
+    assert up[:2].tolist() == [True, False]
+    assert delay_s.tolist() == pytest.approx([0.156, 0.206, np.inf])
+    assert loss[0] == pytest.approx(0.05)
+    assert np.isnan(airtime_s).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("distance_m\n1\n", "run.csv: has no column reception"),
+        ("distance_m,reception,loss\n1,1,0\n", "'loss'; known: distance_m, latency_ms, reception, sight"),
+        ("distance_m,reception\n", "has no rows; give reception at one distance at least"),
+        ("distance_m,reception\n1,1\n2,1.2\n", "line 3: reception is '1.2'; it must be a share from 0 to 1"),
+        ("distance_m,reception\nfar,1\n", "line 2: distance_m is 'far'; it must be metres, 0 or more"),
+        ("distance_m,reception\n1,nan\n", "line 2: reception is 'nan'"),
+        ("distance_m,reception\n1\n", "line 2: has other columns than the first line"),
+        ("distance_m,reception\n1,1,1\n", "line 2: has other columns than the first line"),
+        ("distance_m,reception\n1,1\n1,0.5\n", "distance_m 1 stands there twice"),
+        (
+            "distance_m,reception,sight\n1,1,wall\n",
+            "line 2: sight is 'wall'; it must be clear, vehicle, building",
+        ),
+        (
+            "distance_m,reception,sight\n1,1,clear\n",
+            "has no row of sight 'vehicle'; with sight it needs clear",
+        ),
+        ("distance_m,reception,latency_ms\n1,1,-4\n", "line 2: latency_ms is '-4'; it must be milliseconds"),
+    ],
+)
+def test_a_bad_table_is_refused_in_one_line(tmp_path, text, says):
+    with pytest.raises(UserError) as refused:
+        read(table(tmp_path, text))
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_table_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"none\.csv: cannot be read as a table"):
+        load(tmp_path / "none.csv")
+
+
+def test_a_trace_without_places_is_refused(tmp_path):
+    trace, one = load(table(tmp_path)), np.ones(1)
+    with pytest.raises(UserError, match="a physical radio needs vehicles that are somewhere"):
+        trace.deliver(Links(one > 0, one, one, one, one > 0, one > 0), Draws(np.ones((1, 2)), one))
+    assert isinstance(trace, Trace)
