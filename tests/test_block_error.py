@@ -41,5 +41,5 @@ def test_other_codings_have_a_threshold():
 
 
 def test_an_unknown_curve_is_refused_in_one_line():
-    with pytest.raises(UserError, match="'lte-mcs8' is unknown: use one of 11p-mcs2"):
+    with pytest.raises(UserError, match="'lte-mcs8' is unknown: use one of 11p-goubet"):
         block_error("lte-mcs8")

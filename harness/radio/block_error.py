@@ -1,9 +1,10 @@
 """How often a block is lost at a signal-to-interference-and-noise ratio (SINR), by modulation and coding.
 
 Every curve has fast fading in it already, so a model adds none. `block_error_points.csv` has points read off
-3GPP R1-160284 (190 bytes, 280 km/h, vehicles on a highway). `block_error_fits.csv` has logistic curves that
-were fitted to the tables of packet error that come with WiLabV2Xsim (root mean square error 0.012 at most); a
-name says technology, modulation and coding, size and surroundings.
+3GPP R1-160284 (190 bytes, 280 km/h, vehicles on a highway), and those of Goubet et al. (IEEE TVT 64(9), 2015,
+figure 14, L = 1) as Sepulcre et al. use them, over the energy of a bit (`its_g5`). `block_error_fits.csv` has
+logistic curves that were fitted to the tables of packet error that come with WiLabV2Xsim (root mean square
+error 0.012 at most); a name says technology, modulation and coding, size and surroundings.
 """
 
 import csv

@@ -17,24 +17,26 @@ one that hears the sender and ends its back-off in the same slot. What is done o
   air waits for its end. All helpers of an ego are taken to hear each other. `loss` is without that.
 
 As in the source, a block error curve holds for frames of any size, a receiver does not leave a packet that it
-has locked to for a stronger one, and all vehicles of the background are in line of sight.
+has locked to for a stronger one, and all vehicles of the background are in line of sight. A message is one
+frame however long it is; 802.11 would split one of more than 2304 bytes.
 """
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.special import expit, ndtr, ndtri
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtr, ndtri
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.radio import back_off
 from harness.radio.back_off import SLOT_S, free_share
-from harness.radio.channel import NO_SITE, Broadcast, Delivery, Draws, Links, Site, served_s
-from harness.radio.propagation import CLEAR, VEHICLE, Propagation, noise_dbm
+from harness.radio.block_error import block_error
+from harness.radio.channel import CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site, served_s
+from harness.radio.propagation import Propagation, noise_dbm
 
 BANDWIDTH_HZ = 10e6
 SIFS_S, SYMBOL_S, PREAMBLE_S = 32e-6, 8e-6, 40e-6  # IEEE 802.11-2012, 10 MHz OFDM
@@ -42,11 +44,9 @@ SERVICE_AND_TAIL_BITS = 22
 REACH_M, SENSED_M = 1000.0, 1500.0  # of interferers round a receiver; of who is sensed
 CELL_M, STEP_DB, STRONGEST_DB = 10.0, 0.5, 80.0  # of the tables
 QUANTILES = 400  # of shadowing, in `reception`
-# Goubet, Baudais, Gautier, Berder, IEEE TVT 64(9), 2015, Fig. 14, L = 1, as the source has it (24).
-GOUBET_DB = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0)  # energy of a bit over noise density
-GOUBET = (1.0, 1.0, 0.4, 1.5e-2, 4e-3, 3e-3, 2e-3, 1e-3)
-# SINR in dB at which half are lost, and slope, fitted to WiLabV2Xsim's PERcurves of 6 Mb/s and 350 bytes.
-FITS = {"highway-los": (1.08, 1.15), "urban-los": (1.88, 1.19), "crossing-nlos": (4.02, 1.21)}
+RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
+BY_BIT = "11p-goubet"  # a curve over the energy of a bit
+CURVES_MBPS = {"11p-mcs2": 6.0, "11p-mcs4": 12.0}  # what others' names begin with
 IMPLEMENTATION = 0.37  # of Shannon's rate: Wu et al., arXiv 2203.17114
 
 
@@ -54,13 +54,12 @@ class Hazards(NamedTuple):
     """What a packet meets on average, by distance in CELL_M, and by power received in STEP_DB.
 
     Attributes:
-        locked: packets that the receiver is locked to when it comes, `(D,)`.
-        collisions: with packets begun before it or with it; and with others, for each second that it is on
-            air, `(D, P, 2)`.
+        before: packets begun before it or with it that the receiver is locked to or that spoil it, `(D, P)`.
+        during: others that spoil it, for each second that it is on air, `(D, P)`.
     """
 
-    locked: Floats
-    collisions: Floats
+    before: Floats
+    during: Floats
 
 
 @dataclass(frozen=True)
@@ -76,15 +75,15 @@ class ItsG5(Propagation):
         header_bytes: what the layers below add to a packet and to a message.
         data_rate_mbps: of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
         power_dbm: transmitted by everybody.
-        antenna_gain_db: of both antennas together.
+        gain_dbi: gain of each antenna.
         noise_figure_db: of the receiver.
         sensing_dbm: weakest packet that is sensed.
-        aifs_slots: slots after SIFS in which nobody begins; 6 is that of DENM and CAM of lowest priority.
+        aifs_slots: slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663).
         contention_window: back-off is uniform from 0 to so many slots; a broadcast never doubles it.
             There is always one, as after a packet of one's own.
-        block_error: of frames by SINR: `goubet`, the source's, by energy of a bit; or fits to WiLabV2Xsim's
-            curves of 350 bytes, `highway-los`, `urban-los` or `crossing-nlos`. Those of 6 Mb/s hold at other
-            rates by the implementation loss of Wu et al. (arXiv 2203.17114), 0.37 of Shannon's rate.
+        curve: block error of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's, is by
+            energy of a bit, and so for every rate; one of MCS 2 or 4 (6 or 12 Mb/s) holds at another rate
+            shifted by what that needs more, if an implementation reaches 0.37 of Shannon's rate.
     """
 
     frequency_ghz: float = 5.89
@@ -95,13 +94,30 @@ class ItsG5(Propagation):
     header_bytes: int = 30
     data_rate_mbps: float = 6.0
     power_dbm: float = 23.0
-    antenna_gain_db: float = 0.0
+    gain_dbi: float = 0.0
     noise_figure_db: float = 9.0
     sensing_dbm: float = -85.0
     aifs_slots: int = 6
     contention_window: int = 15
-    block_error: Literal["goubet", "highway-los", "urban-los", "crossing-nlos"] = "goubet"
+    curve: str = "11p-goubet"
     needs_site: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are no radio's."""
+        numbers = {
+            "density_per_km": (0.0, 10_000.0), "rate_hz": (0.0, 1000.0), "packet_bytes": (1, 2304),
+            "header_bytes": (0, 2304), "aifs_slots": (0, 15), "contention_window": (1, 1023),
+            "antenna_m": (self.environment_height_m + 0.1, 10.0),
+        }  # fmt: skip
+        for name, (least, most) in numbers.items():
+            if not least <= getattr(self, name) <= most:
+                raise UserError(f"its-g5: {name} is {getattr(self, name)}; it must be from {least} to {most}")
+        if self.data_rate_mbps not in RATES_MBPS:
+            allowed = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
+            raise UserError(f"its-g5: data_rate_mbps is {self.data_rate_mbps}; it must be one of {allowed}")
+        if self.curve != BY_BIT and self.curve[:8] not in CURVES_MBPS:
+            raise UserError(f"its-g5: curve is {self.curve!r}; it must be {BY_BIT} or begin with 11p-mcs")
+        block_error(self.curve)
 
     @property
     def aifs_s(self) -> float:
@@ -132,13 +148,13 @@ class ItsG5(Propagation):
         load = min(self.density_per_km / 1000 * self.rate_hz * self.packet_s * sensed_m, 0.913 / 0.4962)
         return (-0.2481 * load + 0.913) * load + 0.003844 * (load > 0)
 
-    def block_error_rate(self, sinr_db: Floats) -> Floats:
+    def lost_share(self, sinr_db: Floats) -> Floats:
         """Share of frames lost at these ratios of signal to interference and noise."""
-        if self.block_error == "goubet":
-            return np.interp(sinr_db + 10 * math.log10(10 / self.data_rate_mbps), GOUBET_DB, GOUBET)
-        middle_db, slope = FITS[self.block_error]
-        shift_db = _shannon_db(self.data_rate_mbps / 10) - _shannon_db(0.6)
-        return expit(slope * (middle_db + shift_db - sinr_db))
+        if self.curve == BY_BIT:
+            more_db = 10 * math.log10(self.data_rate_mbps * 1e6 / BANDWIDTH_HZ)
+        else:
+            more_db = _shannon_db(self.data_rate_mbps) - _shannon_db(CURVES_MBPS[self.curve[:8]])
+        return block_error(self.curve)(sinr_db - more_db)
 
     def reception(self, distance_m: Floats, sight: Ints | None = None) -> Floats:
         """Share of the background's packets received at these distances `(n,)`, averaged over shadowing.
@@ -149,8 +165,8 @@ class ItsG5(Propagation):
         distance_m = np.asarray(distance_m, dtype=float)[:, None]
 
         def received(sight: Ints | int) -> Floats:
-            found = self._received(distance_m, sight, None, shadow, self.packet_s)
-            return np.asarray(found.mean(axis=-1))
+            unspoilt, spoils_hz = self._fate(distance_m, (sight,), shadow)
+            return np.asarray(np.mean(unspoilt * np.exp(-self.packet_s * spoils_hz), axis=-1))
 
         if sight is not None:
             return received(np.asarray(sight)[:, None])
@@ -159,8 +175,7 @@ class ItsG5(Propagation):
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
         """Probability `(..., H)` that a message of so many bits is lost, given the link's shadowing."""
-        airtime_s = self.message_s(bits)
-        return 1 - self._received(site.distance_m, site.sight, site.corner_m, shadow, airtime_s)
+        return self._lost(self._fate_at(site, shadow), self.message_s(bits))
 
     def request(self, bits: float, draws: Draws) -> Broadcast:
         """Heard when the medium was taken and the frame is through."""
@@ -172,30 +187,43 @@ class ItsG5(Propagation):
         site = links.site
         if site is None:
             raise UserError(NO_SITE)
-        shadow = draws.shadow(site.xy_m, self.decorrelation_m(CLEAR))
-        request_loss = self.loss(site, shadow, links.request_bits)
-        loss = self.loss(site, shadow, links.payload_bits)
+        fate = self._fate_at(site, draws.shadow(site.xy_m, self.decorrelation_m))
         airtime_s = self.message_s(links.payload_bits)
+        request_loss, loss = (self._lost(fate, s) for s in (self.message_s(links.request_bits), airtime_s))
         begins_s = np.where(links.asked, links.ready_s + self.access_s(draws.jitter), np.inf)
         alone = np.sum(_near(begins_s, SLOT_S / 2), axis=-1) == 1
         up = (draws.packet[..., 0] >= request_loss) & (draws.packet[..., 1] >= loss) & alone
         on_air_s = np.where(links.asked, airtime_s, 0.0)
         return Delivery(up, served_s(begins_s, on_air_s, links.range_m), loss, airtime_s)
 
-    def _received(
-        self, distance_m: Floats, sight: Ints | int, corner_m: Floats | None, shadow: Floats,
-        airtime_s: Floats | float,
-    ) -> Floats:  # fmt: skip
-        """Probability that a message so long on air crosses links with this shadowing, standard normal."""
-        mean_dbm = self.power_dbm + self.antenna_gain_db - self.path_loss_db(distance_m, sight, corner_m)
-        power_dbm = mean_dbm + self.shadowing_db(sight, corner_m) * shadow
+    def _lost(self, fate: tuple[Floats, Floats], airtime_s: Floats | float) -> Floats:
+        unspoilt, spoils_hz = fate
+        return 1 - unspoilt * np.exp(-airtime_s * spoils_hz)
+
+    def _fate_at(self, site: Site, shadow: Floats) -> tuple[Floats, Floats]:
+        return self._fate(site.distance_m, (site.sight, site.blocker_m, site.corner_m), shadow)
+
+    def _fate(self, distance_m: Floats, between: tuple[Any, ...], shadow: Floats) -> tuple[Floats, Floats]:
+        """What becomes of messages on links with this shadowing, standard normal.
+
+        Args:
+            distance_m: of the links.
+            between: what `path_loss_db` wants to know besides: sight, blocker and corner.
+            shadow: of the links.
+
+        Returns:
+            Probability that a message gets through all that does not depend on its length; packets that would
+            spoil it, for each second that it is on air.
+        """
+        mean_dbm = self.power_dbm + 2 * self.gain_dbi - self.path_loss_db(distance_m, *between)
+        power_dbm = mean_dbm + self.shadowing_db(*between) * shadow
         sinr_db = power_dbm - noise_dbm(BANDWIDTH_HZ, self.noise_figure_db)
-        locked, collisions = _hazards(self)
+        # A helper that is not there has no place, and the tables must be read somewhere.
         place = np.broadcast_arrays(distance_m / CELL_M, (power_dbm - self.sensing_dbm) / STEP_DB)
-        met = _between(collisions, *place)
-        hazard = _between(locked, place[0]) + met[..., 0] + airtime_s * met[..., 1]
+        at = np.nan_to_num(place)
+        before, during_hz = (map_coordinates(met, at, order=1, mode="nearest") for met in _hazards(self))
         sensed = power_dbm >= self.sensing_dbm
-        return sensed * (1 - self.block_error_rate(sinr_db)) * np.exp(-hazard)
+        return sensed * (1 - self.lost_share(sinr_db)) * np.exp(-before), during_hz
 
     def access_s(self, uniforms: Floats) -> Floats:
         """Seconds from the wish to send until the medium is taken: the quantiles at these draws."""
@@ -204,15 +232,15 @@ class ItsG5(Propagation):
         )
 
 
-def _shannon_db(bits_per_s_hz: float) -> float:
+def _shannon_db(rate_mbps: float) -> float:
     """SINR that a rate needs under the implementation loss."""
-    return 10 * math.log10(2 ** (bits_per_s_hz / IMPLEMENTATION) - 1)
+    return 10 * math.log10(2 ** (rate_mbps * 1e6 / BANDWIDTH_HZ / IMPLEMENTATION) - 1)
 
 
 def _sensed(radio: ItsG5, distance_m: Floats) -> Floats:
     """Probability (13) that vehicles so far apart sense each other's packets."""
-    mean_dbm = radio.power_dbm + radio.antenna_gain_db - radio.path_loss_db(distance_m)
-    return ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db())
+    mean_dbm = radio.power_dbm + 2 * radio.gain_dbi - radio.path_loss_db(distance_m)
+    return np.asarray(ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db()))
 
 
 @lru_cache(maxsize=64)
@@ -233,42 +261,28 @@ def _hazards(radio: ItsG5) -> Hazards:
     locked = (same_slot * nearer + packet_s * hidden) * heard  # (21), (16)
     before = same_slot * ~nearer + packet_s * hidden * (1 - heard)  # (32), (28)
     spoils = _spoils(radio, power_dbm, np.abs(from_receiver_m))
-    collisions = np.stack([(spoils @ before).T, (spoils @ hidden).T], axis=-1)
-    return Hazards(locked.sum(axis=0), collisions)
+    return Hazards(locked.sum(axis=0)[:, None] + (spoils @ before).T, (spoils @ hidden).T)
 
 
 def _overlap(radio: ItsG5, apart_m: Floats) -> Floats:
     """How much of what one vehicle senses another one senses, by the distance between them (20)."""
     sensed = _sensed(radio, np.abs(np.arange(-SENSED_M, SENSED_M + 1)))
     shared = np.correlate(sensed, sensed, "full")[sensed.size - 1 :]
-    return np.interp(apart_m, np.arange(shared.size), shared / shared[0])
+    return np.asarray(np.interp(apart_m, np.arange(shared.size), shared / shared[0]))
 
 
 def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
     """Probability (31) that a packet on air at once spoils one that noise would not, `(P, interferers)`."""
     noise = noise_dbm(BANDWIDTH_HZ, radio.noise_figure_db)
     shadow, weights = np.polynomial.hermite_e.hermegauss(15)
-    mean_dbm = radio.power_dbm + radio.antenna_gain_db - radio.path_loss_db(interferer_m)
+    mean_dbm = radio.power_dbm + 2 * radio.gain_dbi - radio.path_loss_db(interferer_m)
     others_dbm = 10 * np.log10(10 ** (noise / 10) + 10 ** ((mean_dbm + radio.shadowing_db() * shadow) / 10))
-    lost = radio.block_error_rate(power_dbm[:, None, None] - others_dbm) @ (weights / weights.sum())
-    survives = 1 - radio.block_error_rate(power_dbm - noise)[:, None]
-    return np.clip(1 - (1 - lost) / np.maximum(survives, 1e-12), 0.0, 1.0)
+    lost = radio.lost_share(power_dbm[:, None, None] - others_dbm) @ (weights / weights.sum())
+    survives = 1 - radio.lost_share(power_dbm - noise)[:, None]
+    return np.asarray(np.clip(1 - (1 - lost) / np.maximum(survives, 1e-12), 0.0, 1.0))
 
 
 def _near(at: Floats, within: float) -> Bools:
     """Which of these times `(..., H)` are how near each other, `(..., H, H)`; infinite ones to nobody."""
     finite = np.where(np.isfinite(at), at, np.nan)
     return np.asarray(np.abs(finite[..., :, None] - finite[..., None, :]) < within)
-
-
-def _between(table: Floats, *place: Floats) -> Floats:
-    """A table's values between the whole numbers of its leading axes, linearly; beyond, those at its edge."""
-    found: Floats = np.zeros(())
-    lower = [np.fmin(np.fmax(at, 0.0), n - 1.000001) for at, n in zip(place, table.shape, strict=False)]
-    index = [at.astype(np.intp) for at in lower]
-    share = [at - i for at, i in zip(lower, index, strict=True)]
-    for corner in product((0, 1), repeat=len(place)):
-        weight = math.prod(s if up else 1 - s for s, up in zip(share, corner, strict=True))
-        value = table[tuple(i + up for i, up in zip(index, corner, strict=True))]
-        found = found + (weight[..., None] if value.ndim > weight.ndim else weight) * value
-    return found
