@@ -71,7 +71,7 @@ def one_line(said: Said) -> str:
         (["eval", "--model", "replay:nowhere"], "no such run directory"),
         (["eval", "--prompt", "v22"], "unknown prompt 'v22'; did you mean 'v2'?"),
         (["eval", "--prompt", "../prompts/v2"], "unknown prompt '../prompts/v2'"),
-        (["eval", "--condition", "5g"], "unknown operating point '5g'; known: 6g, density-coupled, "),
+        (["eval", "--condition", "5g"], "unknown operating point '5g'; known: 6g, cloud, "),
         (["eval", "--condition", "6g", "--condition", "\x1b[31m"], "unknown operating point"),
         (["eval", "--limit", "0"], "--limit 0: give 1 or more episodes"),
         (["eval", "--limit", "-3"], "--limit -3: give 1 or more episodes"),

@@ -54,6 +54,18 @@ def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
     assert not decision.deadline_missed
 
 
+def test_from_a_cloud_the_ego_has_its_intent_after_the_round_trip_and_asks_nobody():
+    for own_s in (0.145, 2.0, np.nan):
+        decision = play(POINTS["cloud"], inference_s=(own_s, 0.1, 0.1, 0.1))
+        assert decision.messages == 0
+        assert decision.latency_s == 0.51
+        assert decision.deadline_missed
+    sooner = replace(POINTS["cloud"], round_trip_s=0.15)
+    assert not play(sooner).deadline_missed
+    # With a radio too, it asks once the cloud has answered.
+    assert play(replace(SIXG, round_trip_s=0.3)).arrival_s.min() > 0.3
+
+
 def test_over_v2x_the_third_reply_is_late_and_not_fused_but_waited_for():
     """A request of 40 us, slots of 25.1 ms: replies end at 170.14, 195.24 and 220.34 ms.
 

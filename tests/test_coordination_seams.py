@@ -17,8 +17,9 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
-from harness.radio.channel import Channel, Draws, Links
+from harness.radio.channel import Channel, Draws, Links, Site
 from harness.radio.constant import Radio
+from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
 
 
@@ -139,8 +140,14 @@ def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws
         np.where(asked, rng.uniform(0, 8000, shape), np.nan),
         asked | (rng.random(shape) < 0.5),
         asked & (rng.random(shape) < 0.5),
-    )
-    return links, Draws(rng.random((*shape, 2)), rng.random(shape))
+        400.0,
+        Site(
+            rng.uniform(-90, 90, (shape[0], 1 + shape[1], 2)), rng.integers(0, 3, shape),
+            rng.choice([0.0, 1.5, 3.6], shape), rng.choice([30.0, np.nan], (*shape, 1)) * np.ones(2),
+        ),
+    )  # fmt: skip
+    trips = Trips(rng.integers(0, 3, shape[0]), rng.integers(0, 9, shape[0]), rng.integers(0, 6, shape[0]), 6)
+    return links, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
 
 
 @pytest.mark.parametrize("name", [*CHANNELS, "fog"])

@@ -10,7 +10,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.trace import Trace, load, read
+from harness.radio.trace import Trace, of_profile, read
 
 PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"
 SIGHTED = (
@@ -25,6 +25,10 @@ def table(tmp_path: Path, text: str = PLAIN) -> Path:
     return path
 
 
+def load(path: Path, **settings: object) -> Trace:
+    return of_profile({"file": path.name, **settings}, path.parent, "channel file mine.toml [parameters]")
+
+
 def sites(distances_m: list[float], sight: list[int]) -> Site:
     there = np.stack([np.array([0.0, *distances_m]), np.zeros(1 + len(distances_m))], axis=-1)
     return Site(there, np.array(sight), np.zeros(len(sight)), np.full((len(sight), 2), np.nan))
@@ -36,9 +40,8 @@ def test_reception_is_on_straight_lines_between_rows_held_before_them_and_zero_a
     assert trace.reception(at).tolist() == pytest.approx([0.8, 0.8, 0.65, 0.2, 0.0])
     held = load(table(tmp_path), beyond="held")
     assert held.reception(at).tolist() == pytest.approx([0.8, 0.8, 0.65, 0.2, 0.2])
-    assert (trace.file, trace.sha256) == (
-        str(tmp_path / "run.csv"), hashlib.sha256(PLAIN.encode()).hexdigest()
-    )  # fmt: skip
+    assert trace.receptions.file == "run.csv"
+    assert trace.receptions.sha256 == hashlib.sha256(PLAIN.encode()).hexdigest()
     assert math.isnan(trace.busy_ratio())
 
 
@@ -110,3 +113,22 @@ def test_a_trace_without_places_is_refused(tmp_path):
     with pytest.raises(UserError, match="a physical radio needs vehicles that are somewhere"):
         trace.deliver(Links(one > 0, one, one, one, one > 0, one > 0), Draws(np.ones((1, 2)), one))
     assert isinstance(trace, Trace)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "says"),
+    [
+        ({}, "has no file; add it"),
+        ({"file": 7}, "has no file; add it"),
+        ({"file": "nowhere.csv"}, "cannot be read as a table"),
+        ({"file": "run.csv", "beyond": "on"}, "known: held, zero"),
+        ({"file": "run.csv", "latency_s": -1}, "latency_s = -1; allowed: seconds, 0 or more"),
+        ({"file": "run.csv", "latency": 1}, "did you mean 'latency_s'?"),
+    ],
+)
+def test_a_mistake_in_a_profile_is_one_line(tmp_path, parameters, says):
+    table(tmp_path)
+    with pytest.raises(UserError) as error:
+        of_profile(parameters, tmp_path, "mine.toml [parameters]")
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)

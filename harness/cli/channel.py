@@ -1,19 +1,21 @@
 """`harness channel`: the radios that a condition can name, what each rests on, and how far it reaches."""
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
 from harness.cli.estimates import echo_json, table
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
 
 app = typer.Typer(help="List radios, show one, or hold one against what is published.", no_args_is_help=True)
 
+FORMATS = ("svg", "pdf", "png")
 Name = typer.Argument(help="Profile, or a change of one: `mode4:density_per_km=200`.", metavar="NAME")
 
 
@@ -83,6 +85,104 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     table(heads, [(f"{d} m", *(f"{100 * share:.1f}" for share in row)) for d, *row in shares])
     if busy is not None and not np.isnan(busy):
         typer.echo(f"channel busy ratio {busy:.3f} under the background load")
+
+
+@app.command()
+def check(
+    name: str = Name,
+    n: int = typer.Option(2000, "-n", min=100, max=100_000, help="Trips at each distance."),
+    against: list[Path] | None = typer.Option(
+        None, help="Somebody's curve: a CSV with distance_m and reception. May be given several times."
+    ),
+    out: Path | None = typer.Option(None, help="Picture to write: .svg, .pdf or .png."),
+    as_json: options.Json = False,
+) -> None:
+    """Hold a radio against what it delivers and what is published.
+
+    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Published curves are taken
+    at their own settings.
+    """
+    import numpy as np
+
+    from harness.core.figures import as_mapping, shown
+    from harness.radio.channel import Physical
+    from harness.radio.profiles import CHANNELS, outside
+    from harness.radio.trace import read
+    from harness.studies.reception import DISTANCES_M, SIGHTS, Published, compared, drawn, published
+
+    profile, channel = _of(name)
+    if not isinstance(channel, Physical):
+        raise UserError(f"{printable(name)} loses the same at any distance; there is no curve to check")
+    if out and out.suffix[1:] not in FORMATS:
+        raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
+    where = f"channel profile {profile}"
+    messages = drawn(channel, DISTANCES_M, n)
+    of_others = [compared(CHANNELS[profile], curve, where) for curve in published(profile)]
+    for path in against or ():
+        points = [point for point in read(path) if point.sight in (None, "clear")]
+        curve = np.array([(point.distance_m, point.reception) for point in points])
+        of_others.append(compared(channel, Published("", str(path), *curve.T), where))
+    model = channel.reception(np.array(DISTANCES_M, dtype=float), SIGHTS["clear"]).tolist()
+    beyond = outside(CHANNELS.profile(profile), channel)
+    if out:
+        from harness.report.drawing.pictures import save
+        from harness.studies.figures import reception
+
+        every = np.linspace(1, DISTANCES_M[-1], 250)
+        curves = {sight: channel.reception(every, code) for sight, code in SIGHTS.items()}
+        save(reception(name, curves, every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
+    if as_json:
+        echo_json({
+            "name": name, "n": n, "outside": beyond,
+            "messages": [
+                {"distance_m": m.distance_m, "model": share, "crossing": as_mapping(m.crossing),
+                 "round_trip": as_mapping(m.round_trip), "delay_s": m.delay_s}
+                for m, share in zip(messages, model, strict=True)
+            ],
+            "published": [
+                {"configuration": c.curve.configuration, "source": c.curve.source, "n": len(c.reception),
+                 "mean_difference": c.mean_difference, "largest_difference": c.largest_difference}
+                for c in of_others
+            ],
+        })  # fmt: skip
+        return
+    heads = ["in sight", "model %", "one message %", "round trip %", "delay ms"]
+    table(
+        heads,
+        [
+            (
+                f"{m.distance_m:g} m",
+                f"{100 * share:.1f}",
+                shown(m.crossing),
+                shown(m.round_trip),
+                f"{1000 * m.delay_s:.1f}",
+            )
+            for m, share in zip(messages, model, strict=True)
+        ],
+    )
+    typer.echo(f"n = {n} trips a distance, each with shadowing of its own; 95 % intervals")
+    for line in beyond:
+        typer.echo(f"outside its source's range: {line}")
+    if of_others:
+        typer.echo()
+        table(
+            ["published curve", "points", "mean apart", "largest"],
+            [
+                (
+                    c.curve.configuration or c.curve.source,
+                    str(len(c.reception)),
+                    f"{100 * c.mean_difference:.1f}",
+                    f"{100 * c.largest_difference:+.1f}",
+                )
+                for c in of_others
+            ],
+        )
+        mean = 100 * float(np.mean([c.mean_difference for c in of_others]))
+        typer.echo(f"{len(of_others)} curves, {mean:.1f} points apart on average; model less published")
+        sources = dict.fromkeys(c.curve.source for c in of_others)
+        typer.echo(printable("; ".join(sources), 1000))
+    if out:
+        typer.echo(f"wrote {printable(out)}")
 
 
 def _of(text: str) -> "tuple[str, Channel]":

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from harness.coordination.consensus import EGO_PROMPT, RULES, Messages, inverse_distance_weights
-from harness.coordination.exchange import Exchange, exchange
+from harness.coordination.exchange import Exchange, exchange, inferred_s
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
@@ -106,7 +106,7 @@ def fuse(
         fused=fused,
         action=np.argmax(fused, axis=-1),
         fusion_failed=failed,
-        latency_s=np.where(np.isnan(intents.inference_s[..., 0]), np.nan, latency_s),
+        latency_s=np.where(np.isnan(inferred_s(point, intents)[..., 0]), np.nan, latency_s),
         deadline_missed=latency_s > point.window_s,
         state=state,
     )

@@ -112,7 +112,8 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
     unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
 
-    inference_s = np.where(np.isnan(intents.inference_s), 0.0, intents.inference_s)
+    inference_s = inferred_s(point, intents)
+    inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
     channel = point.channel()
     heard_s, air_s = channel.request(point.request_bits, draws)
@@ -143,6 +144,13 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         on_time=arrival_s <= point.window_s,
         exchange_s=np.maximum(inference_s[..., 0], np.max(ends_s, axis=-1, initial=0.0)),
     )
+
+
+def inferred_s(point: OperatingPoint, intents: Intents) -> Floats:
+    """Seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
+    if point.round_trip_s is None:
+        return intents.inference_s
+    return np.insert(intents.inference_s[..., 1:], 0, point.round_trip_s, axis=-1)
 
 
 def fallback_intent(fallback: str, n_actions: int) -> Floats:

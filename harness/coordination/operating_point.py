@@ -44,6 +44,8 @@ class OperatingPoint:
         messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
             (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
             gain of what helpers see.
+        round_trip_s: seconds from the ego's question to the answer of a model in a cloud, in place of its own
+            inference.
         radio: further settings of the profile's channel, in place of its own:
             `density_per_km=200,power_dbm=23`.
     """
@@ -66,6 +68,7 @@ class OperatingPoint:
     roadside_edge: bool = False
     on_demand: bool = False
     messages: str = "own"
+    round_trip_s: float | None = None
     radio: str = ""
 
     def __post_init__(self) -> None:
@@ -90,6 +93,8 @@ class OperatingPoint:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)
         if self.latency_s is not None:
             self._number("latency_s", "seconds, 0 or more", zero=True)
+        if self.round_trip_s is not None:
+            self._number("round_trip_s", "seconds, 0 or more", zero=True)
         if type(self.max_helpers) is not int or self.max_helpers < 0:
             raise self._wrong("max_helpers", "a whole number, 0 or more")
         for flag in ("density_coupled", "helper_rounds", "roadside_edge", "on_demand"):
@@ -167,6 +172,7 @@ POINTS = {
         OperatingPoint("single-local", None),
         OperatingPoint("v2x", "v2x"),
         OperatingPoint("6g", "6g"),
+        OperatingPoint("cloud", None, round_trip_s=0.51),  # the paper's cloud reference, which it cites
     )
 }
 

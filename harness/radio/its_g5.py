@@ -156,7 +156,7 @@ class ItsG5(Propagation):
             more_db = _shannon_db(self.data_rate_mbps) - _shannon_db(CURVES_MBPS[self.curve[:8]])
         return block_error(self.curve)(sinr_db - more_db)
 
-    def reception(self, distance_m: Floats, sight: Ints | None = None) -> Floats:
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of the background's packets received at these distances `(n,)`, averaged over shadowing.
 
         Without `sight` over links clear and blocked too, where the environment has shares of them.
@@ -169,7 +169,7 @@ class ItsG5(Propagation):
             return np.asarray(np.mean(unspoilt * np.exp(-self.packet_s * spoils_hz), axis=-1))
 
         if sight is not None:
-            return received(np.asarray(sight)[:, None])
+            return received(np.broadcast_to(sight, distance_m.shape[:1])[:, None])
         clear = self.clear_probability(distance_m[:, 0])
         return clear * received(CLEAR) + (1 - clear) * received(VEHICLE)
 

@@ -17,12 +17,18 @@ from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.resources import entries, find
+from harness.radio import trace
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
+from harness.radio.its_g5 import ItsG5
+from harness.radio.lte_mode4 import LteMode4
 
 # Name of a model to what makes a channel of a file's parameters, its folder, and what to call it in messages.
 MODELS: dict[str, Callable[[Mapping[str, Any], Path, str], Channel]] = {
     "constant": lambda parameters, folder, where: convert(parameters, Radio, where),
+    "lte-v2x-mode4": lambda parameters, folder, where: convert(parameters, LteMode4, where),
+    "its-g5": lambda parameters, folder, where: convert(parameters, ItsG5, where),
+    "trace": trace.of_profile,
 }
 
 

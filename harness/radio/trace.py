@@ -6,8 +6,8 @@ interpolated on a straight line; nearer than the first they are the first's.
 """
 
 import csv
-import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
+from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import sha256_file
 from harness.radio.channel import BUILDING, CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
 from harness.radio.constant import link_up
 
@@ -41,6 +43,21 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Table:
+    """A file of receptions.
+
+    Attributes:
+        file: where it was read.
+        sha256: of the file.
+        points: its rows.
+    """
+
+    file: str
+    sha256: str
+    points: tuple[Point, ...]
+
+
+@dataclass(frozen=True)
 class Trace:
     """A channel that receives as a table says.
 
@@ -49,22 +66,18 @@ class Trace:
     longest latency is over.
 
     Attributes:
-        file: where the table was read.
-        sha256: of the file.
-        points: its rows.
+        receptions: the table.
         latency_s: of each message, where the table has none.
         beyond: reception farther away than the last distance: `zero`, since a table usually ends where
             packets do and none was measured beyond, or `held`, the last row's, for one that ends early.
     """
 
-    file: str
-    sha256: str
-    points: tuple[Point, ...]
-    latency_s: float = 0.025
+    receptions: Table
+    latency_s: Seconds = 0.025
     beyond: Literal["zero", "held"] = "zero"
     needs_site: ClassVar[bool] = True
 
-    def reception(self, distance_m: Floats, sight: Ints | None = None) -> Floats:
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of packets received at these distances; in clear sight if nothing else is said."""
         return self._at(distance_m, CLEAR if sight is None else sight, "reception")
 
@@ -78,7 +91,7 @@ class Trace:
 
     def request(self, bits: float, draws: Draws) -> Broadcast:
         """Heard when the longest latency is over; how much of it is time on air is not known."""
-        return Broadcast(max(self._latency_s(p) for p in self.points), math.nan)
+        return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Each link has the loss and the latency of its distance."""
@@ -96,7 +109,7 @@ class Trace:
         """A column of the table at these distances, under what stands between."""
         found = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
         for name, number in SIGHTS.items():
-            rows = [p for p in self.points if p.sight in (None, name)]
+            rows = [p for p in self.receptions.points if p.sight in (None, name)]
             column = [p.reception if what == "reception" else self._latency_s(p) for p in rows]
             last = 0.0 if (what, self.beyond) == ("reception", "zero") else None
             curve = np.interp(distance_m, [p.distance_m for p in rows], column, right=last)
@@ -104,10 +117,15 @@ class Trace:
         return found
 
 
-def load(path: Path, **settings: Any) -> Trace:
-    """The channel of a table, with other fields of `Trace` by name. Raises UserError."""
+def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
+    """The channel of a profile that names a `file` beside it. Raises UserError."""
+    if not isinstance(parameters.get("file"), str):
+        raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
+    path = folder / parameters["file"]
     points = read(path)
-    return Trace(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), points, **settings)
+    table = Table(parameters["file"], sha256_file(path), points)
+    rest = {key: value for key, value in parameters.items() if key != "file"}
+    return convert(rest, Trace, where, receptions=table)
 
 
 def read(path: Path) -> tuple[Point, ...]:

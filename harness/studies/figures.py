@@ -1,6 +1,6 @@
 """Pictures of a study, for print: conditions compared, changes along an axis, frozen against closed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,9 +8,11 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 
+from harness.core.arrays import Floats
 from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE, conditions
 from harness.report.drawing.pictures import styled
 from harness.studies.axes import CORE, axis_of
+from harness.studies.reception import Compared, Drawn
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -228,3 +230,42 @@ def _plain(axes: Any, lines: str) -> None:
 def _lettered(drawn: Any) -> None:
     for axes, letter in zip(drawn, "abcdefg", strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=8)
+
+
+@styled
+def reception(
+    name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: Sequence[Drawn],
+    against: Sequence[Compared],
+) -> Figure:  # fmt: skip
+    """A radio's reception against distance, and beside it, if there are any, against published points.
+
+    Args:
+        name: of the condition.
+        curves: label of what stands between, and reception at `distances_m`.
+        distances_m: `(n,)`.
+        messages: what was drawn in sight.
+        against: published curves.
+    """
+    figure = Figure(figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    axes = figure.add_subplot(1, 2 if against else 1, 1)
+    for (label, curve), colour, dashes in zip(curves.items(), COLOURS, ("-", "--", ":"), strict=False):
+        axes.plot(distances_m, 100 * curve, dashes, color=colour, linewidth=1.4, label=label)
+    crossing = [each.crossing for each in messages]
+    value, low, high = 100 * np.array([(each.value, each.low, each.high) for each in crossing]).T
+    axes.errorbar(
+        [each.distance_m for each in messages], value, yerr=[value - low, high - value], fmt="o", color=INK,
+        markersize=2.5, capsize=2, linewidth=0.8, label=f"messages, n = {crossing[0].n} each",
+    )  # fmt: skip
+    axes.set(xlabel="distance, m", ylabel="received, %", ylim=(-2, 102), xlim=(0, None))
+    axes.set_title(name, fontsize=8)
+    axes.legend(fontsize=6, frameon=False)
+    if against:
+        axes = figure.add_subplot(1, 2, 2)
+        axes.axline((0, 0), (100, 100), color=GREY, linewidth=0.8)
+        for each in against:
+            axes.plot(100 * each.curve.reception, 100 * each.reception, ".", color=COLOURS[0], markersize=2.5)
+        mean = 100 * np.mean([each.mean_difference for each in against])
+        axes.set(xlabel="published, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal")
+        curves_ = f"{len(against)} published curve{'s' * (len(against) != 1)}"
+        axes.set_title(f"{curves_}, {mean:.1f} points apart on average", fontsize=8)
+    return figure

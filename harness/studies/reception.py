@@ -1,17 +1,21 @@
 """Reception against distance: a channel's own curve, the messages it delivers, and what others published."""
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 
 import numpy as np
 
+from harness.coordination.operating_point import pairs
+from harness.core.arrays import Floats
 from harness.core.statistics import Estimate, rate_interval
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Physical, Site
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
+from harness.radio.profiles import changed
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
-BLOCKER_M = {"clear": 0.0, "vehicle": 1.5, "building": 0.0}  # a car's height
 PAYLOAD_BITS = 800.0
 
 
@@ -32,16 +36,16 @@ class Drawn:
     delay_s: float
 
 
-def drawn(channel: Physical, distances_m: Sequence[float], sight: str, n: int, seed: int = 0) -> list[Drawn]:
-    """`n` trips with one helper at each distance, along one road."""
+def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
+    """`n` trips with one helper at each distance, in sight along one road."""
     result = []
     for distance_m in distances_m:
         trips = Trips(np.arange(n), np.full(n, seed), np.zeros(n, dtype=int), 1)
         draws = Draws(trips.uniforms(1)[:, None, 1:], trips.uniforms(1)[:, :1], trips)
         shape = (n, 1)
         site = Site(
-            np.broadcast_to([[0.0, 0.0], [distance_m, 0.0]], (n, 2, 2)), np.full(shape, SIGHTS[sight]),
-            np.full(shape, BLOCKER_M[sight]), np.full((n, 1, 2), np.nan),
+            np.broadcast_to([[0.0, 0.0], [distance_m, 0.0]], (n, 2, 2)), np.full(shape, CLEAR),
+            np.zeros(shape), np.full((n, 1, 2), np.nan),
         )  # fmt: skip
         ones = np.ones(shape, dtype=bool)
         heard_s = np.broadcast_to(np.asarray(channel.request(400.0, draws).heard_s).reshape(-1, 1), shape)
@@ -54,3 +58,63 @@ def drawn(channel: Physical, distances_m: Sequence[float], sight: str, n: int, s
         crossing, round_trip = (rate_interval(each[:, 0].astype(float)) for each in (crossed, up))
         result.append(Drawn(distance_m, crossing, round_trip, float(delay_s.mean())))
     return result
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published curve.
+
+    Attributes:
+        configuration: settings of a channel that are the publication's, as a condition has them.
+        source: the publication, or the file.
+        distance_m: `(n,)`.
+        reception: `(n,)` shares.
+    """
+
+    configuration: str
+    source: str
+    distance_m: Floats
+    reception: Floats
+
+
+def published(profile: str) -> list[Published]:
+    """Curves that the harness has for a profile, out of `harness/radio/published/`."""
+    table = files("harness.radio") / "published" / f"{profile}.csv"
+    if not table.is_file():
+        return []
+    curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
+        point = float(row["distance_m"]), float(row["reception"])
+        curves.setdefault((row["configuration"], row["source"]), []).append(point)
+    return [Published(*key, *np.array(points).T) for key, points in curves.items()]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A model held against a published curve.
+
+    Attributes:
+        curve: the curve.
+        reception: the model's at its distances, `(n,)`.
+    """
+
+    curve: Published
+    reception: Floats
+
+    @property
+    def mean_difference(self) -> float:
+        """Mean absolute difference over the curve's points, a share."""
+        return float(np.abs(self.reception - self.curve.reception).mean())
+
+    @property
+    def largest_difference(self) -> float:
+        """The difference that is largest, model less published, a share."""
+        apart = self.reception - self.curve.reception
+        return float(apart[np.abs(apart).argmax()])
+
+
+def compared(channel: Channel, curve: Published, where: str) -> Compared:
+    """The channel, with the curve's settings, against the curve. Raises UserError for one it has not."""
+    there = changed(channel, pairs(curve.configuration), where)
+    assert isinstance(there, Physical)
+    return Compared(curve, there.reception(curve.distance_m))
