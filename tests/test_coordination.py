@@ -12,7 +12,7 @@ import pytest
 
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.operating_point import CLOUD, POINTS, OperatingPoint
 from harness.radio.channel import Draws
 
 DOUBT = (0.3, 0.4, 0.3)
@@ -56,11 +56,11 @@ def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
 
 def test_from_a_cloud_the_ego_has_its_intent_after_the_round_trip_and_asks_nobody():
     for own_s in (0.145, 2.0, np.nan):
-        decision = play(POINTS["cloud"], inference_s=(own_s, 0.1, 0.1, 0.1))
+        decision = play(CLOUD, inference_s=(own_s, 0.1, 0.1, 0.1))
         assert decision.messages == 0
         assert decision.latency_s == 0.51
         assert decision.deadline_missed
-    sooner = replace(POINTS["cloud"], round_trip_s=0.15)
+    sooner = replace(CLOUD, round_trip_s=0.15)
     assert not play(sooner).deadline_missed
     # With a radio too, it asks once the cloud has answered.
     assert play(replace(SIXG, round_trip_s=0.3)).arrival_s.min() > 0.3

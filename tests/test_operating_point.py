@@ -11,16 +11,19 @@ from harness.radio.profiles import CHANNELS
 from harness.studies.axes import AXES
 
 
-def test_the_papers_operating_points_differ_only_in_the_channel_and_in_where_the_ego_asks():
+def test_the_paper_has_three_operating_points_that_differ_only_in_the_channel():
     assert {name: point.profile for name, point in POINTS.items()} == {
         "single-local": None,
         "v2x": "v2x",
         "6g": "6g",
-        "cloud": None,
     }
-    alike = {replace(point, name="x", profile=None, round_trip_s=None) for point in POINTS.values()}
-    assert len(alike) == 1
-    assert {point.round_trip_s for point in POINTS.values()} == {None, 0.51}
+    assert len({replace(point, name="x", profile=None) for point in POINTS.values()}) == 1
+
+
+def test_the_cloud_is_the_lone_ego_with_a_round_trip():
+    assert named_point("cloud") == replace(POINTS["single-local"], name="cloud", round_trip_s=0.51)
+    assert named_point("cloud:round_trip_s=0.3").round_trip_s == 0.3
+    assert named_point("6g:round_trip_s=0.3").round_trip_s == 0.3
 
 
 @pytest.mark.parametrize("point", POINTS.values(), ids=POINTS)
