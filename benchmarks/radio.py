@@ -17,9 +17,15 @@ import numpy as np
 
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
+from harness.radio.its_g5 import ItsG5
 from harness.radio.lte_mode4 import LteMode4
+from harness.radio.nr_mode2 import NrMode2
 
-MODELS = {"lte-v2x-mode4": LteMode4(density_per_km=200.0)}
+MODELS = {
+    "lte-v2x-mode4": LteMode4(density_per_km=200.0),
+    "nr-v2x-mode2": NrMode2(density_per_km=200.0),
+    "its-g5": ItsG5(density_per_km=200.0),
+}
 AIM_S = 1.0
 HELPERS, STEPS = 3, 20
 

@@ -13,10 +13,12 @@ from harness.radio.block_error import block_error
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
 from harness.radio.lte_mode4 import LteMode4
+from harness.radio.nr_mode2 import NrMode2
 from harness.radio.sps import Scheduling, taken
 
 QUIET = LteMode4(density_per_km=0.0)
 BUSY = LteMode4(density_per_km=200.0)
+NR = NrMode2(density_per_km=200.0)
 NOISE_DBM = -95 + 10 * np.log10(10 / 50)
 LOST = block_error("lte-qpsk-0.7-190B")
 
@@ -93,7 +95,7 @@ def test_collisions_are_those_of_the_equations(distance_m):
     assert BUSY.reception(np.array([distance_m]))[0] == pytest.approx(expected, abs=0.01)
 
 
-@pytest.mark.parametrize("radio", [BUSY, replace(BUSY, transmissions=2), replace(BUSY, subchannels=2)])
+@pytest.mark.parametrize("radio", [BUSY, replace(BUSY, transmissions=2), replace(BUSY, subchannels=2), NR])
 @pytest.mark.parametrize("sight", [CLEAR, VEHICLE, BUILDING])
 def test_loss_averaged_over_shadowing_is_the_curve(radio, sight):
     distances_m = np.array([20.0, 55, 100, 160, 250, 333, 450])
@@ -177,13 +179,58 @@ def test_a_helper_that_is_not_there_changes_nobody():
 
 def test_settings_that_are_no_radio_s_are_refused():
     with pytest.raises(UserError, match="subchannels is 3: block errors are known for 2 and 4"):
-        replace(QUIET, **{"subchannels": 3})
+        replace(QUIET, subchannels=3)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="t2_slots is 0: give 1 or more"):
         LteMode4(t2_slots=0)
     with pytest.raises(UserError, match=r"density_per_km is nan: give 0\.0 or more"):
         LteMode4(density_per_km=np.nan)
     with pytest.raises(UserError, match="physical radio"):
         BUSY.deliver(replace(links(place([50]), 1, 1), site=None), draws(1, 1))
+
+
+# NR Mode 2.
+
+
+@pytest.mark.parametrize(("numerology", "wait_ms"), [(0, 17.5), (1, 8.75), (2, 4.375)])
+def test_a_message_in_nr_waits_17_5_slots_on_average(numerology, wait_ms):
+    radio = replace(NR, numerology=numerology)
+    asked = radio.request(400.0, draws(20_000, 1))
+    assert np.mean(asked.heard_s) - asked.airtime_s == pytest.approx(wait_ms / 1000, rel=0.01)
+    assert asked.airtime_s == pytest.approx(0.001 / 2**numerology)
+
+
+def test_half_duplex_is_a_slot_a_packet():
+    for numerology, missed in ((0, 0.01), (1, 0.005), (2, 0.0025)):
+        radio = replace(NR, density_per_km=0.0, numerology=numerology)  # type: ignore[arg-type]
+        assert radio.loss(place([5]), np.zeros(1), 800.0)[0] == pytest.approx(missed)
+
+
+def test_a_packet_takes_the_sub_channels_that_it_needs():
+    # At 15 kHz a block has 132 data symbols of 2 * 526 / 1024 bits, 135.6 bits: 1 520 bits need 11.2.
+    radio = NrMode2(bandwidth_mhz=10, subchannel_blocks=10, mcs=7, packet_bytes=190)
+    assert radio.block_bits == int(20 * 132 * 2 * 526 / 1024)
+    assert radio.blocks_per_slot == 52 // 10 // 2
+    assert radio.noise_dbm == pytest.approx(-174 + 10 * np.log10(20 * 180e3) + 9)
+    assert radio.block_error(np.array(9.15)) == pytest.approx(0.5), "the curve of MCS 7"
+    # MCS 14: 4 * 553 / 1024 = 2.16 bits, 2^(2.16 / 0.4) - 1 = 41.2, 16.1 dB.
+    assert NR.block_error(np.array([16.1, 16.2])).tolist() == [1.0, 0.0]
+    with pytest.raises(UserError, match="raise bandwidth_mhz or mcs"):
+        replace(radio, numerology=2, packet_bytes=300)
+
+
+def test_the_selection_window_is_in_the_delay_alone():
+    distances_m = np.arange(20.0, 500, 20)
+    short = replace(NR, t2_slots=17)
+    np.testing.assert_array_equal(NR.reception(distances_m), short.reception(distances_m))
+    uniform = draws(1000, 1)
+    assert np.mean(short.request(400.0, uniform).heard_s) < np.mean(NR.request(400.0, uniform).heard_s)
+
+
+def test_twice_the_bandwidth_in_half_as_long_slots_is_half_as_busy():
+    coarse = NrMode2(density_per_km=20.0, bandwidth_mhz=20)
+    fine = replace(coarse, bandwidth_mhz=40, numerology=1)
+    assert coarse.blocks_per_slot == fine.blocks_per_slot == 2
+    assert fine.busy_ratio() == pytest.approx(coarse.busy_ratio() / 2, rel=0.05)
 
 
 # Semi-persistent scheduling.

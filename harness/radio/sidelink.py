@@ -93,7 +93,7 @@ class Sidelink(Propagation):
     @property
     @abstractmethod
     def block_bits(self) -> int:
-        """Size of a background packet; a larger message takes several such blocks, and each must cross."""
+        """What one block carries; a larger message takes several, and each must cross."""
 
     @property
     @abstractmethod

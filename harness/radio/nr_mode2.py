@@ -1,0 +1,119 @@
+"""NR-V2X Mode 2: vehicles choose their resources themselves, by what control information they decoded.
+
+The model of Mode 4 with slots for subframes and without ranking: a vehicle takes any resource that it has
+not sensed as taken (TS 38.214, 8.1.4), which is Step 2 of that model alone. The chance that two vehicles
+choose the same does not depend on the length of the selection window, if all have the same (Brady, Cao and
+Roy, arXiv 2309.16680: the overlap of two windows cancels); the window is in the delay alone. Re-evaluation
+shortly before sending is not modelled.
+
+Defaults are those of 5G-LENA's highway example: 40 MHz at 5.89 GHz, numerology 0, MCS 14, sub-channels of 50
+resource blocks, packets of 200 bytes, window of slots 2 to 33, no resource kept. What it senses is the power
+in the control channel; the sensing threshold here is Mode 4's.
+"""
+
+import csv
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import ClassVar, Literal
+
+from harness.core.errors import UserError
+from harness.radio.block_error import BlockError, block_error, threshold
+from harness.radio.propagation import Environment, noise_dbm
+from harness.radio.sidelink import Sidelink
+
+# Resource blocks by bandwidth in MHz, for subcarriers of 15, 30 and 60 kHz (TS 38.101-1, table 5.3.2-1).
+BLOCKS = {10: (52, 24, 11), 20: (106, 51, 24), 30: (160, 78, 38), 40: (216, 106, 51)}
+
+# Of 12 subcarriers in 13 symbols, those with reference signals, by numerology (WiLabV2Xsim's).
+REFERENCES = (24, 18, 12)
+
+CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
+EFFICIENCY = 0.4
+"""Of codings without a curve: `threshold`."""
+
+
+@dataclass(frozen=True)
+class NrMode2(Sidelink):
+    """Mode 2 in one resource pool.
+
+    Attributes:
+        bandwidth_mhz: 10, 20, 30 or 40.
+        numerology: 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz.
+        subchannel_blocks: resource blocks of a sub-channel. A packet takes as many of these as it needs.
+        mcs: modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block error,
+            the others a threshold of SINR.
+        packet_bytes: of a background packet.
+    """
+
+    environment: Environment = "tr37885-highway"
+    frequency_ghz: float = 5.89
+    t1_slots: int = 2
+    t2_slots: int = 33
+    bandwidth_mhz: Literal[10, 20, 30, 40] = 40
+    numerology: Literal[0, 1, 2] = 0
+    subchannel_blocks: int = 50
+    mcs: int = 14
+    packet_bytes: int = 200
+    ranks: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are no radio's."""
+        super().__post_init__()
+        numbers = {"mcs": (0, 28), "packet_bytes": (1, 10_000), "subchannel_blocks": (10, 100)}
+        for name, (least, most) in numbers.items():
+            if not least <= getattr(self, name) <= most:
+                raise UserError(f"{name} is {getattr(self, name)}: give {least} to {most}")
+        if self.bandwidth_mhz not in BLOCKS or self.numerology not in (0, 1, 2):
+            raise UserError(
+                f"bandwidth_mhz is {self.bandwidth_mhz} and numerology {self.numerology}: "
+                "give 10, 20, 30 or 40, and 0, 1 or 2"
+            )
+        if self.blocks_per_slot < 1:
+            raise UserError(
+                f"a packet of {self.packet_bytes} bytes needs {self._subchannels} sub-channels of "
+                f"{self.subchannel_blocks} resource blocks, and {self.bandwidth_mhz} MHz have "
+                f"{BLOCKS[self.bandwidth_mhz][self.numerology]} blocks: raise bandwidth_mhz or mcs"
+            )
+
+    @property
+    def slot_s(self) -> float:
+        return 0.001 / 2**self.numerology
+
+    @property
+    def blocks_per_slot(self) -> int:
+        return BLOCKS[self.bandwidth_mhz][self.numerology] // self.subchannel_blocks // self._subchannels
+
+    @property
+    def block_bits(self) -> int:
+        """What the packet's sub-channels carry."""
+        return int(self._subchannels * self._subchannel_bits)
+
+    @property
+    def noise_dbm(self) -> float:
+        width_hz = 180e3 * 2**self.numerology * self.subchannel_blocks * self._subchannels
+        return noise_dbm(width_hz, self.noise_figure_db)
+
+    @property
+    def block_error(self) -> BlockError:
+        if self.mcs in CURVES:
+            return block_error(CURVES[self.mcs])
+        return threshold(_bits_per_s_per_hz()[self.mcs], EFFICIENCY)
+
+    @property
+    def _subchannel_bits(self) -> float:
+        data = 12 * 13 - REFERENCES[self.numerology]
+        return self.subchannel_blocks * data * _bits_per_s_per_hz()[self.mcs]
+
+    @property
+    def _subchannels(self) -> int:
+        """Sub-channels that a packet takes."""
+        return math.ceil(8 * self.packet_bytes / self._subchannel_bits)
+
+
+@cache
+def _bits_per_s_per_hz() -> list[float]:
+    text = (resources.files(__package__) / "nr_mcs.csv").read_text(encoding="utf-8")
+    rows = csv.DictReader(text.splitlines())
+    return [int(row["bits_per_symbol"]) * int(row["rate_1024"]) / 1024 for row in rows]
