@@ -51,7 +51,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     profile_name, channel = _of(name)
     profile, meanings = CHANNELS.profile(profile_name), attributes(type(channel))
     settings = asdict(channel)
-    beyond = outside(profile, channel)
+    beyond = outside(settings, profile.limits)
     curves: dict[str, list[float]] = {}
     busy = None
     if isinstance(channel, Physical):
@@ -76,7 +76,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         typer.echo(textwrap.fill(meanings.get(key, ""), 80, initial_indent="    ", subsequent_indent="    "))
     typer.echo()
     for line in beyond:
-        typer.echo(textwrap.fill(f"outside its source's range: {line}", 80, subsequent_indent="  "))
+        typer.echo(textwrap.fill(line, 80, subsequent_indent="  "))
     if not curves:
         typer.echo("its loss is the same at any distance, behind anything")
         return
@@ -123,7 +123,7 @@ def check(
         curve = np.array([(point.distance_m, point.reception) for point in points])
         of_others.append(compared(channel, Published("", str(path), *curve.T), where))
     model = channel.reception(np.array(DISTANCES_M, dtype=float), SIGHTS["clear"]).tolist()
-    beyond = outside(CHANNELS.profile(profile), channel)
+    beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
         from harness.studies.figures import reception
@@ -162,7 +162,7 @@ def check(
     )
     typer.echo(f"n = {n} trips a distance, each with shadowing of its own; 95 % intervals")
     for line in beyond:
-        typer.echo(f"outside its source's range: {line}")
+        typer.echo(line)
     if of_others:
         typer.echo()
         table(

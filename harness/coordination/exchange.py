@@ -124,6 +124,8 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         point.request_bits, intents.site,
     )  # fmt: skip
     up, delay_s, loss, airtime_s = channel.deliver(links, draws)
+    if channel.needs_site and point.loss is not None:
+        up, loss = np.all(draws.packet >= point.loss, axis=-1), np.full_like(loss, point.loss)
     requested = np.any(asked, axis=-1)
     delivered = asked & up
     slot_end_s = request_s + delay_s

@@ -35,7 +35,8 @@ class OperatingPoint:
         consensus: consensus rule, or `ego-prompt`.
         request_bits: size of the ego's request. By default 50 bytes: who asks whom, and until when, as
             compact JSON, which is how replies are counted, without a signature or headers.
-        loss: probability that one crossing is lost, in place of the profile's; None keeps the profile's.
+        loss: probability that one crossing is lost, in place of the profile's or of what follows from a link;
+            None keeps that.
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
@@ -127,6 +128,8 @@ class OperatingPoint:
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
+        if channel.needs_site:  # its loss is no setting: `exchange` puts another in place of it
+            overrides.pop("loss", None)
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")

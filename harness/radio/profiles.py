@@ -4,7 +4,7 @@ A file names a model and its parameters, and says what they rest on. A package a
 point in the group `swarmdrive.channels`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,11 +22,13 @@ from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 from harness.radio.its_g5 import ItsG5
 from harness.radio.lte_mode4 import LteMode4
+from harness.radio.nr_mode2 import NrMode2
 
 # Name of a model to what makes a channel of a file's parameters, its folder, and what to call it in messages.
 MODELS: dict[str, Callable[[Mapping[str, Any], Path, str], Channel]] = {
     "constant": lambda parameters, folder, where: convert(parameters, Radio, where),
     "lte-v2x-mode4": lambda parameters, folder, where: convert(parameters, LteMode4, where),
+    "nr-v2x-mode2": lambda parameters, folder, where: convert(parameters, NrMode2, where),
     "its-g5": lambda parameters, folder, where: convert(parameters, ItsG5, where),
     "trace": trace.of_profile,
 }
@@ -77,16 +79,18 @@ class Profiles(Plugins[Channel]):
 
     def record(self, name: str) -> dict[str, Any]:
         """All that decides what the channel does, as plain values."""
-        profile = self.profile(name)
-        return {**asdict(profile), "parameters": msgspec.to_builtins(asdict(self[name]))}
+        parameters = asdict(self[name])
+        plain = {**asdict(self.profile(name)), "parameters": parameters}
+        record: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
+        return record
 
 
-def outside(profile: Profile, channel: Channel) -> list[str]:
-    """Where a channel's settings leave what the profile's source held the model against, a line each."""
+def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
+    """Which of a channel's settings leave what its source held the model against, a sentence each."""
     return [
-        f"{name} = {getattr(channel, name):g}; it was held against something from {low:g} to {high:g}"
-        for name, (low, high) in profile.limits.items()
-        if not low <= getattr(channel, name) <= high
+        f"{name} = {value:g} is outside what its model was held against, {low:g} to {high:g}."
+        for name, (low, high) in limits.items()
+        if not low <= (value := float(settings[name])) <= high
     ]
 
 

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import find
+from harness.coordination.operating_point import pairs
 from harness.core.errors import printable
+from harness.radio.profiles import outside
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL
@@ -25,7 +27,7 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    return [*unread(scores), *no_prompt([manifest])]
+    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest)]
 
 
 def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
@@ -66,12 +68,22 @@ def of_run(run: Run) -> Iterator[str]:
     for control, heard in _CONTROLS.items():
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
+    yield from beyond_sources(run.manifest)
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
     if off:
         yield (
             f"With {', '.join(off)} most decisions take longer than these frozen scenes allow for: driving "
             "may end otherwise (harness fidelity)."
         )
+
+
+def beyond_sources(manifest: Manifest) -> Iterator[str]:
+    """Conditions whose radio has settings that its model's source never held against anything."""
+    for condition in manifest.conditions:
+        record = manifest.channels.get(condition.get("profile") or "", {})
+        settings = {**record.get("parameters", {}), **pairs(condition.get("radio", ""))}
+        for sentence in outside(settings, record.get("limits", {})):
+            yield f"{printable(condition['name'])}: {sentence}"
 
 
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:

@@ -1,0 +1,139 @@
+"""`harness channel` as typed, and physical radios from the command line to the page."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from evaluating import run as evaluate
+from evaluating import spec_of
+
+from harness.coordination.operating_point import named_point
+from harness.dataset.load import Dataset
+from harness.radio.profiles import CHANNELS
+
+Said = tuple[int, str, str]
+PHYSICAL = [name for name in ("mode4", "mode2", "its-g5") if CHANNELS[name].needs_site]
+
+
+def test_list_says_what_each_radio_rests_on(harness: Callable[..., Said]) -> None:
+    code, out, _ = harness("channel", "list")
+    assert code == 0
+    assert "v2x · constant · assumed" in out
+    assert "mode4 · lte-v2x-mode4 · modelled" in out
+    assert max(map(len, out.splitlines())) <= 80
+    listed = json.loads(harness("channel", "list", "--json")[1])
+    assert {"6g", "v2x", "density-coupled", *PHYSICAL} <= {profile["name"] for profile in listed}
+    assert all(profile["source"] for profile in listed)
+
+
+@pytest.mark.parametrize("name", PHYSICAL)
+def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], name: str) -> None:
+    code, out, err = harness("channel", "show", name)
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert "source: " in out
+    assert "density_per_km = 100\n" in out
+    told = json.loads(harness("channel", "show", f"{name}:density_per_km=0", "--json")[1])
+    assert told["busy_ratio"] == 0
+    reach = told["reception"]
+    for sight in ("clear", "vehicle", "building"):
+        assert reach[sight] == sorted(reach[sight], reverse=True), "the farther the less"
+    for clear, vehicle, building in zip(*(reach[s] for s in ("clear", "vehicle", "building")), strict=True):
+        assert clear >= vehicle - 1e-6
+        assert vehicle >= building - 1e-6
+
+
+def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[..., Said]) -> None:
+    said = "density_per_km = 1000 is outside what its model was held against, 100 to 300."
+    assert said in " ".join(harness("channel", "show", "mode4:density_per_km=1000")[1].split())
+    assert "outside" not in harness("channel", "show", "mode4")[1]
+
+
+def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: Callable[..., Said]) -> None:
+    Path("theirs.csv").write_text("distance_m,reception\n10,0.97\n100,0.5\n")
+    code, out, err = harness(
+        "channel", "check", "mode4", "-n", "400", "--against", "theirs.csv", "--out", "m.svg"
+    )
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    assert "theirs.csv" in out
+    assert "wrote m.svg" in out
+    assert "published, %" in Path("m.svg").read_text()
+    told = json.loads(harness("channel", "check", "mode4", "-n", "2000", "--json")[1])
+    for point in told["messages"]:
+        assert point["crossing"]["low"] - 0.02 <= point["model"] <= point["crossing"]["high"] + 0.02
+        assert point["round_trip"]["value"] <= point["crossing"]["value"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("show", "mode5"), "unknown operating point 'mode5'; did you mean"),
+        (("show", "mode4:density=3"), "did you mean 'density_per_km'?"),
+        (("show", "mode4:density_per_km=-1"), "density_per_km is -1"),
+        (("show", "single-local"), "has no channel; `harness channel list` shows"),
+        (("check", "6g"), "loses the same at any distance"),
+        (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
+        (("check", "mode4", "--against", "no.csv"), "cannot be read as a table"),
+    ],
+)
+def test_a_mistake_is_one_line(harness: Callable[..., Said], arguments: tuple[str, ...], says: str) -> None:
+    code, out, err = harness("channel", *arguments)
+    assert (code, out) == (2, "")
+    assert says in err
+    assert err.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    points = tuple(map(named_point, ("single-local", "6g", "mode4:density_per_km=1000", "its-g5")))
+    return evaluate(spec_of(small, points=points), tmp_path_factory.mktemp("radios") / "run").out
+
+
+def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
+    harness: Callable[..., Said], done: Path
+) -> None:
+    over = ("--over", "density_per_km", "--grid", "100,1000", "--condition", "mode4", "--out", "swept")
+    code, _, err = harness("sweep", done, *over)
+    assert (code, err) == (0, "")
+    swept = pd.read_csv("swept/conditions.csv")
+    run = pd.read_csv(done / "summary.csv")
+    of_run = run[(run.condition == "mode4:density_per_km=1000") & (run.metric == "success_rate")].value
+    at = swept[(swept.value_of_variable == 1000) if "value_of_variable" in swept else swept.value == 1000]
+    assert at[at.metric == "success_rate"]["mean"].tolist() == pytest.approx(of_run.tolist())
+
+
+def test_a_run_warns_of_a_radio_that_its_source_never_tried(harness: Callable[..., Said], done: Path) -> None:
+    said = "mode4:density_per_km=1000: density_per_km = 1000 is outside what its model was held against"
+    assert harness("report", done, "--out", "page.html")[0] == 0
+    assert said in Path("page.html").read_text()
+
+
+def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
+    harness: Callable[..., Said], small: Dataset, tmp_path: Path
+) -> None:
+    Path("swarmdrive.toml").touch()
+    Path("channels").mkdir()
+    mine = Path("channels/mine.toml")
+    text = (
+        'model = "its-g5"\ndescription = "x"\nsource = "x"\nstatus = "assumed"\n'
+        "[parameters]\ndensity_per_km = 50\n"
+    )
+    mine.write_text(text)
+    run = evaluate(spec_of(small, points=(named_point("mine"),)), tmp_path / "run").out
+    assert harness("sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")[0] == 0
+    mine.write_text(text.replace("50", "60"))
+    code, _, err = harness("sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")
+    assert code == 2
+    assert "channel profile mine has changed since; restore it or run again" in err
+
+
+def test_no_messages_is_a_control_of_a_physical_radio_too(harness: Callable[..., Said], done: Path) -> None:
+    code, out, _ = harness("sweep", done, "--over", "loss", "--grid", "1", "--condition", "its-g5", "--json")
+    assert code == 0
+    run = pd.read_csv(done / "summary.csv")
+    alone = run[(run.condition == "single-local") & (run.metric == "success_rate")].value
+    row = next(row for row in json.loads(out) if row["metric"] == "success_rate")
+    assert row["mean"] == pytest.approx(alone.iloc[0])
