@@ -171,6 +171,30 @@ def test_a_copy_helps_a_quiet_channel_and_not_what_is_too_faint():
     assert twice.loss(far, np.full(1, -2.0), 800.0)[0] == 1.0
 
 
+@pytest.mark.parametrize(
+    ("jitter", "heard"),
+    [
+        ([0.5, 0.5, 0.9], [False, False, True]),  # one slot and sub-channel
+        (
+            [0.5, 0.5 + 0.5 / 100, 0.9],
+            [True, True, True],
+        ),  # one slot, another sub-channel
+        ([0.5, 0.51, 0.9], [True, True, True]),  # the next slot
+    ],
+)
+def test_two_replies_in_one_slot_and_sub_channel_are_both_lost(jitter, heard):
+    three = links(place([10, 12, 14]), 1, 3)
+    always = Draws(np.ones((1, 3, 2)), np.array([jitter]), draws(1, 3).trips)
+    always.__dict__["packet"] = np.full((1, 3, 2), 0.999)
+    assert QUIET.deliver(three, always).up.tolist() == [heard]
+    # Who has not heard the request sends nothing that could clash.
+    always.__dict__["packet"][0, 0, 0] = 0.0
+    assert QUIET.deliver(three, always).up[0].tolist() == [False, True, True]
+    asked = np.array([[False, True, True]])
+    unasked = replace(three, asked=asked, ready_s=np.where(asked, 0.1, np.nan))
+    assert QUIET.deliver(unasked, always).up[0, 1:].tolist() == [True, True]
+
+
 def test_a_helper_that_is_not_there_changes_nobody():
     alone = BUSY.deliver(links(place([50, 80]), 5, 2), draws(5, 2))
     beside = BUSY.deliver(links(place([50, 80, np.nan]), 5, 3), draws(5, 3))

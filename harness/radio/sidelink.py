@@ -7,7 +7,8 @@ links in line of sight. `loss` is that of one link whose shadowing and obstacles
 averages it again, and in line of sight is the paper's curve.
 
 Background vehicles stand evenly along a straight road through the receiver, with vehicles between them where
-the surroundings have a probability of that. Swarm messages add no load and do not collide with each other.
+the surroundings have a probability of that. Swarm messages add no load to it. Two replies in one slot and
+sub-channel are both lost; `loss` is without that.
 """
 
 from abc import abstractmethod
@@ -19,7 +20,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError
 from harness.radio.block_error import BlockError
 from harness.radio.channel import CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
@@ -140,21 +141,36 @@ class Sidelink(Propagation):
         return Broadcast(self._wait_s(draws.wait) + airtime_s, airtime_s)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each reply waits for a slot of its own; half duplex and collisions are in the loss."""
+        """Each reply takes a slot and a sub-channel of its window at random."""
         if links.site is None:
             raise UserError(NO_SITE)
         block_loss = self._block_loss(links.site, draws.shadow(links.site.xy_m, self.decorrelation_m))
         loss = self._lost(block_loss, links.payload_bits)
         request_loss = self._lost(block_loss, links.request_bits)
         airtime_s = self._airtime_s(links.payload_bits)
-        delay_s = np.where(links.asked, links.ready_s + self._wait_s(draws.jitter) + airtime_s, np.inf)
-        up = (draws.packet[..., 0] >= request_loss) & (draws.packet[..., 1] >= loss)
-        return Delivery(up, delay_s, loss, airtime_s)
+        start_s = links.ready_s + self._wait_s(draws.jitter)
+        replied = links.asked & (draws.packet[..., 0] >= request_loss)
+        clear = ~self._clash(start_s, airtime_s, draws.jitter, replied)
+        up = replied & (draws.packet[..., 1] >= loss) & clear
+        return Delivery(up, np.where(links.asked, start_s + airtime_s, np.inf), loss, airtime_s)
+
+    def _clash(self, start_s: Floats, airtime_s: Floats, uniform: Floats, replied: Bools) -> Bools:
+        """Whose slots and sub-channel another reply has, wholly or in part, `(..., H)`."""
+        first = np.floor(start_s / self.slot_s + 1e-6)
+        after = first + np.rint(airtime_s / self.slot_s)
+        # What of the draw did not choose the slot chooses the sub-channel.
+        lane = np.floor(np.mod(uniform * self._window, 1.0) * self.blocks_per_slot)
+        meet = (first[..., None] < after[..., None, :]) & (first[..., None, :] < after[..., None])
+        meet &= (lane[..., None] == lane[..., None, :]) & replied[..., None, :]
+        return np.asarray((meet & ~np.eye(start_s.shape[-1], dtype=bool)).any(axis=-1))
 
     def _wait_s(self, uniform: Floats) -> Floats:
         """From the wish to send to the start of the slot chosen."""
-        window = self.t2_slots - self.t1_slots + 1
-        return (self.t1_slots + np.floor(uniform * window)) * self.slot_s
+        return (self.t1_slots + np.floor(uniform * self._window)) * self.slot_s
+
+    @property
+    def _window(self) -> int:
+        return self.t2_slots - self.t1_slots + 1
 
     def _blocks(self, bits: Floats | float) -> Floats:
         return np.maximum(np.ceil(np.divide(bits, self.block_bits)), 1.0)
