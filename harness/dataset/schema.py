@@ -74,6 +74,8 @@ class Beacon(Closed, frozen=True):
     speed_mps: Number
     target_speed_mps: Number | None
     heard_by: list[VehicleId]
+    interval_s: Number | None = None
+    unmoved: Count = 0
 
 
 class State(Closed, frozen=True):

@@ -4,11 +4,15 @@ The ego and the helpers broadcast where they are, as with a CAM or a BSM; nobody
 knows a sender from the last beacon that got through, and takes it to have driven on from there at constant
 speed along its heading, as receivers do. The dials are the scenario's (`Parameters`):
 
-    rate      10 Hz, a BSM's; a CAM comes 1 to 10 times a second (ETSI EN 302 637-2). Each vehicle begins at
-              a time of its own.
+    rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second, finds the
+              vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last CAM says; or that
+              one older than 1 s or, for three CAMs on end, than the last interval of one that moved. Each
+              vehicle begins at a time of its own.
     delay     20 ms until all receivers have it, a frame: NR Mode 2 waits 17.5 ms for a slot on average.
     loss      8 %, the paper's V2X profile. That losses are independent is assumed: a shadowed link loses
-              many beacons in a row.
+              many beacons in a row. With `beacon_channel` a beacon of 190 bytes (3GPP TR 36.885) is lost as
+              on that radio's link: by where both are when it is sent, what stands between them, and shadowing
+              that belongs to the layout, and not to a run's seed.
     noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT (arXiv 2203.10638). That a
               speed has 0.1 m/s, and that errors are new in each beacon, is assumed. They are the sender's,
               so all receivers read the same, rounded to 1 cm, 1 cm/s and 1 mrad.
@@ -20,19 +24,26 @@ the beacon, so no condition, no seed of the channel and no order of asking chang
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import chain
 
 import numpy as np
 
 from harness.core import noise
 from harness.core.arrays import Floats
-from harness.world.scenario import Parameters
+from harness.radio.fading import Trips
+from harness.radio.propagation import Propagation
+from harness.world.scenario import Parameters, beacon_radio
+from harness.world.sight_lines import site
 from harness.world.state import Beacon, VehicleState, WorldState
 
 LEAD_S = 1.0
+BITS = 8 * 190
+SHORTEST_S, LONGEST_S, UNMOVED = 0.1, 1.0, 3  # T_GenCam_DCC, T_GenCamMax and N_GenCam of EN 302 637-2
+TURN_RAD, MOVE_M, CHANGE_MPS = math.radians(4), 4.0, 0.5
+NO_SEED = -1  # of a run's channel: beacons are the layout's
 ROUNDING_S = 1e-9
 
 
@@ -71,7 +82,7 @@ def lead_in(p: Parameters, poses: Floats) -> Floats:
 
 def broadcast(
     p: Parameters, seed: int, before: Sequence[Beacon], radios: Sequence[str], target_mps: float,
-    poses: Floats, first_frame: int,
+    poses: Floats, first_frame: int, loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:  # fmt: skip
     """The beacons that matter after some more frames: the last ones heard, and those under way.
 
@@ -83,6 +94,8 @@ def broadcast(
         target_mps: what the ego's speed controller aims at.
         poses: x, y, heading and speed of each in each frame, (F, V, 4).
         first_frame: number of the first of these frames; 0 is the start.
+        loss: probability that a beacon of one of these frames, counted from 0, is lost on the link to each
+            helper, `(H,)`.
     """
     if p.perfect_knowledge:
         return ()
@@ -91,21 +104,23 @@ def broadcast(
     for place, sender in enumerate(radios):
         receivers = tuple(radios[:1] if place else radios[1:])
         target = None if place else target_mps
+        links = slice(place - 1, place) if place else slice(None)
+        earlier = [b for b in before if b.sender == sender]
         newest_first = chain(
-            _sent(p, seed, sender, receivers, target, poses[:, place], first_frame),
-            reversed([b for b in before if b.sender == sender]),
+            _sent(p, seed, sender, receivers, target, poses[:, place], first_frame, earlier, loss, links),
+            reversed(earlier),
         )
         kept += reversed(_that_matter(newest_first, {*receivers}, time_s))
     return tuple(kept)
 
 
 def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: float) -> list[Beacon]:
-    """Of one sender's beacons those under way, and the last that each receiver has."""
-    kept = []
+    """Of one sender's beacons those under way, the last that each receiver has, and under `cam` the last."""
+    kept = list[Beacon]()
     for beacon in newest_first:
         if not receivers:
             break
-        if not receivers.isdisjoint(beacon.heard_by):
+        if not receivers.isdisjoint(beacon.heard_by) or (beacon.interval_s is not None and not kept):
             kept.append(beacon)
         if _is_there(beacon, time_s):
             receivers = receivers.difference(beacon.heard_by)
@@ -114,21 +129,63 @@ def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: fl
 
 def _sent(
     p: Parameters, seed: int, sender: str, receivers: tuple[str, ...], target_mps: float | None,
-    poses: Floats, first_frame: int,
+    poses: Floats, first_frame: int, before: Sequence[Beacon], loss: Callable[[int], Floats], links: slice,
 ) -> Iterator[Beacon]:  # fmt: skip
-    """What one vehicle, whose poses these are, (F, 4), broadcasts in these frames, the last first."""
-    phase, errors, heard_by = _draws(p, seed, sender, receivers)
+    """What one vehicle, whose poses these are, (F, 4), broadcasts in these frames, the last first.
+
+    `links` are those of `loss` to its receivers.
+    """
+    phase, errors, uniforms = _draws(p, seed, sender, receivers)
     every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
+
+    def said(number: int, frame: int) -> Beacon:
+        """All but who hears it."""
+        x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
+        time_s = frame / p.simulation_hz
+        return Beacon(
+            sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
+            max(round(speed, 2), 0.0), target_mps, (),
+        )  # fmt: skip
+
+    checks = list[tuple[int, int]]()  # number and frame, the last first
     number = math.ceil((first_frame + len(poses) + lead) / every - phase)
     while number >= 0 and (frame := math.floor((number + phase) * every) - lead) >= first_frame:
         if frame < first_frame + len(poses):
-            x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
-            time_s = frame / p.simulation_hz
-            yield Beacon(
-                sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
-                max(round(speed, 2), 0.0), target_mps, heard_by[number],
-            )  # fmt: skip
+            checks.append((number, frame))
         number -= 1
+    sent: Iterable[tuple[int, Beacon]] = ((number, said(number, frame)) for number, frame in checks)
+    if p.beacon_rule == "cam":
+        last, due = before[-1] if before else None, list[tuple[int, Beacon]]()
+        for number, frame in reversed(checks):
+            cam = _cam(said(number, frame), poses[frame - first_frame].tolist(), last)
+            if cam:
+                due.insert(0, (number, cam))
+                last = cam
+        sent = due
+    for number, beacon in sent:
+        frame = round(beacon.time_s * p.simulation_hz) - first_frame
+        crosses = uniforms[:, number] >= loss(frame)[links] if number else [True] * len(receivers)
+        yield replace(beacon, heard_by=tuple(r for r, there in zip(receivers, crosses, strict=True) if there))
+
+
+def _cam(said: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
+    """What is said, if a CAM is due by the last one (EN 302 637-2, 6.1.3) and the vehicle's true pose."""
+    if last is None or last.interval_s is None:
+        return replace(said, interval_s=LONGEST_S)
+    age_s = said.time_s - last.time_s + ROUNDING_S
+    x, y, heading, speed = pose
+    turned_rad = abs(math.remainder(heading - last.heading_rad, math.tau))
+    moved = (
+        turned_rad > TURN_RAD
+        or math.hypot(x - last.x_m, y - last.y_m) > MOVE_M
+        or abs(speed - last.speed_mps) > CHANGE_MPS
+    )
+    if age_s >= SHORTEST_S and moved:
+        return replace(said, interval_s=round(age_s, 3))
+    if age_s >= last.interval_s:
+        unmoved = min(last.unmoved + 1, UNMOVED)
+        return replace(said, interval_s=LONGEST_S if unmoved == UNMOVED else last.interval_s, unmoved=unmoved)
+    return None
 
 
 def _is_there(beacon: Beacon, time_s: float) -> bool:
@@ -139,18 +196,43 @@ def _lead_frames(p: Parameters) -> int:
     return math.ceil(max(LEAD_S, 1 / p.beacon_hz + p.beacon_delay_s) * p.simulation_hz)
 
 
+def losses(
+    p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
+) -> Callable[[int], Floats]:
+    """Probability that a beacon is lost on the link to each helper, `(H,)`, by frame.
+
+    Args:
+        p: the dials.
+        world: who is there.
+        radios: ids of the ego and of the helpers.
+        poses: x, y, heading and speed of all in each frame, (F, V, 4).
+    """
+    radio = beacon_radio(p.beacon_channel)
+    if radio is None:
+        declared = np.full(len(radios) - 1, p.beacon_loss)
+        return lambda frame: declared
+    state = world()
+    # Of the models only these have shadowing.
+    decorrelation_m = radio.decorrelation_m if isinstance(radio, Propagation) else np.inf
+    trips = Trips(np.array([NO_SEED]), np.array([state.episode_seed]), np.zeros(1, dtype=int), 1)
+
+    @cache
+    def at(frame: int) -> Floats:
+        there = zip(state.vehicles, poses[frame].tolist(), strict=True)
+        vehicles = tuple(replace(v, x_m=x, y_m=y, heading_rad=heading) for v, (x, y, heading, _) in there)
+        links = site([(replace(state, vehicles=vehicles), radios)])
+        return np.asarray(radio.loss(links, trips.shadow(links.xy_m, decorrelation_m), BITS)[0])
+
+    return at
+
+
 @lru_cache(maxsize=1024)
-def _draws(
-    p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]
-) -> tuple[float, Floats, list[tuple[str, ...]]]:
-    """When a sender begins, as a share of its period; its errors, (n, 4); who hears each beacon."""
+def _draws(p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]) -> tuple[float, Floats, Floats]:
+    """When a sender begins, as a share of its period; its errors, (n, 4); each receiver's draws, (R, n)."""
     n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
     own = noise.generator("beacons", seed, sender)
     phase = float(own.random())
     sizes = [p.beacon_noise_m, p.beacon_noise_m, p.beacon_noise_rad, p.beacon_noise_mps]
     errors = own.standard_normal((n, 4)) * sizes
-    draws = {receiver: noise.uniforms((n,), "beacons", seed, sender, receiver) for receiver in receivers}
-    heard_by = [
-        tuple(r for r in receivers if number == 0 or draws[r][number] >= p.beacon_loss) for number in range(n)
-    ]
-    return phase, errors, heard_by
+    draws = [noise.uniforms((n,), "beacons", seed, sender, receiver) for receiver in receivers]
+    return phase, errors, np.array(draws).reshape(-1, n)

@@ -3,14 +3,18 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from functools import lru_cache
+from typing import Any, Literal, get_args
 
 from harness.core import noise
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable, unknown
+from harness.radio.channel import Physical
+from harness.radio.profiles import CHANNELS, changed
 from harness.world.ambient import AMBIENTS, DAY, Ambient
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part
 
+BeaconRule = Literal["fixed", "cam"]
 ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000001
 
 
@@ -35,9 +39,13 @@ class Parameters:
         time_limit_s: an ego that has not reached its goal by then never will.
         delay_allowance_s: how much later than the full-view driver an ego may reach its goal.
         perfect_knowledge: whether the ego and the helpers know each other's truth instead of beacons.
-        beacon_hz: beacons a second; `harness.world.beacons` has the sources of these dials.
+        beacon_rule: when a vehicle sends one: `fixed`, or `cam`, as it moves (ETSI EN 302 637-2);
+            `harness.world.beacons` has the sources of these dials.
+        beacon_hz: beacons a second; under `cam`, checks a second whether one is due.
         beacon_delay_s: from a beacon's pose until receivers have it.
         beacon_loss: probability that a beacon does not get through to a receiver.
+        beacon_channel: physical radio whose loss on each link it is instead, with settings of its own:
+            `its-g5:density_per_km=120+rate_hz=20`.
         beacon_noise_m: standard deviation of a beacon's position on each axis.
         beacon_noise_mps: standard deviation of a beacon's speed.
         beacon_noise_rad: standard deviation of a beacon's heading.
@@ -54,9 +62,11 @@ class Parameters:
     time_limit_s: float = 10.0
     delay_allowance_s: float = 1.0
     perfect_knowledge: bool = False
+    beacon_rule: BeaconRule = "fixed"
     beacon_hz: float = 10.0
     beacon_delay_s: float = 0.02
     beacon_loss: float = 0.08
+    beacon_channel: str = ""
     beacon_noise_m: float = 0.2
     beacon_noise_mps: float = 0.1
     beacon_noise_rad: float = 0.0035
@@ -65,6 +75,7 @@ class Parameters:
     def __post_init__(self) -> None:
         bounds = {
             "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
+            "beacon_rule": (self.beacon_rule in get_args(BeaconRule), " or ".join(get_args(BeaconRule))),
             "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
             "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
             "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
@@ -81,6 +92,7 @@ class Parameters:
         for name, (fits, allowed) in bounds.items():
             if not fits:
                 raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be {allowed}")
+        beacon_radio(self.beacon_channel)
 
     @property
     def light(self) -> Ambient:
@@ -88,8 +100,8 @@ class Parameters:
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
-        """All dials as plain values; of `ambient` only what is not day."""
-        return {k: v for k, v in asdict(self).items() if (k, v) != ("ambient", DAY)}
+        """All dials as plain values; those that came later only where they are not as they were before."""
+        return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 
     @property
     def lag_frames(self) -> int:
@@ -100,6 +112,27 @@ class Parameters:
         """The frame in which a decision is due; after the last one, that of the time limit."""
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
         return round(due_s * self.simulation_hz)
+
+
+LATER = (("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""))
+
+
+@lru_cache(maxsize=64)
+def beacon_radio(text: str) -> Physical | None:
+    """The radio of `beacon_channel`; None for none. Raises UserError."""
+    if not text:
+        return None
+    name, _, settings = text.partition(":")
+    if name not in CHANNELS:
+        raise unknown("beacon_channel", name, CHANNELS)
+    given = {key: value for key, _, value in (each.partition("=") for each in settings.split("+") if each)}
+    radio = changed(CHANNELS[name], given, f"beacon_channel {name}")
+    if not isinstance(radio, Physical):
+        raise UserError(
+            f"scenario: beacon_channel is {printable(text)}, which has one loss for all links; "
+            "it must be a physical radio, or set beacon_loss"
+        )
+    return radio
 
 
 # What changes neither who is there nor how they drive, but what is known of them.

@@ -123,6 +123,9 @@ class Beacon:
         speed_mps: speed along the heading.
         target_speed_mps: what the ego's speed controller aims at; None of others.
         heard_by: ids of the receivers that it gets through to.
+        interval_s: where they are sent as the vehicle moves, how long it waits now if it does not move; else
+            None.
+        unmoved: how many were sent on end because of that.
     """
 
     sender: str
@@ -134,6 +137,8 @@ class Beacon:
     speed_mps: float
     target_speed_mps: float | None
     heard_by: tuple[str, ...]
+    interval_s: float | None = None
+    unmoved: int = 0
 
 
 @dataclass(frozen=True)
@@ -179,11 +184,14 @@ class WorldState:
         raise KeyError(vehicle_id)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready mapping; of `braking` only what is true."""
+        """JSON-ready mapping; of `braking` only what is true, and of beacons what their rule needs."""
         record = asdict(self)
         for vehicle in record["vehicles"]:
             if not vehicle["braking"]:
                 del vehicle["braking"]
+        for beacon in record["beacons"]:
+            if beacon["interval_s"] is None:
+                del beacon["interval_s"], beacon["unmoved"]
         return record
 
     @classmethod

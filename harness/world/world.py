@@ -206,11 +206,14 @@ class World:
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
         """What the ego and the helpers say of themselves in some frames, (F, V, 4)."""
-        radios = [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
+        p, radios = (
+            self.scenario.parameters,
+            [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"],
+        )
+        ids = [self.vehicles[n].spawn.id for n in radios]
         self.beacons = beacons.broadcast(
-            self.scenario.parameters, self.seed, self.beacons,
-            [self.vehicles[n].spawn.id for n in radios], float(self.vehicles[0].target_speed),
-            poses[:, radios], first_frame,
+            p, self.seed, self.beacons, ids, float(self.vehicles[0].target_speed), poses[:, radios],
+            first_frame, beacons.losses(p, self.state, ids, poses),
         )  # fmt: skip
 
     def _move(self) -> None:

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,16 +13,17 @@ from hypothesis import strategies as st
 from harness.core.errors import UserError
 from harness.dataset.freeze import moment
 from harness.world import scenarios
-from harness.world.beacons import known, last_heard
+from harness.world.beacons import broadcast, known, last_heard
 from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import SCENARIO
-from harness.world.state import WorldState
+from harness.world.state import Beacon, WorldState
 from harness.world.world import World
 
 SILENT: Any = {"beacon_noise_m": 0.0, "beacon_noise_mps": 0.0, "beacon_noise_rad": 0.0}
 EXACT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, beacon_loss=0.0, **SILENT))
 PERFECT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, perfect_knowledge=True))
 HELPERS = ("v2", "v3", "v4")
+RADIO = "beacon_channel=its-g5:density_per_km=120+rate_hz=25"
 
 
 def with_loss(loss):
@@ -114,11 +116,14 @@ def test_a_beacon_says_the_same_to_all_and_its_errors_are_those_declared():
     assert math.sqrt(sum(e * e for e in errors) / len(errors)) == pytest.approx(0.2, rel=0.2)
 
 
+DIALS = ("beacon_loss=0", "beacon_loss=0.08", "beacon_loss=0.7", "beacon_rule=cam,beacon_loss=0.7", RADIO)
+
+
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.integers(1, 120), max_size=6), st.sampled_from((0.0, 0.08, 0.7)))
-def test_beacons_do_not_depend_on_how_time_is_cut(frames, loss):
+@given(st.lists(st.integers(1, 120), max_size=6), st.sampled_from(DIALS))
+def test_beacons_do_not_depend_on_how_time_is_cut(frames, dials):
     """Nor on a freeze: a world that was thawed at every stop knows the same."""
-    scenario = with_loss(loss)
+    scenario = scenarios.get(f"occluded-intersection:{dials}")
     whole, cut = World.start(scenario, 3), World.start(scenario, 3)
     for frame in sorted(frames):
         cut.advance(frame)
@@ -191,6 +196,13 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
         ("beacon_noise_m=much", "beacon_noise_m is 'much'; give a number"),
         ("beacon_los=0.1", "unknown setting of scenario occluded-intersection 'beacon_los'; did you mean"),
         ("danger_share=0.5", "unknown setting of scenario occluded-intersection 'danger_share'"),
+        ("beacon_rule=often", "beacon_rule is often; it must be fixed or cam"),
+        (
+            "beacon_channel=v2x",
+            "beacon_channel is v2x, which has one loss for all links; it must be a physical",
+        ),
+        ("beacon_channel=its-g6", "unknown beacon_channel 'its-g6'; did you mean 'its-g5'?"),
+        ("beacon_channel=its-g5:density=3", "unknown setting of beacon_channel its-g5 'density'"),
         ("", "unknown setting of scenario occluded-intersection ''"),
     ],
 )
@@ -212,3 +224,133 @@ def test_any_rate_up_to_one_a_frame_has_everybody_heard_at_the_start(hz):
             state = world.state()
             ages = [state.time_s - last_heard(state, "v1", helper).time_s for helper in HELPERS]
             assert all(0.1 - 1e-9 <= age <= 0.1 + 1 / hz + 0.02 for age in ages)
+
+
+# -- CAM: sent as the vehicle moves ------------------------------------------------------------------------
+
+
+def cams(scenario, speeds_mps, turn_rad=0.0):
+    """Frames of one ego's CAMs that drives at these speeds, frame by frame, from the first in them."""
+    heard, frames = tuple[Beacon, ...](), []
+    x_m = heading_rad = 0.0
+    for frame, speed in enumerate(speeds_mps):
+        x_m += speed / 50
+        heading_rad += turn_rad / 50
+        poses = np.array([[[x_m, 0.0, heading_rad, speed], [x_m, 9.0, 0.0, speed]]])
+        heard = broadcast(
+            scenario.parameters, 0, heard, ("v1", "v2"), 14.0, poses, frame, lambda _: np.zeros(1)
+        )
+        frames += [round(50 * b.time_s) for b in heard if b.sender == "v1"][-1:]
+    return [frame for n, frame in enumerate(frames) if frame not in frames[:n]]
+
+
+CAM = replace(EXACT, parameters=replace(EXACT.parameters, beacon_rule="cam", beacon_delay_s=0.0))
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "every_s"),
+    [(0.0, 1.0), (3.0, 1.0), (7.0, 0.6), (14.0, 0.3), (30.0, 0.2), (45.0, 0.1)],
+)
+def test_a_steady_vehicle_sends_when_a_check_finds_it_four_metres_on_and_once_a_second_at_least(
+    speed_mps, every_s
+):
+    """At 14 m/s 4 m take 286 ms, and the third check finds them; at 3 m/s the second is over before."""
+    sent = cams(CAM, [speed_mps] * 250)
+    assert set(np.diff(sent)) == {round(50 * every_s)}
+
+
+def test_who_turns_sends_every_four_degrees():
+    """40° a second at a standstill: 4° are passed at the second check."""
+    assert set(np.diff(cams(CAM, [0.0] * 200, math.radians(25)))) == {10}
+
+
+def test_who_brakes_sends_at_every_check_three_times_more_after_it_and_then_by_distance():
+    """From 14 m/s to 3 m/s at 8 m/s²: 0.8 m/s a check. At 3 m/s 4 m take longer than a second."""
+    speeds = [14.0] * 100 + [14.0 - 0.16 * k for k in range(1, 70)]
+    sent = cams(CAM, speeds + [speeds[-1]] * 300)
+    assert np.diff(sent).tolist() == [15] * 7 + [5] * 12 + [5] * 3 + [50] * 5
+    assert sent[19] == 166, "the last check that finds it slower: it brakes until frame 168"
+
+
+def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
+    """The next is measured from it, whoever heard it, so losses do not change when beacons are sent."""
+
+    def times(loss):
+        world = World.start(scenarios.get(f"occluded-intersection:beacon_rule=cam,beacon_loss={loss}"), 0)
+        world.take("SLOWER")
+        found = set()
+        for frame in range(1, 150):
+            world.advance(frame)
+            found |= {b.time_s for b in world.beacons if b.sender == "v1" and b.time_s > 0}
+        return found
+
+    assert times(0) == times(0.9)
+    assert 5 < len(times(0)) < 30
+
+
+# -- beacons over a radio ----------------------------------------------------------------------------------
+
+
+def heard(dials, seeds=range(5)):
+    """When what each has heard of the other was sent, at each of three decisions."""
+    found = {}
+    for seed in seeds:
+        world = World.start(scenarios.get(f"occluded-intersection:{dials}"), seed)
+        for step in range(3):
+            state = world.state()
+            for helper in HELPERS:
+                for way in (("v1", helper), (helper, "v1")):
+                    found[seed, step, *way] = last_heard(state, *way).time_s
+            world.act("IDLE")
+    return found
+
+
+def test_on_a_strong_radio_beacons_get_through_and_on_a_feeble_one_only_the_first_does():
+    strong = heard("beacon_channel=its-g5:density_per_km=0+power_dbm=60")
+    feeble = heard("beacon_channel=its-g5:power_dbm=-60")
+    assert strong == heard("beacon_loss=0.001")
+    assert all(time_s < -0.8 for time_s in feeble.values())
+
+
+def test_a_busier_channel_never_makes_anybody_hear_more():
+    """The draws are shared, and so is the shadowing."""
+    quiet, busy = (heard(f"beacon_channel=its-g5:density_per_km={density}") for density in (10, 150))
+    assert all(busy[key] <= quiet[key] for key in quiet)
+    assert busy != quiet
+
+
+def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
+    """Where the radio says .3 for one link and 1 for the others, its share comes, and nothing else."""
+    p, n = SCENARIO.parameters, 1000
+    poses = np.zeros((5, 3, 4))
+    came = 0
+    for seed in range(n):
+        sent = broadcast(p, seed, (), ("v1", "v2", "v3"), 14.0, poses, 100, lambda _: np.array([0.3, 1.0]))
+        came += sum(b.heard_by == ("v2",) for b in sent if b.sender == "v1")
+        assert not any("v3" in b.heard_by or b.sender == "v3" for b in sent), "the link fails both ways"
+    assert came / n == pytest.approx(0.7, abs=0.04)
+
+
+def test_times_between_beacons_that_get_through_are_geometric():
+    """Mean T / p; the share q is reached after ceil(log(1 - q) / log(1 - p)) periods: 3 at .95 and p = .7."""
+    p, gaps = replace(SCENARIO.parameters, beacon_loss=0.3), []
+    poses = np.zeros((1, 2, 4))
+    for seed in range(40):
+        before, times = tuple[Beacon, ...](), []
+        for frame in range(450):
+            before = broadcast(p, seed, before, ("v1", "v2"), 0.0, poses, frame, lambda _: np.array([0.3]))
+            times += [b.time_s for b in before if b.sender == "v1" and b.heard_by and b.time_s not in times]
+        gaps += np.diff(times).tolist()
+    assert np.mean(gaps) == pytest.approx(0.1 / 0.7, rel=0.03)
+    assert np.quantile(gaps, 0.95) == pytest.approx(
+        0.1 * math.ceil(math.log(0.05) / math.log(0.3)), abs=0.001
+    )
+
+
+def test_dials_that_are_as_before_are_not_stated_so_that_what_was_built_stays_as_it_is():
+    stated = SCENARIO.parameters.stated()
+    assert not {"beacon_rule", "beacon_channel"} & set(stated)
+    changed = scenarios.get(f"occluded-intersection:beacon_rule=cam,{RADIO}")
+    assert changed.parameters.stated()["beacon_channel"] == "its-g5:density_per_km=120+rate_hz=25"
+    assert scenarios.stated("occluded-intersection", changed.parameters.stated()) == changed
+    assert "interval_s" not in World.start(SCENARIO, 0).state().to_dict()["beacons"][0]

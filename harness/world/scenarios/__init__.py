@@ -53,7 +53,7 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float | str]:
         raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
     if key == "perfect_knowledge" and value in ("true", "false"):
         return key, value == "true"
-    if key == "ambient":
+    if isinstance(getattr(scenario.parameters, key), str):
         return key, value
     try:
         return key, (int if type(getattr(scenario.parameters, key)) is int else float)(value)
