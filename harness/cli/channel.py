@@ -113,8 +113,7 @@ def check(
     profile, channel = _of(name)
     if not isinstance(channel, Physical):
         raise UserError(f"{printable(name)} loses the same at any distance; there is no curve to check")
-    if out and out.suffix[1:] not in FORMATS:
-        raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
+    _picture(out)
     where = f"channel profile {profile}"
     messages = drawn(channel, DISTANCES_M, n)
     of_others = [compared(CHANNELS[profile], curve, where) for curve in published(profile)]
@@ -183,6 +182,73 @@ def check(
         typer.echo(printable("; ".join(sources), 1000))
     if out:
         typer.echo(f"wrote {printable(out)}")
+
+
+@app.command()
+def crowd(
+    names: list[str] | None = typer.Argument(None, help="Radios. Default: all whose load can be set."),
+    distance_m: float = typer.Option(50.0, min=1.0, max=1000.0, help="Between sender and receiver, m."),
+    radius_m: float = typer.Option(100.0, min=10.0, max=1000.0, help="Within which the vehicles stand, m."),
+    sight: str = typer.Option("clear", help="What stands between: clear, vehicle or building."),
+    out: Path | None = typer.Option(None, help="Picture to write: .svg, .pdf or .png."),
+    as_json: options.Json = False,
+) -> None:
+    """Show loss against swarm size: radios beside the paper's line.
+
+    The road is as full everywhere as it is within the radius, and all of them send.
+    """
+    import numpy as np
+
+    from harness.radio.channel import Physical
+    from harness.radio.constant import density_coupled_loss
+    from harness.radio.profiles import CHANNELS, settable
+    from harness.studies.reception import SIGHTS, crowded
+
+    if sight not in SIGHTS:
+        raise unknown("--sight", sight, SIGHTS)
+    _picture(out)
+    every = (
+        {name: CHANNELS[name] for name in CHANNELS} if not names else {name: _of(name)[1] for name in names}
+    )
+    loaded = {
+        name: channel for name, channel in every.items()
+        if isinstance(channel, Physical) and "density_per_km" in settable(channel)
+    }  # fmt: skip
+    if lacks := [name for name in names or () if name not in loaded]:
+        raise UserError(
+            f"{printable(lacks[0])} has no density_per_km that a swarm could change; leave it out"
+        )
+    vehicles = (2, 4, 8, 16, 32, 64, 128)
+    losses = {n: crowded(channel, vehicles, radius_m, distance_m, sight) for n, channel in loaded.items()}
+    line = density_coupled_loss(np.array(vehicles))
+    if out:
+        from harness.report.drawing.pictures import save
+        from harness.studies.figures import crowds
+
+        between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[sight]
+        title = f"one crossing over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
+        save(crowds(vehicles, losses, line, title), out, out.suffix[1:])  # type: ignore[arg-type]
+    if as_json:
+        echo_json({
+            "vehicles": vehicles, "distance_m": distance_m, "radius_m": radius_m, "sight": sight,
+            "paper": line.tolist(), "loss": {name: loss.tolist() for name, loss in losses.items()},
+        })  # fmt: skip
+        return
+    columns = {"paper": line, **losses}
+    table(
+        ["lost, %", *map(printable, columns)],
+        [
+            (f"{n} vehicles", *(f"{100 * column[place]:.1f}" for column in columns.values()))
+            for place, n in enumerate(vehicles)
+        ],
+    )
+    if out:
+        typer.echo(f"wrote {printable(out)}")
+
+
+def _picture(out: Path | None) -> None:
+    if out and out.suffix[1:] not in FORMATS:
+        raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
 
 
 def _of(text: str) -> "tuple[str, Channel]":

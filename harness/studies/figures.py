@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
+PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: its panel of swarm sizes
 SHORT = 13  # characters of a name that fit under a bar
 BEST_BAND = (0.65, 0.70)  # the paper's
 # What is drawn beside success along an axis.
@@ -268,4 +269,33 @@ def reception(
         axes.set(xlabel="published, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal")
         curves_ = f"{len(against)} published curve{'s' * (len(against) != 1)}"
         axes.set_title(f"{curves_}, {mean:.1f} points apart on average", fontsize=8)
+    return figure
+
+
+@styled
+def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], line: Floats, title: str) -> Figure:
+    """Loss of one crossing against vehicles in the radius: radios beside the paper's line.
+
+    Args:
+        vehicles: `(n,)`, sender and receiver included.
+        losses: name of a radio to its losses, `(n,)`.
+        line: the paper's, `(n,)`.
+        title: what the losses are of.
+    """
+    figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    axes = figure.add_subplot()
+    axes.plot(vehicles, 100 * line, color=INK, linewidth=1.2, label="the paper's line")
+    axes.plot(*zip(*PAPER_LOSS, strict=True), "x", color=INK, label="the paper's three points")
+    for (name, loss), colour, marker in zip(losses.items(), COLOURS, MARKERS, strict=False):
+        axes.plot(vehicles, 100 * loss, marker=marker, markersize=3, linewidth=1.0, color=colour, label=name)
+    axes.set(
+        xscale="log",
+        xlabel="vehicles in the radius, the ego included",
+        ylabel="lost crossings, %",
+        ylim=(-2, 102),
+    )
+    axes.set_xticks(vehicles, [str(n) for n in vehicles])
+    axes.minorticks_off()
+    axes.set_title(title, fontsize=8)
+    axes.legend(fontsize=6, frameon=False)
     return figure

@@ -118,3 +118,26 @@ def compared(channel: Channel, curve: Published, where: str) -> Compared:
     there = changed(channel, pairs(curve.configuration), where)
     assert isinstance(there, Physical)
     return Compared(curve, there.reception(curve.distance_m))
+
+
+def crowded(
+    channel: Channel, vehicles: Sequence[int], radius_m: float, distance_m: float, sight: str
+) -> Floats:
+    """Loss of one crossing when so many vehicles stand within a radius and nobody else does, `(n,)`.
+
+    Those other than sender and receiver are the background's load, evenly along one road through the radius.
+
+    Args:
+        channel: whose `density_per_km` they are.
+        vehicles: how many, sender and receiver included.
+        radius_m: the radius.
+        distance_m: between sender and receiver.
+        sight: what stands between.
+    """
+    losses = []
+    for n in vehicles:
+        per_km = max(n - 2, 0) / (2 * radius_m) * 1000
+        there = changed(channel, {"density_per_km": str(per_km)}, "channel")
+        assert isinstance(there, Physical)
+        losses.append(1 - there.reception(np.array([distance_m]), SIGHTS[sight])[0])
+    return np.array(losses)
