@@ -109,6 +109,7 @@ def test_what_stands_between_and_the_corner_cost_reception():
     far = np.array([150.0])
     clear, vehicle, building = (BUSY.reception(far, sight)[0] for sight in (CLEAR, VEHICLE, BUILDING))
     assert clear > vehicle > building
+    assert BUSY.reception(np.full(2, 150.0), np.array([CLEAR, BUILDING])).tolist() == [clear, building]
     z = np.zeros(1)
     corner = BUSY.loss(place([80 * np.sqrt(2)], BUILDING, 80.0), z, 800.0)
     assert corner > BUSY.loss(place([80 * np.sqrt(2)], BUILDING), z, 800.0)
@@ -121,13 +122,13 @@ def test_what_stands_between_and_the_corner_cost_reception():
     density=st.floats(0, 400),
     more=st.floats(1, 200),
     rate=st.sampled_from([5.0, 10.0, 20.0]),
-    subchannels=st.sampled_from([2, 4]),
+    radio=st.sampled_from(
+        [BUSY, replace(BUSY, subchannels=2), replace(BUSY, environment="tr37885-urban"), NR]
+    ),
 )
-def test_more_load_never_helps_and_distance_never_helps(density, more, rate, subchannels):
+def test_more_load_never_helps_and_distance_never_helps(density, more, rate, radio):
     distances_m = np.arange(20.0, 600, 20)
-    light, heavy = (
-        LteMode4(density_per_km=d, rate_hz=rate, subchannels=subchannels) for d in (density, density + more)
-    )
+    light, heavy = (replace(radio, density_per_km=d, rate_hz=rate) for d in (density, density + more))
     assert np.all(np.diff(light.reception(distances_m)) <= 2e-3)
     # The evenly spaced interferers of two densities stand elsewhere: ripples of a point.
     assert np.all(heavy.reception(distances_m) <= light.reception(distances_m) + 0.02)

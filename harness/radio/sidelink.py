@@ -20,10 +20,10 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.radio.block_error import BlockError
-from harness.radio.channel import CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
+from harness.radio.channel import BUILDING, CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 from harness.radio.sps import Scheduling
 
@@ -110,18 +110,16 @@ class Sidelink(Propagation):
         """Channel busy ratio under the background load (34)."""
         return self._scheduling().busy_ratio
 
-    def reception(self, distance_m: Floats, sight: int | None = None) -> Floats:
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of background packets received over these distances, averaged over shadowing, `(n,)` (6).
 
         Args:
             distance_m: `(n,)`.
-            sight: what stands between; without, no building does, and vehicles do with the surroundings'
-                probability.
+            sight: what stands between, `(n,)` or one for all; without, no building does, and vehicles do with
+                the surroundings' probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
-        success = np.apply_along_axis(
-            lambda column: np.interp(distance_m, _DISTANCE_M, column), 0, _success(self)
-        )
+        success = np.array([np.interp(distance_m, _DISTANCE_M, column) for column in _success(self).T]).T
         received: Floats = 1 - (1 - success) ** self.transmissions
         return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
 
@@ -206,10 +204,12 @@ class Sidelink(Propagation):
             threshold_dbm=self.sensing_dbm,
         )
 
-    def _states(self, distance_m: Floats, sight: int | None) -> list[tuple[Floats, Floats, float]]:
+    def _states(self, distance_m: Floats, sight: Ints | int | None) -> list[tuple[Floats, Floats, float]]:
         """What may stand between: shares `(n,)`, mean received powers `(n,)` and their deviation in dB."""
         clear = self.clear_probability(distance_m)
-        shares = {CLEAR: clear, VEHICLE: 1 - clear} if sight is None else {sight: np.ones_like(clear)}
+        shares = {CLEAR: clear, VEHICLE: 1 - clear}
+        if sight is not None:
+            shares = {state: (sight == state) * np.ones_like(clear) for state in (CLEAR, VEHICLE, BUILDING)}
         return [
             (share, self._received_dbm(self.path_loss_db(distance_m, state)), float(self.shadowing_db(state)))
             for state, share in shares.items()
@@ -221,7 +221,7 @@ class Sidelink(Propagation):
         states = self._states(distance_m, None)
         return np.asarray(sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states))
 
-    def _shares(self, distance_m: Floats, sight: int | None) -> Floats:
+    def _shares(self, distance_m: Floats, sight: Ints | int | None) -> Floats:
         """Shares of the power cells, `(n, CELLS)`; what is missing to 1 is below the threshold (10)."""
         edges = self.sensing_dbm + CELL_DB * np.arange(CELLS + 1)
         edges[-1] = np.inf
@@ -260,9 +260,8 @@ def _success(radio: Sidelink) -> Floats:
     # The source multiplies the interferers' average collisions. A link's own power is the same against all of
     # them, so that the average of products is a little larger; the curve shall be the source's.
     average_free = np.sum(shares * free, axis=-1)
-    free *= np.divide(free_on_average, average_free, out=np.ones(len(shares)), where=average_free > 0)[
-        :, None
-    ]
+    scale = np.where(average_free > 0, free_on_average / np.maximum(average_free, 1e-300), 1.0)
+    free *= scale[:, None]
     half_duplex = radio.rate_hz * radio.transmissions * radio.slot_s  # (7)
     success: Floats = max(1 - half_duplex, 0.0) * (1 - noise_lost) * free
     return success

@@ -73,7 +73,11 @@ class Scheduling:
         return taken(times * self.per_m * float(self.sensed(metres, threshold_dbm).sum()), self.resources)
 
     def _same(self, apart_m: Floats, taken: float, threshold_dbm: float) -> Floats:
-        """(24) to (27) and (30): they choose from what both have left, the nearer, the more in common."""
+        """(24) to (27) and (30): they choose from what both have left, the nearer, the more in common.
+
+        Not less than what two have in common who sense independently: the source's equations fall below that
+        at a busy ratio of about 0.75 and more.
+        """
         sensed = self.sensed(np.abs(np.arange(-REACH_M, REACH_M + 1.0)), self.threshold_dbm)
         overlap = correlate(sensed, sensed, method="fft")[2 * REACH_M :]  # (30.2), by metre from 0 on
         by_chance = taken**2 / self.resources
@@ -82,7 +86,8 @@ class Scheduling:
         both = taken * overlap / max(sensed.sum(), 1e-300) + (1 - nearness) * by_chance
         common = np.interp(apart_m, np.arange(overlap.size), self.resources - 2 * taken + both)
         unaware = 1 - (1 - self.forgotten) * self.sensed(apart_m, threshold_dbm)
-        return np.asarray(np.clip(unaware * common / (self.resources - taken) ** 2, 0.0, 1.0))
+        at_least = 1 / self.resources
+        return np.asarray(unaware * np.clip(common / (self.resources - taken) ** 2, at_least, 1.0))
 
 
 def taken(packets: float, resources: float) -> float:
