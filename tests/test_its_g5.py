@@ -1,11 +1,7 @@
 """802.11p: airtimes and waits by hand, closed forms beside a simulation of the slots, published curves."""
 
-import csv
 import math
 from dataclasses import replace
-from importlib import resources
-from itertools import groupby
-from typing import Any
 
 import numpy as np
 import pytest
@@ -184,3 +180,87 @@ def test_the_waits_drawn_have_the_mean_of_the_closed_form(busy):
     )
 
 
+# -- the seam ----------------------------------------------------------------------------------------------
+
+
+def links_and_draws(n: int) -> tuple[Links, Draws]:
+    rng = np.random.default_rng(n)
+    where = Site(rng.uniform(0, 120, (n, 4, 2)), rng.integers(0, 3, (n, 3)), rng.choice([1.5, 3.6], (n, 3)),
+                 rng.uniform(0, 60, (n, 3, 2)))  # fmt: skip
+    asked = rng.random((n, 3)) < 0.8
+    ready_s = np.where(asked, 0.145 + rng.uniform(0, 0.05, (n, 3)), np.nan)
+    links = Links(
+        asked, ready_s, rng.uniform(5, 90, (n, 3)), np.full((n, 3), 2400.0), asked, asked, 800.0, where
+    )
+    trips = Trips(np.zeros(n, int), np.arange(n), np.zeros(n, int), 6)
+    return links, Draws(rng.random((n, 3, 2)), rng.random((n, 3)), trips)
+
+
+def test_a_batch_is_one_at_a_time_and_who_was_not_asked_changes_nobody():
+    assert isinstance(CROWD, Channel)
+    links, draws = links_and_draws(200)
+    up, delay_s, loss, airtime_s = CROWD.deliver(links, draws)
+    assert np.array_equal(np.isfinite(delay_s), links.asked)
+    assert np.all((delay_s > links.ready_s)[links.asked])
+    assert np.all((loss >= 0) & (loss <= 1))
+    assert airtime_s[0, 0] == CROWD.message_s(2400.0)
+    assert 0.1 < up[links.asked].mean() < 0.95
+    alone = CROWD.deliver(links.take(7), draws.take(7))
+    for batch, single in zip((up, delay_s, loss, airtime_s), alone, strict=True):
+        assert np.array_equal(batch[7], single, equal_nan=True)
+    heard_s = np.asarray(CROWD.request(800.0, draws).heard_s)
+    assert np.all(heard_s >= 110e-6 + CROWD.message_s(800.0) - 1e-6)
+
+
+def test_replies_wait_for_each_other_and_those_that_begin_together_are_both_lost():
+    """All ready at 150 ms on an idle medium; back-offs of 0, 0 and 10 slots, then of 0, 1 and 10."""
+    where = Site(
+        np.array([[0.0, 0], [20, 0], [0, 20], [20, 20]]),
+        np.zeros(3, int),
+        np.zeros(3),
+        np.full((3, 2), np.nan),
+    )
+    asked, same = np.ones(3, bool), np.full(3, 0.15)
+    links = Links(asked, same, np.array([20.0, 20.0, 28.0]), np.full(3, 1280.0), asked, asked, 800.0, where)
+
+    def played(slots):
+        draws = Draws(
+            np.ones((3, 2)), (np.array(slots) + 0.5) / 16, Trips(np.array(0), np.array(0), np.array(0), 1)
+        )
+        object.__setattr__(draws, "packet", np.full((3, 2), 0.5))
+        return QUIET.deliver(links, draws)
+
+    together, apart = played([0, 0, 10]), played([0, 1, 10])
+    assert together.up.tolist() == [False, False, True]
+    assert apart.up.tolist() == [True, True, True]
+    first_s = 0.15 + 110e-6 + 304e-6
+    assert apart.delay_s == pytest.approx([first_s, first_s + 304e-6, first_s + 608e-6], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ({"density_per_km": -1.0}, "its-g5: density_per_km is -1.0; it must be from 0.0 to 10000.0"),
+        ({"density_per_km": math.nan}, "its-g5: density_per_km is nan"),
+        (
+            {"data_rate_mbps": 5.0},
+            "its-g5: data_rate_mbps is 5.0; it must be one of 3, 4.5, 6, 9, 12, 18, 24, 27",
+        ),
+        (
+            {"curve": "lte-mcs7-350B-urban-los"},
+            "its-g5: curve is 'lte-mcs7-350B-urban-los'; it must be 11p-goubet or",
+        ),
+        ({"curve": "11p-mcs2-999B"}, "block error curve '11p-mcs2-999B' is unknown"),
+        ({"antenna_m": 0.5}, "its-g5: antenna_m is 0.5"),
+    ],
+)
+def test_settings_that_are_no_radio_are_refused(setting, says):
+    with pytest.raises(UserError) as refused:
+        ItsG5(**setting)
+    assert says in str(refused.value)
+
+
+def test_a_world_without_places_is_refused():
+    one = np.ones(1)
+    with pytest.raises(UserError, match="a physical radio needs vehicles that are somewhere"):
+        ItsG5().deliver(Links(one > 0, one, one, one, one > 0, one > 0), Draws(np.ones((1, 2)), one))
