@@ -21,7 +21,7 @@ from harness.radio.its_g5 import ItsG5
 from harness.radio.lte_mode4 import LteMode4
 from harness.radio.nr_mode2 import NrMode2
 
-MODELS = {
+MODELS: dict[str, LteMode4 | NrMode2 | ItsG5] = {
     "lte-v2x-mode4": LteMode4(density_per_km=200.0),
     "nr-v2x-mode2": NrMode2(density_per_km=200.0),
     "its-g5": ItsG5(density_per_km=200.0),

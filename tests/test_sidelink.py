@@ -258,6 +258,17 @@ def test_twice_the_bandwidth_in_half_as_long_slots_is_half_as_busy():
     assert fine.busy_ratio() == pytest.approx(coarse.busy_ratio() / 2, rel=0.05)
 
 
+def test_where_a_real_radio_is_what_the_paper_declares():
+    """8 % and 25 ms: Mode 4 at 150 to 250 m beside 200 vehicles a km. 1.2 % and 5 ms: Mode 2 at 50 m."""
+    v2x = replace(BUSY, t2_slots=50)
+    lost = 1 - v2x.reception(np.array([150.0, 200, 250]))
+    assert lost[0] < 0.08 < lost[2]
+    assert np.mean(v2x.request(400.0, draws(20_000, 1)).heard_s) == pytest.approx(0.0265, abs=3e-4)
+    short = NrMode2(numerology=2, mcs=7, subchannel_blocks=10, packet_bytes=190)
+    assert 1 - short.reception(np.array([50.0]))[0] == pytest.approx(0.012, abs=0.004)
+    assert np.mean(short.request(400.0, draws(20_000, 1)).heard_s) == pytest.approx(0.0046, abs=1e-4)
+
+
 # Semi-persistent scheduling.
 
 
