@@ -14,6 +14,7 @@ from harness.core.arrays import Floats
 
 SLOT_S = 13e-6  # IEEE 802.11-2012, 10 MHz OFDM
 TICK_S, TICKS = 1e-6, 1 << 17  # of the access delay's distribution: 131 ms
+RAREST = 1e-7  # share of the longest waits, which are cut off
 SATURATED = 0.6  # busier, vehicles that all hear each other never catch up
 
 
@@ -68,7 +69,9 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
     back_off = (1 - slot_idle ** (window + 1)) / ((window + 1) * (1 - slot_idle))
     rest = (1 - busy) + busy * (1 - z**packet) / (packet * (1 - z))
     share = np.fft.irfft(np.append(1.0, rest * aifs_idle * back_off), TICKS)
-    return np.maximum.accumulate(np.cumsum(share)), np.arange(1.0, TICKS + 1) * TICK_S
+    chances = np.maximum.accumulate(np.cumsum(share))
+    chances = chances[: 1 + int(np.searchsorted(chances, 1 - RAREST))]
+    return chances, np.arange(1.0, chances.size + 1) * TICK_S
 
 
 @lru_cache(maxsize=64)
