@@ -45,7 +45,7 @@ class Parameters:
         beacon_delay_s: from a beacon's pose until receivers have it.
         beacon_loss: probability that a beacon does not get through to a receiver.
         beacon_channel: physical radio whose loss on each link it is instead, with settings of its own:
-            `its-g5:density_per_km=120+rate_hz=20`.
+            `its-g5+density_per_km=120+rate_hz=20`.
         beacon_noise_m: standard deviation of a beacon's position on each axis.
         beacon_noise_mps: standard deviation of a beacon's speed.
         beacon_noise_rad: standard deviation of a beacon's heading.
@@ -122,10 +122,10 @@ def beacon_radio(text: str) -> Physical | None:
     """The radio of `beacon_channel`; None for none. Raises UserError."""
     if not text:
         return None
-    name, _, settings = text.partition(":")
+    name, *settings = text.split("+")
     if name not in CHANNELS:
         raise unknown("beacon_channel", name, CHANNELS)
-    given = {key: value for key, _, value in (each.partition("=") for each in settings.split("+") if each)}
+    given = {key: value for key, _, value in (each.partition("=") for each in settings)}
     radio = changed(CHANNELS[name], given, f"beacon_channel {name}")
     if not isinstance(radio, Physical):
         raise UserError(

@@ -23,7 +23,7 @@ SILENT: Any = {"beacon_noise_m": 0.0, "beacon_noise_mps": 0.0, "beacon_noise_rad
 EXACT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, beacon_loss=0.0, **SILENT))
 PERFECT = replace(SCENARIO, parameters=replace(SCENARIO.parameters, perfect_knowledge=True))
 HELPERS = ("v2", "v3", "v4")
-RADIO = "beacon_channel=its-g5:density_per_km=120+rate_hz=25"
+RADIO = "beacon_channel=its-g5+density_per_km=120+rate_hz=25"
 
 
 def with_loss(loss):
@@ -202,7 +202,7 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
             "beacon_channel is v2x, which has one loss for all links; it must be a physical",
         ),
         ("beacon_channel=its-g6", "unknown beacon_channel 'its-g6'; did you mean 'its-g5'?"),
-        ("beacon_channel=its-g5:density=3", "unknown setting of beacon_channel its-g5 'density'"),
+        ("beacon_channel=its-g5+density=3", "unknown setting of beacon_channel its-g5 'density'"),
         ("", "unknown setting of scenario occluded-intersection ''"),
     ],
 )
@@ -306,15 +306,15 @@ def heard(dials, seeds=range(5)):
 
 
 def test_on_a_strong_radio_beacons_get_through_and_on_a_feeble_one_only_the_first_does():
-    strong = heard("beacon_channel=its-g5:density_per_km=0+power_dbm=60")
-    feeble = heard("beacon_channel=its-g5:power_dbm=-60")
+    strong = heard("beacon_channel=its-g5+density_per_km=0+power_dbm=60")
+    feeble = heard("beacon_channel=its-g5+power_dbm=-60")
     assert strong == heard("beacon_loss=0.001")
     assert all(time_s < -0.8 for time_s in feeble.values())
 
 
 def test_a_busier_channel_never_makes_anybody_hear_more():
     """The draws are shared, and so is the shadowing."""
-    quiet, busy = (heard(f"beacon_channel=its-g5:density_per_km={density}") for density in (10, 150))
+    quiet, busy = (heard(f"beacon_channel=its-g5+density_per_km={density}") for density in (10, 150))
     assert all(busy[key] <= quiet[key] for key in quiet)
     assert busy != quiet
 
@@ -351,6 +351,6 @@ def test_dials_that_are_as_before_are_not_stated_so_that_what_was_built_stays_as
     stated = SCENARIO.parameters.stated()
     assert not {"beacon_rule", "beacon_channel"} & set(stated)
     changed = scenarios.get(f"occluded-intersection:beacon_rule=cam,{RADIO}")
-    assert changed.parameters.stated()["beacon_channel"] == "its-g5:density_per_km=120+rate_hz=25"
+    assert changed.parameters.stated()["beacon_channel"] == "its-g5+density_per_km=120+rate_hz=25"
     assert scenarios.stated("occluded-intersection", changed.parameters.stated()) == changed
     assert "interval_s" not in World.start(SCENARIO, 0).state().to_dict()["beacons"][0]
