@@ -319,6 +319,15 @@ def test_a_busier_channel_never_makes_anybody_hear_more():
     assert busy != quiet
 
 
+def test_an_environments_vehicles_beacon_over_a_radio_too():
+    dials = "beacon_rule=cam,beacon_channel=its-g5+density_per_km=200+rate_hz=20"
+    world = World.start(scenarios.get(f"env:merge-v0:{dials}"), 3)
+    world.act("IDLE")
+    state = world.state()
+    assert state.helpers
+    assert all(0.02 <= state.time_s - last_heard(state, h.id, "v1").time_s <= 1.5 for h in state.helpers)
+
+
 def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
     """Where the radio says .3 for one link and 1 for the others, its share comes, and nothing else."""
     p, n = SCENARIO.parameters, 1000
