@@ -37,7 +37,7 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
     text = (ROOT / "docs/operating-points.md").read_text()
     [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
     default = getattr(POINTS["v2x"], setting)
-    unset = "its distance" if setting == "ego_distance_m" else "the profile's"
+    unset = {"ego_distance_m": "its distance", "round_trip_s": "the model's"}.get(setting, "the profile's")
     shown = {None: unset, False: "false"}.get(default, default)
     cell = line.split("|")[3].strip().strip("`")
     assert cell == (f"{shown:g}" if isinstance(shown, float) else str(shown))

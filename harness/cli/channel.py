@@ -13,7 +13,7 @@ from harness.core.errors import UserError, printable, unknown
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
 
-app = typer.Typer(help="List radios, show one, or hold one against what is published.", no_args_is_help=True)
+app = typer.Typer(help="List radios, show one, or hold one against others' curves.", no_args_is_help=True)
 
 FORMATS = ("svg", "pdf", "png")
 Name = typer.Argument(help="Profile, or a change of one: `mode4:density_per_km=200`.", metavar="NAME")
@@ -92,23 +92,24 @@ def check(
     name: str = Name,
     n: int = typer.Option(2000, "-n", min=100, max=100_000, help="Trips at each distance."),
     against: list[Path] | None = typer.Option(
-        None, help="Somebody's curve: a CSV with distance_m and reception. May be given several times."
+        None,
+        help="Somebody's curves: a CSV with distance_m, reception and, where they had other settings, "
+        "configuration (rate_hz=10,power_dbm=20). Repeatable.",
     ),
     out: Path | None = typer.Option(None, help="Picture to write: .svg, .pdf or .png."),
     as_json: options.Json = False,
 ) -> None:
-    """Hold a radio against what it delivers and what is published.
+    """Hold a radio against what it delivers, and against others' curves.
 
-    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Published curves are taken
-    at their own settings.
+    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Curves are taken at their
+    own settings.
     """
     import numpy as np
 
     from harness.core.figures import as_mapping, shown
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.radio.trace import read
-    from harness.studies.reception import DISTANCES_M, SIGHTS, Published, compared, drawn, published
+    from harness.studies.reception import DISTANCES_M, SIGHTS, compared, curves_of, drawn
 
     profile, channel = _of(name)
     if not isinstance(channel, Physical):
@@ -116,11 +117,7 @@ def check(
     _picture(out)
     where = f"channel profile {profile}"
     messages = drawn(channel, DISTANCES_M, n)
-    of_others = [compared(CHANNELS[profile], curve, where) for curve in published(profile)]
-    for path in against or ():
-        points = [point for point in read(path) if point.sight in (None, "clear")]
-        curve = np.array([(point.distance_m, point.reception) for point in points])
-        of_others.append(compared(channel, Published("", str(path), *curve.T), where))
+    of_others = [compared(channel, curve, where) for path in against or () for curve in curves_of(path)]
     model = channel.reception(np.array(DISTANCES_M, dtype=float), SIGHTS["clear"]).tolist()
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
@@ -138,7 +135,7 @@ def check(
                  "round_trip": as_mapping(m.round_trip), "delay_s": m.delay_s}
                 for m, share in zip(messages, model, strict=True)
             ],
-            "published": [
+            "curves": [
                 {"configuration": c.curve.configuration, "source": c.curve.source, "n": len(c.reception),
                  "mean_difference": c.mean_difference, "largest_difference": c.largest_difference}
                 for c in of_others
@@ -165,7 +162,7 @@ def check(
     if of_others:
         typer.echo()
         table(
-            ["published curve", "points", "mean apart", "largest"],
+            ["curve", "points", "mean apart", "largest"],
             [
                 (
                     c.curve.configuration or c.curve.source,
@@ -177,7 +174,7 @@ def check(
             ],
         )
         mean = 100 * float(np.mean([c.mean_difference for c in of_others]))
-        typer.echo(f"{len(of_others)} curves, {mean:.1f} points apart on average; model less published")
+        typer.echo(f"{len(of_others)} curves, {mean:.1f} points apart on average; model less theirs")
         sources = dict.fromkeys(c.curve.source for c in of_others)
         typer.echo(printable("; ".join(sources), 1000))
     if out:

@@ -238,14 +238,14 @@ def reception(
     name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: Sequence[Drawn],
     against: Sequence[Compared],
 ) -> Figure:  # fmt: skip
-    """A radio's reception against distance, and beside it, if there are any, against published points.
+    """A radio's reception against distance, and beside it, if there are any, against others' curves.
 
     Args:
         name: of the condition.
         curves: label of what stands between, and reception at `distances_m`.
         distances_m: `(n,)`.
         messages: what was drawn in sight.
-        against: published curves.
+        against: others' curves.
     """
     figure = Figure(figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.add_subplot(1, 2 if against else 1, 1)
@@ -266,8 +266,10 @@ def reception(
         for each in against:
             axes.plot(100 * each.curve.reception, 100 * each.reception, ".", color=COLOURS[0], markersize=2.5)
         mean = 100 * np.mean([each.mean_difference for each in against])
-        axes.set(xlabel="published, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal")
-        curves_ = f"{len(against)} published curve{'s' * (len(against) != 1)}"
+        axes.set(
+            xlabel="others' curves, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal"
+        )
+        curves_ = f"{len(against)} curve{'s' * (len(against) != 1)}"
         axes.set_title(f"{curves_}, {mean:.1f} points apart on average", fontsize=8)
     return figure
 

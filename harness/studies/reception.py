@@ -1,14 +1,18 @@
-"""Reception against distance: a channel's own curve, the messages it delivers, and what others published."""
+"""Reception against distance: a channel's own curve, the messages it delivers, and others' curves."""
 
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from harness.coordination.operating_point import pairs
 from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, rate_interval
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
@@ -61,12 +65,12 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 
 
 @dataclass(frozen=True)
-class Published:
-    """A published curve.
+class Curve:
+    """Somebody else's curve.
 
     Attributes:
-        configuration: settings of a channel that are the publication's, as a condition has them.
-        source: the publication, or the file.
+        configuration: settings of a channel that are theirs, as a condition has them.
+        source: whose it is; else the file.
         distance_m: `(n,)`.
         reception: `(n,)` shares.
     """
@@ -77,28 +81,47 @@ class Published:
     reception: Floats
 
 
-def published(profile: str) -> list[Published]:
-    """Curves that the harness has for a profile, out of `harness/radio/published/`."""
-    table = files("harness.radio") / "published" / f"{profile}.csv"
-    if not table.is_file():
-        return []
+class _Row(msgspec.Struct, forbid_unknown_fields=True):
+    distance_m: Annotated[float, Meta(ge=0, description="metres, 0 or more")]
+    reception: Annotated[float, Meta(ge=0, le=1, description="a share from 0 to 1")]
+    configuration: str = ""
+    source: str = ""
+
+
+def curves_of(path: Path) -> list[Curve]:
+    """Curves out of a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
+
+    Raises:
+        UserError: it is none, or a value is not allowed: file, line, value.
+    """
+    shown = printable(path)
+    try:
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{shown} cannot be read as a table: {printable(error)}") from None
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
-        point = float(row["distance_m"]), float(row["reception"])
-        curves.setdefault((row["configuration"], row["source"]), []).append(point)
-    return [Published(*key, *np.array(points).T) for key, points in curves.items()]
+    for line, row in enumerate(rows, 2):
+        try:
+            point = msgspec.convert(row, _Row, strict=False, str_keys=True)
+        except msgspec.ValidationError as error:
+            raise UserError(f"{shown}, line {line}: {printable(error)}") from None
+        key = point.configuration, point.source or path.name
+        curves.setdefault(key, []).append((point.distance_m, point.reception))
+    if not curves:
+        raise UserError(f"{shown} has no rows; give distance_m and reception at one distance at least")
+    return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A model held against a published curve.
+    """A model held against a curve.
 
     Attributes:
         curve: the curve.
         reception: the model's at its distances, `(n,)`.
     """
 
-    curve: Published
+    curve: Curve
     reception: Floats
 
     @property
@@ -108,12 +131,12 @@ class Compared:
 
     @property
     def largest_difference(self) -> float:
-        """The difference that is largest, model less published, a share."""
+        """The difference that is largest, model less theirs, a share."""
         apart = self.reception - self.curve.reception
         return float(apart[np.abs(apart).argmax()])
 
 
-def compared(channel: Channel, curve: Published, where: str) -> Compared:
+def compared(channel: Channel, curve: Curve, where: str) -> Compared:
     """The channel, with the curve's settings, against the curve. Raises UserError for one it has not."""
     there = changed(channel, pairs(curve.configuration), where)
     assert isinstance(there, Physical)

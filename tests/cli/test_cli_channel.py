@@ -52,15 +52,17 @@ def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[
 
 
 def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: Callable[..., Said]) -> None:
-    Path("theirs.csv").write_text("distance_m,reception\n10,0.97\n100,0.5\n")
+    rows = '10,0.97,"power_dbm=20,rate_hz=20",they\n100,0.5,"power_dbm=20,rate_hz=20",they\n10,0.9,,they\n'
+    Path("theirs.csv").write_text(f"distance_m,reception,configuration,source\n{rows}")
     code, out, err = harness(
         "channel", "check", "mode4", "-n", "400", "--against", "theirs.csv", "--out", "m.svg"
     )
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    assert "theirs.csv" in out
+    assert "power_dbm=20,rate_hz=20       2" in out
+    assert "2 curves, " in out
     assert "wrote m.svg" in out
-    assert "published, %" in Path("m.svg").read_text()
+    assert "others' curves, %" in Path("m.svg").read_text()
     told = json.loads(harness("channel", "check", "mode4", "-n", "2000", "--json")[1])
     for point in told["messages"]:
         assert point["crossing"]["low"] - 0.02 <= point["model"] <= point["crossing"]["high"] + 0.02
@@ -76,10 +78,14 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
         (("show", "single-local"), "has no channel; `harness channel list` shows"),
         (("check", "6g"), "loses the same at any distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
-        (("check", "mode4", "--against", "no.csv"), "cannot be read as a table"),
+        (("check", "mode4", "--against", "bad.csv"), "bad.csv, line 3: Expected `float` <= 1.0"),
+        (("check", "mode4", "--against", "other.csv"), "did you mean 'rate_hz'"),
+        (("check", "mode4", "--against", "no.csv"), "no.csv cannot be read as a table"),
     ],
 )
 def test_a_mistake_is_one_line(harness: Callable[..., Said], arguments: tuple[str, ...], says: str) -> None:
+    Path("bad.csv").write_text("distance_m,reception\n10,0.9\n20,1.9\n")
+    Path("other.csv").write_text("distance_m,reception,configuration\n10,0.9,rat_hz=10\n")
     code, out, err = harness("channel", *arguments)
     assert (code, out) == (2, "")
     assert says in err
