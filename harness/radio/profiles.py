@@ -4,9 +4,10 @@ A file names a model and its parameters, and says what they rest on. A package a
 point in the group `swarmdrive.channels`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
@@ -17,20 +18,17 @@ from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.resources import entries, find
-from harness.radio import trace
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
-from harness.radio.its_g5 import ItsG5
-from harness.radio.lte_mode4 import LteMode4
-from harness.radio.nr_mode2 import NrMode2
 
-# Name of a model to what makes a channel of a file's parameters, its folder, and what to call it in messages.
-MODELS: dict[str, Callable[[Mapping[str, Any], Path, str], Channel]] = {
-    "constant": lambda parameters, folder, where: convert(parameters, Radio, where),
-    "lte-v2x-mode4": lambda parameters, folder, where: convert(parameters, LteMode4, where),
-    "nr-v2x-mode2": lambda parameters, folder, where: convert(parameters, NrMode2, where),
-    "its-g5": lambda parameters, folder, where: convert(parameters, ItsG5, where),
-    "trace": trace.of_profile,
+# Name of a model to its class, or to a function of a file's parameters, its folder and what to call them in
+# messages. A physical one takes a while to import, so only what is named is.
+MODELS = {
+    "constant": "harness.radio.constant:Radio",
+    "lte-v2x-mode4": "harness.radio.lte_mode4:LteMode4",
+    "nr-v2x-mode2": "harness.radio.nr_mode2:NrMode2",
+    "its-g5": "harness.radio.its_g5:ItsG5",
+    "trace": "harness.radio.trace:of_profile",
 }
 
 
@@ -152,7 +150,13 @@ def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
     profile = convert(toml(path, where), Profile, where)
     if profile.model not in MODELS:
         raise unknown(f"model in {where}", profile.model, MODELS)
-    channel = MODELS[profile.model](profile.parameters, path.parent, f"{where} [parameters]")
+    module, _, name = MODELS[profile.model].partition(":")
+    model: Any = getattr(import_module(module), name)
+    parameters = f"{where} [parameters]"
+    if isinstance(model, type):
+        channel: Channel = convert(profile.parameters, model, parameters)
+    else:
+        channel = model(profile.parameters, path.parent, parameters)
     for name in profile.limits:
         if name not in settable(channel):
             raise unknown(f"key in {where} [limits]", name, settable(channel))
