@@ -2,8 +2,8 @@
 
 That holds for every episode whose decisions act in the frame of the dataset's lag. The reference drivers'
 all do. Over 6G a decision that waits for a lost or a slow reply acts later, and one answer of twenty of
-`proxy-faulty` is 0.4 s late: such episodes are left out, and counted. Over a physical radio it shows that both
-worlds have the same places, shadowing and packets.
+`proxy-faulty` is 0.4 s late: such episodes are left out, and counted. Over a physical radio it shows that
+both worlds have the same places, shadowing and packets.
 """
 
 from collections import defaultdict
