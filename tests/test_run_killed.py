@@ -118,7 +118,7 @@ def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Datase
         ({"batch_size": 3}, "batch_size"),
         ({"prompt": "v1"}, "prompt"),
         ({"model": "cruise"}, "model"),
-        ({"points": ()}, "conditions"),
+        ({"points": ()}, "conditions, channels"),
         ({"limit": 4}, "limit of the world"),
         ({"prompt": "v1", "seeds": (7,)}, "prompt, seeds"),
     ],

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="List radios, show one, or hold one against others' curves.", no_args_is_help=True)
 
 FORMATS = ("svg", "pdf", "png")
+MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(help="Profile, or a change of one: `mode4:density_per_km=200`.", metavar="NAME")
 
 
@@ -90,7 +91,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     name: str = Name,
-    n: int = typer.Option(2000, "-n", min=100, max=100_000, help="Trips at each distance."),
+    n: int = typer.Option(2000, "-n", help="Trips at each distance, 100 to 100000."),
     against: list[Path] | None = typer.Option(
         None,
         help="Somebody's curves: a CSV with distance_m, reception and, where they had other settings, "
@@ -111,6 +112,8 @@ def check(
     from harness.radio.profiles import CHANNELS, outside
     from harness.studies.reception import DISTANCES_M, SIGHTS, compared, curves_of, drawn
 
+    if not 100 <= n <= MOST_TRIPS:
+        raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
     profile, channel = _of(name)
     if not isinstance(channel, Physical):
         raise UserError(f"{printable(name)} loses the same at any distance; there is no curve to check")

@@ -86,10 +86,19 @@ class Profiles(Plugins[Channel]):
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
     """Which of a channel's settings leave what its source held the model against, a sentence each."""
     return [
-        f"{name} = {value:g} is outside what its model was held against, {low:g} to {high:g}."
+        f"{name} = {printable(settings.get(name), 20)} is outside what its model was held against, "
+        f"{low:g} to {high:g}."
         for name, (low, high) in limits.items()
-        if not low <= (value := float(settings[name])) <= high
+        if not low <= _number(settings.get(name)) <= high
     ]
+
+
+def _number(value: object) -> float:
+    """A number, or the text of one, as a float; NaN for anything else."""
+    try:
+        return float(value) if isinstance(value, str | int | float) else np.nan
+    except ValueError:
+        return np.nan
 
 
 def changed(channel: Channel, settings: Mapping[str, str], where: str) -> Channel:

@@ -80,10 +80,10 @@ def of_run(run: Run) -> Iterator[str]:
 def beyond_sources(manifest: Manifest) -> Iterator[str]:
     """Conditions whose radio has settings that its model's source never held against anything."""
     for condition in manifest.conditions:
-        record = manifest.channels.get(condition.get("profile") or "", {})
-        settings = {**record.get("parameters", {}), **pairs(condition.get("radio", ""))}
-        for sentence in outside(settings, record.get("limits", {})):
-            yield f"{printable(condition['name'])}: {sentence}"
+        if record := manifest.channels.get(condition.get("profile") or ""):
+            settings = {**record.parameters, **pairs(condition.get("radio", ""))}
+            for sentence in outside(settings, record.limits):
+                yield f"{printable(condition['name'])}: {sentence}"
 
 
 def no_prompt(manifests: Iterable[Manifest]) -> list[str]:

@@ -360,6 +360,17 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
             raise ValueError("the scenario has no name, or no parameters")
 
 
+class ChannelRecord(Struct, frozen=True, kw_only=True):
+    """A channel profile as it was: `harness.radio.profiles.Profile`, with every parameter of its model."""
+
+    model: str
+    description: str
+    source: str
+    status: str
+    parameters: dict[str, Any]
+    limits: dict[str, tuple[float, float]] = {}
+
+
 class Manifest(Struct, frozen=True, kw_only=True):
     """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
 
@@ -374,7 +385,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     world: FrozenScenes | ClosedLoop
     actions: tuple[str, ...]
     conditions: tuple[dict[str, Any], ...]
-    channels: dict[str, dict[str, Any]] = {}
+    channels: dict[str, ChannelRecord] = {}
     seeds: tuple[int, ...]
     thinking: bool
     answer: str
@@ -404,6 +415,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"{where}: {lacks[0]} is no text")
         if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
             raise ValueError("conditions: a profile is no text")
+        if any(not isinstance(point.get("radio", ""), str) for point in self.conditions):
+            raise ValueError("conditions: a radio is no text")
         names = tuple(point["name"] for point in self.conditions)
         for what, several in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
             if not 0 < len(several) == len(set(several)):

@@ -78,7 +78,9 @@ class Stored:
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         for profile, recorded in manifest.channels.items():
-            if profile not in CHANNELS or CHANNELS.record(profile) != recorded:
+            if profile not in CHANNELS or CHANNELS.record(profile) != msgspec.json.decode(
+                msgspec.json.encode(recorded)
+            ):
                 raise UserError(
                     f"{printable(folder)}: channel profile {printable(profile)} has changed since; restore "
                     "it or run again"

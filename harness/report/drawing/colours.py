@@ -11,7 +11,7 @@ INK, GREY, PALE = "#222222", "#777777", "#DDDDDD"
 GOOD, LATE, BAD = "#009E73", "#BA7F00", "#C8321F"
 OUTCOMES = {"good": GOOD, "late": LATE, "bad": BAD}
 ROLES = {"ego": "#9645B0", "helper": "#B07CC6", "danger": "#D6246E", "merge": "#85709F", "other": "#FFFFFF"}
-CONDITIONS = {"single-local": "#6B7480", "v2x": "#0072B2", "6g": "#2F97DB", "cloud": "#3E8E9E"}
+CONDITIONS = {"single-local": "#6B7480", "v2x": "#0072B2", "6g": "#2F97DB"}
 _MORE = ("#5B5BD0", "#8094AC")
 _SLOW_TO_FAST = ("#E6D7AE", "#CBB176", "#AE8A42", "#866828", "#5F430F")
 # Of sources that a study draws along one axis; no page of a run has them.
