@@ -86,7 +86,7 @@ class Profiles(Plugins[Channel]):
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
     """Which of a channel's settings leave what its source held the model against, a sentence each."""
     return [
-        f"{name} = {printable(settings.get(name), 20)} is outside what its model was held against, "
+        f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "
         f"{low:g} to {high:g}."
         for name, (low, high) in limits.items()
         if not low <= _number(settings.get(name)) <= high
