@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="List radios, show one, or hold one against others' curves.", no_args_is_help=True)
 
-FORMATS = ("svg", "pdf", "png")
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(help="Profile, or a change of one: `mode4:density_per_km=200`.", metavar="NAME")
 
@@ -247,7 +246,11 @@ def crowd(
 
 
 def _picture(out: Path | None) -> None:
-    if out and out.suffix[1:] not in FORMATS:
+    if not out:
+        return
+    from harness.report.drawing.pictures import FORMATS
+
+    if out.suffix[1:] not in FORMATS:
         raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
 
 

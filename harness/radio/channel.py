@@ -68,16 +68,20 @@ class Draws:
     @cached_property
     def packet(self) -> Floats:
         """Request and reply of each helper, `(..., H, 2)`, anew at every step."""
-        return self._trips.uniforms(self.jitter.shape[-1])[..., 1:].reshape(*self.jitter.shape, 2)
+        return self._uniforms[..., 1:].reshape(*self.jitter.shape, 2)
 
     @cached_property
     def wait(self) -> Floats:
         """The request's wait for its turn, `(...)`, anew at every step."""
-        return self._trips.uniforms(self.jitter.shape[-1])[..., 0]
+        return self._uniforms[..., 0]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
         return self._trips.shadow(xy_m, decorrelation_m)
+
+    @cached_property
+    def _uniforms(self) -> Floats:
+        return self._trips.uniforms(self.jitter.shape[-1])
 
     @property
     def _trips(self) -> Trips:
