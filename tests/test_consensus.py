@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from harness.coordination.consensus import (
-    POOLS,
     inverse_distance_weights,
     linear_pool,
     log_pool,
     median,
     trimmed_mean,
 )
+from harness.coordination.rules import POOLS
 
 
 def test_weights_fall_with_the_distance_to_the_conflict_zone():

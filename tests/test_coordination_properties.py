@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.consensus import POOLS
 from harness.coordination.coordinate import Coordination, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.rules import POOLS
 from harness.radio.channel import Draws
 
 COOPERATIVE = [POINTS["v2x"], POINTS["6g"], replace(POINTS["6g"], density_coupled=True)]

@@ -11,10 +11,11 @@ import pytest
 from packaged import register
 from swarm_extras import FOG, SMOOTHING, Fog
 
-from harness.coordination.consensus import RULES, Messages, Rule
+from harness.coordination.consensus import Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
 from harness.radio.channel import Channel, Draws, Links, Site
@@ -182,8 +183,9 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         weights /= weights.sum(axis=-1, keepdims=True)
         intents = np.where((weights > 0)[..., None], rng.dirichlet(np.ones(4), (20, 4)), np.nan)
         messages = Messages(
-            intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3))
-        )
+            intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3)),
+            np.full((20, 3), np.nan),
+        )  # fmt: skip
         fused = rule.fuse(messages, state)
         assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
         assert (fused.policy >= 0).all()

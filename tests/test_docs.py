@@ -8,8 +8,8 @@ import pytest
 
 from harness.backends.base import AnswerMode
 from harness.backends.failures import Failures
-from harness.coordination.consensus import EGO_PROMPT, POOLS
 from harness.coordination.operating_point import POINTS, SETTINGS
+from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.parsing.parse import Repair, Status
 from harness.report.compare.gate import NAMES
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from evaluating import A_TENTH, Scripted, Walked, all_scenes, asker_of, course, says, spec_of, sure, walked
 
-from harness.coordination.consensus import RULES, Fused, linear_pool
+from harness.coordination.consensus import Fused, linear_pool
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import RULES
 from harness.dataset.load import Dataset
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import walk

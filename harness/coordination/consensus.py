@@ -1,9 +1,7 @@
 """How intents become one policy. Vehicle 0 is the ego and is always heard.
 
-A rule without memory is one function of (p, weights) and one entry in `POOLS`; a rule with memory is a class
-with `start` and `fuse`. A package adds either, the function wrapped by `Pool`, by an entry point in the group
-`swarmdrive.rules`. `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its
-prompt (the paper's section III-C).
+A rule without memory is one function of (p, weights); a rule with memory is a class with `start` and `fuse`.
+`rules.py` lists them.
 """
 
 from collections.abc import Callable
@@ -13,7 +11,6 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
-from harness.core.plugins import Plugins
 
 
 @dataclass(frozen=True)
@@ -29,6 +26,8 @@ class Messages:
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its
             operating point declares, if it does.
         range_m: distance to the ego, `(..., H)`.
+        sensed_m: distance to that centroid as the ego's own sensors have it, `(..., H)`; NaN where they do
+            not see the helper.
     """
 
     intents: Floats
@@ -37,6 +36,7 @@ class Messages:
     arrival_s: Floats
     distance_m: Floats
     range_m: Floats
+    sensed_m: Floats
 
 
 class Fused(NamedTuple):
@@ -46,11 +46,14 @@ class Fused(NamedTuple):
         policy: `(..., A)`, each a distribution.
         weights: each vehicle's weight in it, `(..., 1+H)`; NaN where there is no such thing.
         state: what the rule remembers at the next step, `(..., K)`; K may be 0.
+        trust: how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it takes
+            it for an attacker. NaN where it heard nothing. None of a rule that judges nobody.
     """
 
     policy: Floats
     weights: Floats
     state: Floats
+    trust: Floats | None = None
 
 
 @runtime_checkable
@@ -164,13 +167,3 @@ def _pick(values: Floats, reached: Bools) -> Floats:
 def _scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))
-
-
-POOLS = {"linear": linear_pool, "log-pool": log_pool, "median": median, "trimmed-mean": trimmed_mean}
-RULES: Plugins[Rule] = Plugins("swarmdrive.rules", Rule, {name: Pool(pool) for name, pool in POOLS.items()})
-EGO_PROMPT = "ego-prompt"
-
-
-def names() -> tuple[str, ...]:
-    """What an operating point's `consensus` may be."""
-    return (*RULES, EGO_PROMPT)

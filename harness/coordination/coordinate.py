@@ -11,10 +11,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from harness.coordination.consensus import EGO_PROMPT, RULES, Messages, inverse_distance_weights
+from harness.coordination.consensus import Messages, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange, inferred_s
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Draws
 
@@ -51,6 +52,7 @@ class Coordination(Exchange):
             NaN where the ego's time of inference is unknown.
         deadline_missed: that was after the window, `(...)`.
         state: what the rule remembers at the episode's next step, `(..., K)`; K is 0 without memory.
+        trust: how far the rule trusts each helper, `(..., H)`; NaN where it judges none (`consensus.Fused`).
     """
 
     weights: Floats
@@ -60,6 +62,7 @@ class Coordination(Exchange):
     latency_s: Floats
     deadline_missed: Bools
     state: Floats
+    trust: Floats
 
     @property
     def fusion_s(self) -> Floats:
@@ -85,6 +88,7 @@ def fuse(
         distance_m = np.insert(distance_m[..., 1:], 0, point.ego_distance_m, axis=-1)
     weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
     anybody = np.any(heard.on_time, axis=-1)
+    trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus == EGO_PROMPT:
         if fusion.call is None:
@@ -96,9 +100,11 @@ def fuse(
         state = np.zeros((*failed.shape, 0))
     else:
         rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
-        messages = Messages(p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m)
+        sensed_m = trust if intents.sensed_m is None else intents.sensed_m  # NaN: nobody looked
+        messages = Messages(p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, sensed_m)
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
-        fused, weights, state = rule.fuse(messages, state)
+        fused, weights, state, trusted = rule.fuse(messages, state)
+        trust = trust if trusted is None else np.where(heard.on_time, trusted, np.nan)
     fused = np.where((anybody & ~failed)[..., None], fused, heard.own)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
@@ -109,4 +115,5 @@ def fuse(
         latency_s=np.where(np.isnan(inferred_s(point, intents)[..., 0]), np.nan, latency_s),
         deadline_missed=latency_s > point.window_s,
         state=state,
+        trust=trust,
     )

@@ -127,7 +127,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     if channel.needs_site and point.loss is not None:
         up, loss = np.all(draws.packet >= point.loss, axis=-1), np.full_like(loss, point.loss)
     requested = np.any(asked, axis=-1)
-    delivered = asked & up
+    delivered = asked & up if intents.silent is None else asked & up & ~intents.silent
     slot_end_s = request_s + delay_s
     arrival_s = np.where(delivered, slot_end_s, np.inf)
     ends_s = np.where(asked, slot_end_s, request_s)

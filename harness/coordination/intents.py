@@ -3,7 +3,9 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from harness.core.arrays import Bools, Floats
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Site
 
 
@@ -22,6 +24,11 @@ class Intents:
         payload_bits: size of the reply, `(..., H)`.
         inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
         site: where the vehicles truly are, for a channel that needs it; else None.
+        sensed_m: the helper's distance to that centroid as the ego's own sensors have it, `(..., H)`; NaN
+            where they do not see it. None where nobody looked.
+        silent: the helper is asked and sends nothing in its slot, `(..., H)`. None: nobody.
+        voice_of: place of the vehicle whose voice each of the H is, `(..., H)`, where one has several. None:
+            each its own.
     """
 
     own: Floats
@@ -32,11 +39,33 @@ class Intents:
     payload_bits: Floats
     inference_s: Floats
     site: Site | None = None
+    sensed_m: Floats | None = None
+    silent: Bools | None = None
+    voice_of: Ints | None = None
 
     def take(self, at: Any) -> "Intents":
         """The decisions at these places of the leading dimension."""
-        site = self.site and self.site.take(at)
-        return replace(self, **{name: getattr(self, name)[at] for name in ARRAYS}, site=site)
+        return replace(
+            self,
+            site=self.site and self.site.take(at),
+            **{name: array[at] for name, array in self.arrays().items()},
+        )
+
+    def of_helpers(self, places: Ints) -> "Intents":
+        """The same with the helpers of these places `(n, H')`, of decisions `(n, H)`; one may come again."""
+        with_ego = np.insert(places + 1, 0, 0, axis=-1)
+        taken = {
+            name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
+            for name, array in self.arrays().items()
+            if name not in ("own", "helpers")
+        }
+        helpers = np.take_along_axis(self.helpers, places[..., None], axis=-2)
+        return replace(self, helpers=helpers, site=self.site and self.site.of_helpers(places), **taken)
+
+    def arrays(self) -> dict[str, Any]:
+        """Those that are there, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if name != "site" and value is not None}
 
 
-ARRAYS = tuple(field.name for field in fields(Intents) if field.name != "site")
+WITH_EGO = ("distance_m", "inference_s")  # arrays whose first column is the ego's

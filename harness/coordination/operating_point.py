@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from harness.coordination.consensus import EGO_PROMPT, RULES, names
+from harness.coordination.attacks import attacks_of
+from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel
 from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
@@ -49,6 +50,8 @@ class OperatingPoint:
             inference.
         radio: further settings of the profile's channel, in place of its own:
             `density_per_km=200,power_dbm=23`.
+        attack: what some of the helpers do instead of saying what they intend, `liar:share=1/3+spoof`
+            (`harness.coordination.attacks`); empty for honest ones.
     """
 
     name: str
@@ -71,6 +74,7 @@ class OperatingPoint:
     messages: str = "own"
     round_trip_s: float | None = None
     radio: str = ""
+    attack: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -103,6 +107,13 @@ class OperatingPoint:
                 raise self._wrong(flag, "true or false")
         if self.messages == "shuffled" and self.consensus == EGO_PROMPT:
             raise self._wrong("messages", f"own or blind where consensus is {EGO_PROMPT}")
+        for attack in attacks_of(str(self.attack)):
+            if self.profile is None:
+                raise self._wrong("attack", "left out where there is no channel")
+            if self.consensus == EGO_PROMPT and not attack.by_moment:
+                raise self._wrong(
+                    "attack", f"one that needs no past and adds no voices where consensus is {EGO_PROMPT}"
+                )
         self.channel()
 
     @classmethod

@@ -17,8 +17,9 @@ from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
+from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.fusion import codes_of
 from harness.radio.channel import Draws, Site
 from harness.radio.fading import Trips
@@ -44,6 +45,11 @@ class Due:
     seed: Ints
     draws: Draws
 
+    @property
+    def episodes(self) -> list[tuple[int, int]]:
+        """Number and seed of each."""
+        return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
+
 
 @dataclass(frozen=True)
 class Decided(Generic[Moment]):
@@ -54,12 +60,14 @@ class Decided(Generic[Moment]):
         moments: those the world showed.
         due: what was to be decided.
         result: what was, (n, ...).
+        attackers: whose voice was an attacker's, (n, H).
     """
 
     point: OperatingPoint
     moments: Sequence[Moment]
     due: Due
     result: Coordination
+    attackers: Bools
 
 
 class World(Protocol[Moment]):
@@ -108,6 +116,7 @@ def walk(
 ) -> Iterator[Sequence[Decided[Moment]]]:
     """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
     memories: dict[str, Memory] = {point.name: Memory() for point in points}
+    attackers = {point.name: Attackers(point) for point in points}
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
@@ -115,13 +124,17 @@ def walk(
             intents = replace(intents, site=world.site())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
-        calls = _fusion_calls(due, moments, intents, blind, ask)
+        said = {
+            point: attackers[point.name].said(heard(point, intents, blind, each), each.draws, each.episodes)
+            for point, each in due.items()
+        }
+        calls = _fusion_calls(due, said, moments, ask)
         decided = []
         for point, each in due.items():
             call = calls[point.asks_blind](each.at) if point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, heard(point, intents, blind, each), each.draws, fusion)
-            decided.append(Decided(point, moments, each, result))
+            result = coordinate(point, said[point].intents, said[point].draws, fusion)
+            decided.append(Decided(point, moments, each, result, said[point].attackers))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
         yield decided
@@ -161,18 +174,16 @@ class Memory:
 
     def recall(self, due: Due) -> Floats | None:
         """The state of each decision's episode, (n, K); None at the first step."""
-        places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
-        return np.array([self._state[place] for place in places]) if self._state else None
+        return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
         """The state for the next step, (n, K), if the rule has any."""
         if state.shape[-1]:
-            places = zip(due.episode.tolist(), due.seed.tolist(), strict=True)
-            self._state |= dict(zip(places, state, strict=True))
+            self._state |= dict(zip(due.episodes, state, strict=True))
 
 
 def _fusion_calls(
-    due: Mapping[OperatingPoint, Due], moments: Sequence[Moment], intents: Intents, blind: Intents | None,
+    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said], moments: Sequence[Moment],
     ask: Ask[Moment],
 ) -> dict[bool, Callable[[Ints], FusionCall]]:  # fmt: skip
     """One fusion call for each set of messages that any condition hears; who is heard depends on none.
@@ -182,18 +193,16 @@ def _fusion_calls(
     calls = {}
     for of in sorted({point.asks_blind for point in due if point.asks_again}):
         alike = {point: each for point, each in due.items() if point.asks_blind == of}
-        calls[of] = ask.fusion_call(moments, heard_codes(alike, intents, blind), of)
+        calls[of] = ask.fusion_call(moments, heard_codes(alike, said), of)
     return calls
 
 
-def heard_codes(
-    due: Mapping[OperatingPoint, Due], intents: Intents, blind: Intents | None = None
-) -> Ints:  # fmt: skip
+def heard_codes(due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said]) -> Ints:
     """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
     for point, each in due.items():
         if point.asks_again:
-            on_time = exchange(point, heard(point, intents, blind, each), each.draws).on_time
+            on_time = exchange(point, said[point].intents, said[point].draws).on_time
             codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
@@ -245,7 +254,8 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     starts = np.cumsum([0, *map(len, first.values())]).tolist()
     start = dict(zip(first, starts, strict=False))
     scenes = [scene for moments in first.values() for scene in moments]
-    helpers = max(len(scene.viewers) for scene in scenes) - 1
+    places = max(len(scene.viewers) for scene in scenes) - 1
+    helpers = max(places, *(part.attackers.shape[1] for part in decided))
     at = np.concatenate([start[id(part.moments)] + part.due.at for part in decided])
     n_each = [len(part.due.at) for part in decided]
     points = list(dict.fromkeys(part.point.name for part in decided))
@@ -254,22 +264,22 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     def of_scenes(values: Iterable[Any]) -> Any:
         return np.array(list(values))[at]
 
+    def widened(arrays: Iterable[Any]) -> Any:
+        return np.concatenate([np.pad(each, ((0, 0), (0, helpers - each.shape[1]))) for each in arrays])
+
     def of_messages(name: str) -> Any:
-        arrays = [getattr(part.result, name) for part in decided]
-        wide = [np.pad(each, ((0, 0), (0, helpers - each.shape[1]))) for each in arrays]
-        return np.concatenate(wide)
+        return widened(getattr(part.result, name) for part in decided)
 
     numbers = [columns(part) for part in decided]
     asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
     sent = {
         "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
         "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
-        "weight": np.concatenate([
-            np.pad(part.result.weights[:, 1:], ((0, 0), (0, helpers + 1 - part.result.weights.shape[1])))
-            for part in decided
-        ]),
+        "weight": widened([part.result.weights[:, 1:] for part in decided]),
+        "trust": of_messages("trust"), "attacker": widened([part.attackers for part in decided]),
     }  # fmt: skip
-    senders = [[*scene.viewers[1:], *[None] * (helpers + 1 - len(scene.viewers))] for scene in scenes]
+    voices = [f"voice-{n + 1}" for n in range(helpers - places)]  # of a helper that has several
+    senders = [[*scene.viewers[1:], *[None] * (places + 1 - len(scene.viewers)), *voices] for scene in scenes]
     episode, step = (of_scenes(scene.record[name] for scene in scenes) for name in ("episode", "step"))
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]

@@ -45,6 +45,16 @@ class Site:
         """The sites at these places of the leading dimension."""
         return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at])
 
+    def of_helpers(self, places: Ints) -> "Site":
+        """The same with the helpers of these places, `(n, H')`; one may come again."""
+        with_ego = np.insert(places + 1, 0, 0, axis=-1)[..., None]
+        return Site(
+            np.take_along_axis(self.xy_m, with_ego, axis=-2),
+            np.take_along_axis(self.sight, places, axis=-1),
+            np.take_along_axis(self.blocker_m, places, axis=-1),
+            np.take_along_axis(self.corner_m, places[..., None], axis=-2),
+        )
+
 
 @dataclass(frozen=True)
 class Draws:
@@ -64,6 +74,11 @@ class Draws:
     def take(self, at: Any) -> "Draws":
         """The draws at these places of the leading dimension."""
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at))
+
+    def of_helpers(self, places: Ints) -> "Draws":
+        """The draws of the helpers of these places, `(n, H')`; voices of one share its link."""
+        link = np.take_along_axis(self.link, places[..., None], axis=-2)
+        return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
 
     @cached_property
     def packet(self) -> Floats:

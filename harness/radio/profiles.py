@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal, TypeVar, cast, get_type_hints
 
 import msgspec
 import numpy as np
@@ -20,6 +20,8 @@ from harness.core.plugins import Plugins
 from harness.core.resources import entries, find
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
+
+Settings = TypeVar("Settings")
 
 # Name of a model to its class, or to a function of a file's parameters, its folder and what to call them in
 # messages. A physical one takes a while to import, so only what is named is.
@@ -101,11 +103,11 @@ def _number(value: object) -> float:
         return np.nan
 
 
-def changed(channel: Channel, settings: Mapping[str, str], where: str) -> Channel:
-    """The channel with some of its fields from their texts.
+def changed(channel: Settings, settings: Mapping[str, str], where: str) -> Settings:
+    """The channel, or another frozen dataclass, with some of its fields from their texts.
 
     Args:
-        channel: of a profile.
+        channel: what is changed.
         settings: fields' names and values.
         where: what to call it in messages.
 
@@ -121,12 +123,12 @@ def changed(channel: Channel, settings: Mapping[str, str], where: str) -> Channe
     kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
     convert(values, kind, where)
     try:
-        return replace(channel, **values)
+        return cast("Settings", replace(cast("Any", channel), **values))
     except ValueError as problem:
         raise UserError(f"{where}: {printable(problem)}") from None
 
 
-def settable(channel: Channel) -> list[str]:
+def settable(channel: Any) -> list[str]:
     """Names of the fields that are one number, switch or text."""
     values = {field.name: getattr(channel, field.name) for field in fields(channel)}
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]

@@ -34,10 +34,13 @@ NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and the outcome of each action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
 # A column a message's place, from 1: who was asked, and the fate of the reply.
-OF_MESSAGES = {"helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER}
+OF_MESSAGES = {
+    "helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER,
+    "trust": NUMBER, "attacker": FLAG,
+}  # fmt: skip
 DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
     "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
-    "airtime_ms": 6, "arrival_ms": 3, "weight": 6,
+    "airtime_ms": 6, "arrival_ms": 3, "weight": 6, "trust": 6,
 }  # fmt: skip
 
 ROWS = 2048  # that become mappings at a time

@@ -155,13 +155,25 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
-    """A helper's reply: whether it arrived, when (None if lost), and its weight in the policy."""
+    """A helper's reply: what became of it, and of what worth it was to the ego.
+
+    Attributes:
+        sender: the helper.
+        delivered: whether it arrived.
+        on_time: within the window.
+        arrival_ms: None if lost.
+        weight: in the policy; None if a fusion call answered.
+        trust: how far the consensus rule trusted it, from 0 to 1; None if the rule judges nobody.
+        attacker: whether the sender attacks under this condition.
+    """
 
     sender: str
     delivered: bool
     on_time: bool
     arrival_ms: float | None
     weight: float | None
+    trust: float | None
+    attacker: bool
 
 
 class Decision(Struct, frozen=True, kw_only=True):

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.consensus import POOLS, names
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
+from harness.coordination.rules import POOLS, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.profiles import CHANNELS, settable
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.coordinate import FusionCall
-from harness.coordination.intents import ARRAYS, Intents
+from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
@@ -133,7 +133,8 @@ class CalibratedWorld:
 
     def __call__(self, moments: Sequence[int]) -> Intents:
         """What every vehicle intends at this step."""
-        now = Intents(*(self._now(lambda d: getattr(d.intents, name)) for name in ARRAYS))  # noqa: B023
+        names = self._drawn[0].intents.arrays()
+        now = Intents(**{name: self._now(lambda d: d.intents.arrays()[name]) for name in names})  # noqa: B023
         return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
 
     def blind(self, moments: Sequence[int], at: Ints) -> Intents:

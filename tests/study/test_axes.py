@@ -2,8 +2,8 @@
 
 import pytest
 
-from harness.coordination.consensus import POOLS
 from harness.coordination.operating_point import POINTS
+from harness.coordination.rules import POOLS
 from harness.core.errors import UserError
 from harness.studies.axes import AXES, axis_of, grid
 

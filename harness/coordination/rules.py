@@ -1,0 +1,24 @@
+"""The consensus rules by name, and what packages add to them.
+
+A package adds a rule by an entry point in the group `swarmdrive.rules`, a function of (p, weights) wrapped by
+`Pool`. `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its prompt (the
+paper's section III-C).
+"""
+
+from harness.coordination.consensus import Pool, Rule, linear_pool, log_pool, median, trimmed_mean
+from harness.coordination.robust import HEADS
+from harness.coordination.trust import Trust
+from harness.core.plugins import Plugins
+
+POOLS = {"linear": linear_pool, "log-pool": log_pool, "median": median, "trimmed-mean": trimmed_mean}
+RULES: Plugins[Rule] = Plugins(
+    "swarmdrive.rules",
+    Rule,
+    {**{name: Pool(pool) for name, pool in POOLS.items()}, **HEADS, "trust": Trust()},
+)
+EGO_PROMPT = "ego-prompt"
+
+
+def names() -> tuple[str, ...]:
+    """What an operating point's `consensus` may be."""
+    return (*RULES, EGO_PROMPT)

@@ -1,0 +1,224 @@
+"""Attacks, played by hand: what reaches the channel in place of what helpers intend."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.coordination.attacks import ATTACKS, Turn, attackers, attacks_of
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.core.errors import UserError
+from harness.evaluate.attackers import Attackers
+from harness.radio.channel import Draws
+from harness.radio.fading import Trips
+
+NAN = np.nan
+SLOWER_IDLE_FASTER = 3
+
+
+def intents(helpers: Any, own: Any = (0.4, 0.3, 0.3)) -> Intents:
+    """One decision: the ego 20 m from the conflict zone, helpers 10, 11 and 12 m, all in sight of it."""
+    p = np.array([helpers], dtype=float)
+    n = p.shape[1]
+    return Intents(
+        own=np.array([own]), helpers=p, valid=np.ones((1, n), dtype=bool),
+        distance_m=np.array([[20.0, *(10.0 + np.arange(n))]]), range_m=np.array([30.0 + np.arange(n)]),
+        payload_bits=np.full((1, n), 800.0), inference_s=np.full((1, 1 + n), 0.1),
+        sensed_m=np.array([10.0 + np.arange(n)]),
+    )  # fmt: skip
+
+
+CAREFUL, KEEP, BOLD = [0.7, 0.2, 0.1], [0.2, 0.6, 0.2], [0.1, 0.3, 0.6]
+TRUTH = intents([CAREFUL, KEEP, BOLD])
+
+
+def said(text: str, truth: Intents = TRUTH, **turn: Any) -> Intents:
+    """What is said where helper 0 attacks."""
+    helpers = truth.helpers
+    by = np.zeros(truth.valid.shape, dtype=bool)
+    by[:, 0] = True
+    usual = {
+        "truth": truth, "attackers": by, "first": helpers, "past": np.full((1, 1, *helpers.shape[1:]), NAN),
+        "uniforms": np.zeros(by.shape),
+    }  # fmt: skip
+    for attack in attacks_of(text):
+        truth = attack.act(truth, Turn(**{**usual, **turn}))
+    return truth
+
+
+def test_a_liar_is_sure_of_what_it_finds_least_likely():
+    assert said("liar").helpers[0].tolist() == [[0.0, 0.0, 1.0], KEEP, BOLD]
+
+
+def test_a_liar_may_turn_its_distribution_round():
+    assert said("liar:says=permuted").helpers[0, 0].tolist() == [0.1, 0.2, 0.7]
+
+
+def test_feigned_braking_is_sure_of_the_most_careful_action():
+    assert said("brake").helpers[0].tolist() == [[1.0, 0.0, 0.0], KEEP, BOLD]
+
+
+def test_stuck_says_what_it_said_at_first():
+    first = np.array([[BOLD, BOLD, BOLD]])
+    assert said("stuck", first=first).helpers[0].tolist() == [BOLD, KEEP, BOLD]
+
+
+def test_stale_says_what_it_intended_before_and_at_first_the_oldest_there_is():
+    past = np.array([[[KEEP, BOLD, BOLD], [[NAN] * 3] * 3]])
+    assert said("stale", past=past).helpers[0, 0].tolist() == KEEP
+    assert said("stale:decisions=2", past=past, first=np.array([[BOLD] * 3])).helpers[0, 0].tolist() == BOLD
+
+
+def test_a_replay_is_what_the_next_helper_said_at_the_last_step():
+    past = np.array([[[CAREFUL, BOLD, KEEP]]])
+    assert said("replay", past=past).helpers[0].tolist() == [BOLD, KEEP, BOLD]
+    assert said("replay").helpers[0].tolist() == [CAREFUL, KEEP, BOLD]  # nothing was said yet
+
+
+def test_a_spoofed_pose_is_a_place_on_the_egos_way_and_the_intent_stays():
+    claim = said("spoof")
+    assert claim.distance_m[0].tolist() == [20.0, 3.0, 11.0, 12.0]
+    assert claim.range_m[0].tolist() == [17.0, 31.0, 32.0]
+    assert claim.sensed_m is TRUTH.sensed_m
+    assert claim.helpers[0, 0].tolist() == CAREFUL
+
+
+def test_silence_is_selective():
+    """The ego is for SLOWER: helper 0 agrees and answers; if it were for FASTER, it would not."""
+    assert said("silent").silent.tolist() == [[False, False, False]]
+    differs = intents([BOLD, KEEP, BOLD])
+    assert said("silent", differs).silent.tolist() == [[True, False, False]]
+
+
+def test_an_overconfident_helper_is_surer_of_the_same():
+    """.7, .2 and .1 to the second power are .49, .04 and .01."""
+    assert said("overconfident:power=2").helpers[0, 0] == pytest.approx(
+        [0.49 / 0.54, 0.04 / 0.54, 0.01 / 0.54]
+    )
+
+
+def test_a_sybil_is_several_vehicles_two_metres_apart():
+    voices = said("sybil")
+    assert voices.helpers[0].tolist() == [CAREFUL, KEEP, BOLD, CAREFUL, CAREFUL]
+    assert voices.distance_m[0].tolist() == [20, 10, 11, 12, 12, 14]
+    assert voices.range_m[0].tolist() == [30, 31, 32, 32, 34]
+    assert voices.voice_of is not None
+    assert voices.voice_of[0].tolist() == [0, 1, 2, 0, 0]
+    assert voices.valid.all()
+
+
+def test_a_flood_says_nothing_with_many_voices():
+    voices = said("flood:voices=2")
+    assert voices.helpers[0, 0] == pytest.approx([1 / 3] * 3)
+    assert voices.helpers[0, 3] == pytest.approx([1 / 3] * 3)
+    assert voices.helpers[0, 1:3].tolist() == [KEEP, BOLD]
+
+
+def test_several_at_once_have_the_same_attackers_and_voices_come_last():
+    """The sybil's voices lie as it does, and claim to stand where it does."""
+    voices = said("sybil:voices=2+liar+spoof")
+    assert voices.helpers[0, [0, 3]].tolist() == [[0.0, 0.0, 1.0]] * 2
+    assert voices.distance_m[0].tolist() == [20, 3, 11, 12, 5]
+
+
+@given(
+    share=st.floats(0, 1),
+    order=st.permutations(range(4)),
+    there=st.lists(st.booleans(), min_size=4, max_size=4),
+)
+def test_a_larger_share_has_the_attackers_of_a_smaller_one(share: float, order: Any, there: Any):
+    present, draws = np.array([there]), np.array([order]) / 4
+    fewer, more = (attackers(s, present, draws) for s in (share / 2, share))
+    assert not (fewer & ~more).any()
+    assert not (more & ~present).any()
+    assert more.sum() == int(share * sum(there) + 0.5)
+
+
+def drawn(seeds: Any, step: int = 0, helpers: int = 3) -> Draws:
+    n = len(seeds)
+    trips = Trips(np.array(seeds), np.full(n, 7), np.full(n, step), 6)
+    return Draws(np.full((n, helpers, 2), 0.5), np.full((n, helpers), 0.5), trips)
+
+
+def many(truth: Intents, n: int) -> Intents:
+    return truth.take(np.zeros(n, dtype=int))
+
+
+def test_who_attacks_is_drawn_for_a_seed_and_a_layout_and_stays():
+    """Of 3 helpers one attacks; over 300 seeds each of them in about 100, whatever else is in the batch."""
+    seeds = list(range(300))
+    point = named_point("6g:attack=liar:share=1/3")
+    first = Attackers(point).said(many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds])
+    later = Attackers(point).said(many(TRUTH, 300), drawn(seeds, step=4), [(0, s) for s in seeds])
+    assert (first.attackers.sum(axis=1) == 1).all()
+    assert (first.attackers == later.attackers).all()
+    assert (abs(first.attackers.sum(axis=0) - 100) < 35).all()
+    alone = Attackers(point).said(many(TRUTH, 1), drawn([217]), [(0, 217)])
+    assert (alone.attackers[0] == first.attackers[217]).all()
+    other = Attackers(replace(point, attack="brake")).said(
+        many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds]
+    )
+    assert (other.attackers == first.attackers).all()
+
+
+def test_an_episode_remembers_its_own_past_and_no_other():
+    point = named_point("6g:attack=stale:share=1")
+    both = Attackers(point)
+    both.said(TRUTH, drawn([0]), [(0, 0)])
+    both.said(intents([BOLD, BOLD, BOLD]), drawn([1]), [(0, 1)])
+    now = both.said(many(intents([KEEP, KEEP, KEEP]), 2), drawn([0, 1], step=1), [(0, 0), (0, 1)])
+    assert now.intents.helpers.tolist() == [[CAREFUL, KEEP, BOLD], [BOLD, BOLD, BOLD]]
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
+    rng = np.random.default_rng(3)
+    p = rng.dirichlet(np.ones(3), (40, 3))
+    truth = replace(many(TRUTH, 40), helpers=p)
+    told = Attackers(named_point(f"6g:attack={name}")).said(
+        truth, drawn(range(40)), [(n, n) for n in range(40)]
+    )
+    assert told.intents.helpers.sum(axis=-1) == pytest.approx(1.0)
+    honest = ~told.attackers[:, :3]
+    assert (told.intents.helpers[:, :3][honest] == p[honest]).all()
+    assert (told.intents.distance_m[:, 1:4][honest] == truth.distance_m[:, 1:][honest]).all()
+    assert told.intents.helpers.shape[1] == told.draws.jitter.shape[1] == told.attackers.shape[1]
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack_of_nobody_changes_nothing(name: str):
+    told = Attackers(named_point(f"6g:attack={name}:share=0")).said(TRUTH, drawn([0]), [(0, 0)])
+    assert not told.attackers.any()
+    for field, array in TRUTH.arrays().items():
+        assert np.array_equal(getattr(told.intents, field), array), field
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("lair", "unknown attack 'lair'"),
+        ("liar:share=2", "share"),
+        ("liar:share=1/0", "share"),
+        ("liar:shar=1", "shar"),
+        ("liar:share=1:share=0", "twice"),
+        ("liar:says=whatever", "says"),
+        ("sybil:voices=1", "voices"),
+        ("injection:language=klingon", "klingon"),
+        ("+", "unknown attack"),
+    ],
+)
+def test_an_attack_that_is_none_is_one_line(text: str, said: str):
+    with pytest.raises(UserError, match=said) as problem:
+        named_point(f"6g:attack={text}")
+    assert "\n" not in str(problem.value)
+
+
+def test_without_a_channel_nobody_can_attack():
+    with pytest.raises(UserError, match="no channel"):
+        OperatingPoint("alone", None, attack="liar")
+    with pytest.raises(UserError, match="adds no voices"):
+        OperatingPoint("fused", "6g", consensus="ego-prompt", attack="sybil")
