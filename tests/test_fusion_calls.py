@@ -29,12 +29,15 @@ from evaluating import (
 from run_on_disk import UNTIMED, answers_of, configure
 
 from harness.backends.base import Completion, Request
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.core.arrays import Ints
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
+from harness.evaluate.attackers import Said
 from harness.evaluate.fusion import FusionAnswers, codes_of, heard_in
 from harness.evaluate.run import Evaluated, evaluate
 from harness.evaluate.spec import Spec
@@ -60,6 +63,12 @@ def clear(n: int, helpers: int = 3) -> Due:
     return due(np.full((n, helpers, 2), 0.9), np.zeros((n, helpers)))
 
 
+def heard(due: dict[OperatingPoint, Due], intents: Intents) -> Ints:
+    """The sets of messages that are heard where nobody attacks."""
+    nobody = np.zeros(intents.valid.shape, dtype=bool)
+    return heard_codes(due, {point: Said(intents, of.draws, nobody) for point, of in due.items()})
+
+
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:
     """v2 and v4 are heard, v3's reply is lost: two lines of messages, with intent, risk and evidence."""
     data = course(small, steps=1).of_episodes([0])
@@ -71,7 +80,7 @@ def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None
     asker = asker_of(spec_of(data, LANGUAGE_MODEL, points=(FUSION,), seeds=(0,)), Scripted(lines))
     lossy = clear(1)
     lossy.draws.link[0, 1] = 0.0
-    codes = heard_codes({FUSION: lossy, POINTS["v2x"]: lossy}, asker([scene]))
+    codes = heard({FUSION: lossy, POINTS["v2x"]: lossy}, asker([scene]))
     assert codes.tolist() == [0b101]
     [request] = asker.fusion_requests([scene], codes)
     assert request.id == f"{scene.id}/v1+v2+v4"
@@ -89,11 +98,11 @@ def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset)
     n = len(scenes_of(small))
     all_cross = clear(n)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
-    once = heard_codes({FUSION: all_cross}, intents)
+    once = heard({FUSION: all_cross}, intents)
     assert len(once) == n
-    assert heard_codes({FUSION: all_cross, slow: all_cross}, intents).tolist() == once.tolist()
+    assert heard({FUSION: all_cross, slow: all_cross}, intents).tolist() == once.tolist()
     nobody = due(np.zeros((n, 3, 2)), all_cross.draws.jitter)
-    assert heard_codes({FUSION: nobody}, intents).size == 0
+    assert heard({FUSION: nobody}, intents).size == 0
 
 
 def test_a_whole_run_makes_each_fusion_call_once(
@@ -119,7 +128,19 @@ def test_who_was_heard_has_one_code_a_decision() -> None:
     heard = np.array([[False] * 3, [True, False, True], [True] * 3])
     codes = codes_of(heard, np.arange(3))
     assert codes.tolist() == [0, 8 + 5, 16 + 7]
-    assert [heard_in(code, 3) for code in codes.tolist()] == [(0, []), (1, [0, 2]), (2, [0, 1, 2])]
+    assert [heard_in(code, 3) for code in codes.tolist()] == [
+        (0, [], []),
+        (1, [0, 2], []),
+        (2, [0, 1, 2], []),
+    ]
+
+
+def test_with_attackers_in_the_text_the_code_says_who_they_are() -> None:
+    """Of those heard: an attacker whose message is lost changes no prompt."""
+    heard = np.array([[True, False, True], [True, True, False]])
+    attackers = np.array([[True, True, False], [False, False, True]])
+    codes = codes_of(heard, np.array([4, 5]), attackers).tolist()
+    assert [heard_in(code, 3, attacked=True) for code in codes] == [(4, [0, 2], [0]), (5, [0, 1], [])]
 
 
 def test_a_set_that_was_never_asked_about_is_no_guess() -> None:

@@ -8,10 +8,10 @@ have the same attackers, as far as their shares go. An attack of one's own is a 
 in the group `swarmdrive.attacks`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -66,6 +66,10 @@ class Attack:
         """What is said and claimed instead; `said` is what attacks before it have made of the truth."""
         raise NotImplementedError
 
+    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        """What a fusion prompt shows of an attacker's message (`in_text`), but for its intent."""
+        return dict(message)
+
     def intend(self, said: Intents, turn: Turn, intents: Floats) -> Intents:
         """The same with attackers' intents `(n, H, A)`; where those are NaN, they stay."""
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
@@ -93,6 +97,10 @@ class Liar(Attack):
         turned = np.empty_like(p)
         np.put_along_axis(turned, order, np.take_along_axis(p, order[..., ::-1], -1), -1)
         return self.intend(said, turn, turned)
+
+    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        """It gives no reasons and sees no risk."""
+        return {**message, "evidence": "", "risk": "low"}
 
 
 @dataclass(frozen=True)
@@ -153,6 +161,10 @@ class FeignedBraking(Attack):
     def act(self, said: Intents, turn: Turn) -> Intents:
         braking = np.zeros(said.helpers.shape[:-1], dtype=int)
         return self.intend(said, turn, _sure_of(braking, said.helpers.shape[-1]))
+
+    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        """It gives no reasons and sees great risk."""
+        return {**message, "evidence": "", "risk": "high"}
 
 
 @dataclass(frozen=True)
@@ -263,9 +275,9 @@ class Injection(Attack):
     def act(self, said: Intents, turn: Turn) -> Intents:
         return said
 
-    def evidence(self, actions: Sequence[str]) -> str:
-        """The text in place of the evidence, which asks for the last action, the boldest one."""
-        return INSTRUCTIONS[self.language].format(action=actions[-1])
+    def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        """The instructions ask for the last action, the boldest one."""
+        return {**message, "evidence": INSTRUCTIONS[self.language].format(action=actions[-1])}
 
 
 INSTRUCTIONS = {
@@ -298,6 +310,16 @@ def attacks_of(text: str) -> tuple[Attack, ...]:
     """
     named = [_attack(part) for part in text.split("+")] if text else []
     return tuple(sorted(named, key=lambda attack: isinstance(attack, Sybil)))
+
+
+def in_text(text: str) -> str:
+    """The part of such a text that changes what a fusion prompt shows, without shares, joined by `&`."""
+    named = (part.split(":") for part in text.split("+") if part)
+    return "&".join(
+        ":".join([name, *(each for each in settings if not each.startswith("share="))])
+        for name, *settings in named
+        if ATTACKS[name].in_text
+    )
 
 
 def _attack(text: str) -> Attack:

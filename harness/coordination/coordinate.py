@@ -15,6 +15,7 @@ from harness.coordination.consensus import Messages, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange, inferred_s
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Draws
@@ -94,6 +95,9 @@ def fuse(
         if fusion.call is None:
             raise ValueError(f"consensus {point.consensus} needs a fusion call")
         fused, seconds = fusion.call(heard.on_time)
+        if "majority" in point.guards:
+            voices = np.insert(heard.on_time, 0, True, axis=-1)
+            fused = outvoted(fused, p, voices, np.sum(voices, axis=-1) // 2 + 1)
         failed = anybody & np.any(np.isnan(fused), axis=-1)
         weights = np.where(anybody[..., None], np.nan, weights)
         latency_s = latency_s + np.where(anybody, seconds, 0.0)

@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
-from harness.coordination.attacks import attacks_of
+from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel
@@ -13,8 +13,26 @@ from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, valu
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
+DEFENCES = ("quoted", "schema", "majority")
 OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
 _LARGEST = sys.float_info.max
+
+
+class Rewrites(NamedTuple):
+    """How a fusion call shows messages.
+
+    Attributes:
+        blind: they are those of helpers that are shown nothing.
+        attack: what attackers make of theirs (`attacks.in_text`); empty for nothing.
+        defences: what the ego makes of all.
+    """
+
+    blind: bool = False
+    attack: str = ""
+    defences: tuple[str, ...] = ()
+
+
+AS_SENT = Rewrites()
 
 
 @dataclass(frozen=True)
@@ -52,6 +70,9 @@ class OperatingPoint:
             `density_per_km=200,power_dbm=23`.
         attack: what some of the helpers do instead of saying what they intend, `liar:share=1/3+spoof`
             (`harness.coordination.attacks`); empty for honest ones.
+        defence: what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted`, evidence is a JSON
+            string; `schema`, messages have no free text; `majority`, an action that most of the voices agree
+            on stands against the call's.
     """
 
     name: str
@@ -75,6 +96,7 @@ class OperatingPoint:
     round_trip_s: float | None = None
     radio: str = ""
     attack: str = ""
+    defence: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -114,6 +136,11 @@ class OperatingPoint:
                 raise self._wrong(
                     "attack", f"one that needs no past and adds no voices where consensus is {EGO_PROMPT}"
                 )
+        for part in filter(None, str(self.defence).split("+")):
+            if part not in DEFENCES:
+                raise unknown("defence", part, DEFENCES)
+            if self.consensus != EGO_PROMPT:
+                raise self._wrong("defence", f"left out where consensus is not {EGO_PROMPT}")
         self.channel()
 
     @classmethod
@@ -165,6 +192,17 @@ class OperatingPoint:
     def asks_blind(self) -> bool:
         """Whether helpers are asked who see nothing."""
         return self.profile is not None and self.messages == "blind"
+
+    @property
+    def guards(self) -> tuple[str, ...]:
+        """What guards its fusion calls."""
+        return tuple(part for part in DEFENCES if part in self.defence.split("+"))
+
+    @property
+    def rewrites(self) -> "Rewrites":
+        """How its fusion calls show messages."""
+        shows = tuple(part for part in self.guards if part != "majority")
+        return Rewrites(self.asks_blind, in_text(self.attack), shows)
 
     def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
         value = getattr(self, key)

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, linear_pool
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats, Ints
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
 CLIP_ROUNDS = 5
 RELIABILITY = 0.8  # of a helper in the Bayesian pool: the share of messages that say what is the case
+NEVER = 1e-9  # what a probability of 0 that the ego gives counts for
 WEISZFELD_ROUNDS = 60
 SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite where a message is the median itself
 
@@ -37,24 +38,28 @@ class Heads:
     def fuse(self, messages: Messages, state: Floats) -> Fused:
         """The pool; where it leaves what all but one want, the mean of those."""
         voices = messages.weights > 0
-        weights = voices / np.sum(voices, axis=-1, keepdims=True)
-        return Fused(
-            unflipped(self.pool(messages.intents, weights), messages.intents, weights), weights, state
-        )
+        heads = np.sum(voices, axis=-1)
+        weights = voices / heads[..., None]
+        policy = self.pool(messages.intents, weights)
+        return Fused(outvoted(policy, messages.intents, voices, np.maximum(heads - 1, 2)), weights, state)
 
 
-def unflipped(policy: Floats, p: Floats, weights: Floats) -> Floats:
-    """The policy; where all but one helper, and at least two, agree on another action, the mean of those."""
-    voices = weights > 0
+def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
+    """The policy; where so many voices, the ego's among them, want another action, the mean of those.
+
+    Args:
+        policy: `(..., A)`.
+        p: intents, `(..., 1+H, A)`; those of no voice may hold anything.
+        voices: who counts, `(..., 1+H)`.
+        votes: how many have to agree, more than half, `(...)`.
+    """
     choices = np.where(voices, np.argmax(np.where(voices[..., None], p, -1.0), axis=-1), -1)
-    votes = np.sum(choices[..., None] == np.arange(p.shape[-1]), axis=-2)
-    wanted = np.argmax(votes, axis=-1)
-    enough = np.max(votes, axis=-1) >= np.maximum(np.sum(voices, axis=-1) - 1, 2)
-    agree = (choices == wanted[..., None]) & voices
+    counts = np.sum(choices[..., None] == np.arange(p.shape[-1]), axis=-2)
+    wanted = np.argmax(counts, axis=-1)
+    agree = choices == wanted[..., None]
     of_those = linear_pool(p, agree / np.maximum(np.sum(agree, axis=-1, keepdims=True), 1))
-    # The ego is no helper: where it alone wants something else, its own intent is one of the voices pooled.
-    flipped = enough & agree[..., 0] & (np.argmax(policy, axis=-1) != wanted)
-    return np.where(flipped[..., None], of_those, policy)
+    stands = (np.max(counts, axis=-1) >= votes) & agree[..., 0] & (np.argmax(policy, axis=-1) != wanted)
+    return np.where(stands[..., None], of_those, policy)
 
 
 def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
@@ -113,9 +118,9 @@ def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY)
     """
     actions = p.shape[-1]
     helper = np.broadcast_to(np.asarray(reliability), weights[..., 1:].shape)
-    r = np.concatenate([np.full(weights[..., :1].shape, 0.99), helper], axis=-1)[..., None]
+    r = np.concatenate([np.ones(weights[..., :1].shape), helper], axis=-1)[..., None]
     worth = r * np.where((weights > 0)[..., None], p, 1 / actions) + (1 - r) / actions
-    logs = np.sum(np.log(worth), axis=-2)
+    logs = np.sum(np.log(np.maximum(worth, NEVER)), axis=-2)
     pooled = np.exp(logs - np.max(logs, axis=-1, keepdims=True))
     return np.asarray(pooled / np.sum(pooled, axis=-1, keepdims=True))
 

@@ -11,19 +11,20 @@ import numpy as np
 from msgspec import UNSET
 
 from harness.backends.base import Backend, Completion, Request, Role
-from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
+from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, digest
 from harness.dataset.load import Scene
 from harness.evaluate import repair
-from harness.evaluate.fusion import FusionAnswers, heard_in, messages_of
+from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
 from harness.evaluate.spec import Spec
+from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
-from harness.runs.records import BLIND, Answer, Latency
+from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
@@ -72,7 +73,7 @@ def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
     """The fusion call with these helpers' messages; `answers` by key, as `senders` has them."""
-    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders)
+    graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders, spec.actions)
     messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
     image = picture(spec, 0, scene, scene.viewers[0])
     return _request(spec, 0, _fusion_id(scene, senders), "ego", messages, image=image)
@@ -230,23 +231,24 @@ class Asker:
         y = ego["y_m"] + seen["forward_m"] * sin - seen["left_m"] * cos
         return math.hypot(x - zone_x, y - zone_y)
 
-    def fusion_call(
-        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
-    ) -> Callable[[Ints], FusionCall]:
-        """The ego's answers to these sets of messages, of helpers that are shown nothing if `blind`."""
-        ids = [_fusion_id(*each) for each in _heard(moments, codes, blind)]
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+        """The ego's answers to these sets of messages, shown so."""
+        ids = [_fusion_id(*each) for each in _heard(moments, codes, rewrites)]
         if not self.answers.keys() >= set(ids):
-            self.answer(self.fusion_requests(moments, codes, blind))
+            self.answer(self.fusion_requests(moments, codes, rewrites))
         answers = [self.answers[name] for name in ids]
         nothing = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
 
-    def fusion_requests(self, moments: Sequence[Scene], codes: Ints, blind: bool = False) -> list[Request]:
+    def fusion_requests(
+        self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> list[Request]:
         """The requests of the fusion calls with these sets of messages."""
         asked = []
-        for scene, senders in _heard(moments, codes, blind):
-            sent = {key: a for key in senders if (a := self.answers.get(f"{scene.id}/{key}"))}
+        for scene, senders in _heard(moments, codes, rewrites):
+            keys = (key.partition(REWRITTEN)[0] for key in senders)
+            sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
             asked.append(fusion_request(self.spec, scene, sent, senders))
         return asked
 
@@ -258,12 +260,15 @@ class Asker:
         self.ask(asked)
 
 
-def _heard(moments: Sequence[Scene], codes: Ints, blind: bool) -> Iterator[tuple[Scene, list[str]]]:
-    """The scene of each set of messages, and the keys of its senders' answers."""
+def _heard(
+    moments: Sequence[Scene], codes: Ints, rewrites: Rewrites
+) -> Iterator[tuple[Scene, list[str]]]:  # fmt: skip
+    """The scene of each set of messages, and the keys of its senders."""
     helpers = max(len(scene.viewers) for scene in moments) - 1
     for code in codes.tolist():
-        moment, heard = heard_in(code, helpers)
-        yield moments[moment], [moments[moment].viewers[1 + h] + BLIND * blind for h in heard]
+        moment, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
+        scene = moments[moment]
+        yield scene, [key_of(scene.viewers[1 + h], rewrites, h in attacking) for h in heard]
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:

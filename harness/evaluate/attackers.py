@@ -7,6 +7,7 @@ same, in frozen scenes, sweeps and the closed loop.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,10 @@ class Said:
     intents: Intents
     draws: Draws
     attackers: Bools
+
+    def take(self, at: Any) -> "Said":
+        """What is said in the decisions at these places."""
+        return Said(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 
 class Attackers:

@@ -4,14 +4,19 @@ Who is heard depends on the channel and not on fusion, so the sets of messages t
 hears are known before the first call. There is one call for each set.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from harness.coordination.attacks import Turn, attacks_of
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import Rewrites
 from harness.core.arrays import Bools, Floats, Ints
-from harness.runs.records import BLIND, Answer
+from harness.evaluate.repair import as_text
+from harness.runs.records import BLIND, REWRITTEN, Answer
 
 
 @dataclass(frozen=True)
@@ -28,9 +33,9 @@ class FusionAnswers:
     intents: Floats
     seconds: Floats
 
-    def at(self, moments: Ints) -> "FusionAnswersAt":
-        """The fusion call of decisions at these moments, (n,)."""
-        return FusionAnswersAt(self, moments)
+    def at(self, moments: Ints, attackers: Bools | None = None) -> "FusionAnswersAt":
+        """The fusion call of decisions at these moments, (n,); with attackers in the text, (n, H)."""
+        return FusionAnswersAt(self, moments, attackers)
 
 
 @dataclass(frozen=True)
@@ -39,11 +44,12 @@ class FusionAnswersAt:
 
     answers: FusionAnswers
     moments: Ints
+    attackers: Bools | None = None
 
     def __call__(self, on_time: Bools) -> tuple[Floats, Floats]:
         """Intents (n, A) and seconds (n,) for who was heard, (n, H); NaN where nobody was."""
         answers, anybody = self.answers, on_time.any(axis=1)
-        wanted = codes_of(on_time, self.moments)[anybody]
+        wanted = codes_of(on_time, self.moments, self.attackers)[anybody]
         intents = np.full((len(on_time), answers.intents.shape[1]), np.nan)
         seconds = np.full(len(on_time), np.nan)
         if len(wanted):
@@ -54,21 +60,56 @@ class FusionAnswersAt:
         return intents, seconds
 
 
-def codes_of(on_time: Bools, moments: Ints) -> Ints:
-    """One number for a moment and who was heard in it, (n,), from (n, H) and moments (n,)."""
-    helpers = on_time.shape[1]
-    return np.asarray(moments << helpers | on_time @ (1 << np.arange(helpers)))
+def codes_of(on_time: Bools, moments: Ints, attackers: Bools | None = None) -> Ints:
+    """One number for a moment and who was heard in it, (n,), from (n, H) and moments (n,).
+
+    With attackers (n, H) also for which of those attack.
+    """
+    said = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
+    return np.asarray(moments << said.shape[1] | said @ (1 << np.arange(said.shape[1])))
 
 
-def heard_in(code: int, helpers: int) -> tuple[int, list[int]]:
-    """The moment of a code, and the helpers that were heard, counted from 0."""
-    return code >> helpers, [h for h in range(helpers) if code >> h & 1]
+def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
+    """The moment of a code, the helpers that were heard, counted from 0, and those of them that attack."""
+    bits = helpers * (1 + attacked)
+    heard = [h for h in range(helpers) if code >> h & 1]
+    return code >> bits, heard, [h for h in heard if attacked and code >> (helpers + h) & 1]
 
 
-def messages_of(answers: Mapping[str, Answer], senders: Sequence[str]) -> list[dict[str, Any]]:
+def key_of(helper: str, rewrites: Rewrites, attacks: bool) -> str:
+    """Names what a helper says in a fusion call: `v2`, `v2~blind`, `v3!liar&schema`."""
+    changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
+    return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
+
+
+def messages_of(
+    answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
+) -> list[dict[str, Any]]:
     """What these helpers sent, as a prompt takes it, from the answers of a moment by key."""
-    return [
-        {"sender": sender.removesuffix(BLIND), "intent": list(said.intent), **said.message}
-        for sender in senders
-        if (said := answers.get(sender)) and said.intent and said.message
-    ]
+    found = []
+    for sender in senders:
+        key, _, changes = sender.partition(REWRITTEN)
+        if (said := answers.get(key)) and said.intent and said.message:
+            message = {"intent": list(said.intent), **said.message}
+            for change in filter(None, changes.split("&")):
+                message = _rewritten(message, change, actions)
+            message["evidence"] = as_text(message["evidence"])  # no token of a chat template gets through
+            found.append({"sender": key.removesuffix(BLIND), **message})
+    return found
+
+
+def _rewritten(message: dict[str, Any], change: str, actions: Sequence[str]) -> dict[str, Any]:
+    """A message as an attack or a defence leaves it."""
+    if change == "schema":
+        return {**message, "evidence": ""}
+    if change == "quoted":
+        return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}
+    [attack] = attacks_of(change)
+    p = np.array([[message["intent"]]])
+    alone = Intents(
+        np.full((1, p.shape[-1]), np.nan), p, np.ones((1, 1), dtype=bool), np.zeros((1, 2)), np.zeros((1, 1)),
+        np.zeros((1, 1)), np.zeros((1, 2)),
+    )  # fmt: skip
+    turn = Turn(alone, np.ones((1, 1), dtype=bool), p, np.empty((1, 0, *p.shape[1:])), np.zeros((1, 1)))
+    intent = attack.act(alone, turn).helpers[0, 0].tolist()
+    return {**attack.rewritten(message, actions), "intent": intent}

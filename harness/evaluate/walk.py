@@ -4,7 +4,7 @@ Frozen scenes, the closed loop and the calibrated proxy of the paper's study are
 their moments come from and in where an action leads, and in nothing else. A moment is one decision point.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Generic, Protocol, TypeVar
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
@@ -60,14 +60,14 @@ class Decided(Generic[Moment]):
         moments: those the world showed.
         due: what was to be decided.
         result: what was, (n, ...).
-        attackers: whose voice was an attacker's, (n, H).
+        said: what reached the channel for it.
     """
 
     point: OperatingPoint
     moments: Sequence[Moment]
     due: Due
     result: Coordination
-    attackers: Bools
+    said: Said
 
 
 class World(Protocol[Moment]):
@@ -90,6 +90,14 @@ class World(Protocol[Moment]):
         ...
 
 
+class Fuses(Protocol):
+    """Fusion calls that have been answered."""
+
+    def __call__(self, moments: Ints, attackers: Bools | None = None, /) -> FusionCall:
+        """The call of decisions at moments (n,), with the attackers (n, H) if messages show them."""
+        ...
+
+
 class Ask(Protocol[AskedMoment]):
     """Where intents come from."""
 
@@ -101,13 +109,8 @@ class Ask(Protocol[AskedMoment]):
         """The same where helpers are shown nothing, (n, ...); it has to be known at these places alone."""
         ...
 
-    def fusion_call(
-        self, moments: Sequence[AskedMoment], codes: Ints, blind: bool = False
-    ) -> Callable[[Ints], FusionCall]:
-        """The ego's answers to these sets of messages (`codes_of`), for decisions at moments (n,).
-
-        The messages are those of helpers that are shown nothing, if `blind`.
-        """
+    def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+        """The ego's answers to these sets of messages (`codes_of`), shown so."""
         ...
 
 
@@ -131,10 +134,11 @@ def walk(
         calls = _fusion_calls(due, said, moments, ask)
         decided = []
         for point, each in due.items():
-            call = calls[point.asks_blind](each.at) if point.asks_again else None
+            of = said[point]
+            call = calls[point.rewrites](each.at, shown(point, of)) if point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, said[point].intents, said[point].draws, fusion)
-            decided.append(Decided(point, moments, each, result, said[point].attackers))
+            result = coordinate(point, of.intents, of.draws, fusion)
+            decided.append(Decided(point, moments, each, result, of))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
         yield decided
@@ -185,15 +189,12 @@ class Memory:
 def _fusion_calls(
     due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said], moments: Sequence[Moment],
     ask: Ask[Moment],
-) -> dict[bool, Callable[[Ints], FusionCall]]:  # fmt: skip
-    """One fusion call for each set of messages that any condition hears; who is heard depends on none.
-
-    Those with blind helpers' messages are under True.
-    """
+) -> dict[Rewrites, Fuses]:  # fmt: skip
+    """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
     calls = {}
-    for of in sorted({point.asks_blind for point in due if point.asks_again}):
-        alike = {point: each for point, each in due.items() if point.asks_blind == of}
-        calls[of] = ask.fusion_call(moments, heard_codes(alike, said), of)
+    for rewrites in dict.fromkeys(point.rewrites for point in due if point.asks_again):
+        alike = {point: each for point, each in due.items() if point.rewrites == rewrites}
+        calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said), rewrites)
     return calls
 
 
@@ -202,9 +203,15 @@ def heard_codes(due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint,
     codes = [np.empty(0, dtype=int)]
     for point, each in due.items():
         if point.asks_again:
-            on_time = exchange(point, said[point].intents, said[point].draws).on_time
-            codes.append(codes_of(on_time, each.at)[on_time.any(axis=1)])
+            of = said[point]
+            on_time = exchange(point, of.intents, of.draws).on_time
+            codes.append(codes_of(on_time, each.at, shown(point, of))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
+
+
+def shown(point: OperatingPoint, said: Said) -> Bools | None:
+    """Who attacks, (n, H), where a fusion call shows it; else None."""
+    return said.attackers if point.rewrites.attack else None
 
 
 @lru_cache(maxsize=1 << 16)
@@ -255,7 +262,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     start = dict(zip(first, starts, strict=False))
     scenes = [scene for moments in first.values() for scene in moments]
     places = max(len(scene.viewers) for scene in scenes) - 1
-    helpers = max(places, *(part.attackers.shape[1] for part in decided))
+    helpers = max(places, *(part.said.attackers.shape[1] for part in decided))
     at = np.concatenate([start[id(part.moments)] + part.due.at for part in decided])
     n_each = [len(part.due.at) for part in decided]
     points = list(dict.fromkeys(part.point.name for part in decided))
@@ -276,7 +283,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
         "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
         "weight": widened([part.result.weights[:, 1:] for part in decided]),
-        "trust": of_messages("trust"), "attacker": widened([part.attackers for part in decided]),
+        "trust": of_messages("trust"), "attacker": widened([part.said.attackers for part in decided]),
     }  # fmt: skip
     voices = [f"voice-{n + 1}" for n in range(helpers - places)]  # of a helper that has several
     senders = [[*scene.viewers[1:], *[None] * (places + 1 - len(scene.viewers)), *voices] for scene in scenes]

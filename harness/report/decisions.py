@@ -199,7 +199,7 @@ class Decisions:
             asked = None
             if scene and prompts:
                 shown_to = as_shown(scene, answer)
-                messages = prompts(shown_to, answer.viewer, messages_of(by_viewer, answer.heard))
+                messages = prompts(shown_to, answer.viewer, messages_of(by_viewer, answer.heard, run.actions))
                 key = digest(messages)
                 if answer.prompt_sha256 == key:
                     sent.setdefault(key, messages)

@@ -88,7 +88,7 @@ def _samples(run: Run) -> Iterator[log.EvalSample]:
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
             if sent and name in scenes:
-                heard = messages_of(answers, answer.heard)
+                heard = messages_of(answers, answer.heard, run.actions)
                 asked = sent(as_shown(scenes[name], answer), answer.viewer, heard)
             yield _sample(run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts)
 

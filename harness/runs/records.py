@@ -9,6 +9,7 @@ from harness.core.statistics import Estimate
 
 Role = Literal["ego", "helper", "merge", "blind"]
 BLIND = "~blind"  # at the end of an answer's key
+REWRITTEN = "!"  # in a sender's key, before what an attack or a defence makes of its message
 TURNS = ("turns", "first_status", "first_raw")  # what tables say of an answer's turns
 
 

@@ -27,7 +27,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
-from harness.evaluate.walk import Decided, Memory, heard, walk
+from harness.evaluate.walk import Decided, Memory, shown, walk
 from harness.prompts.versions import shown as listing
 from harness.runs.attribution import FILE, Attribution, LeftOut
 from harness.studies.stored import Stored
@@ -170,17 +170,18 @@ def _messages(
     decisions, helpers = np.nonzero(part.result.on_time & np.array(chosen)[:, None])
     if not len(decisions):
         return
-    blind = stored.blind(moments, np.unique(due.at)) if point.asks_blind else None
-    said = heard(point, stored(moments), blind, due).take(decisions)
+    said = part.said.take(decisions)
     whole, at = _taken(part.result, decisions), due.at[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.asks_again:
-        codes = np.unique(codes_of(rest, at)[rest.any(axis=1)])
-        call = stored.fusion_call(moments, codes, point.asks_blind)(at)
+        attackers = shown(point, said)
+        codes = np.unique(codes_of(rest, at, attackers)[rest.any(axis=1)])
+        call = stored.fusion_call(moments, codes, point.rewrites)(at, attackers)
     fusion = Fusion(call, None if state is None else state[decisions])
-    less = fuse(point, replace(whole, on_time=rest), said, fusion)
-    for n, helper in enumerate(helpers.tolist()):
+    less = fuse(point, replace(whole, on_time=rest), said.intents, fusion)
+    for n, voice in enumerate(helpers.tolist()):
+        helper = voice if said.intents.voice_of is None else int(said.intents.voice_of[n, voice])
         scene = moments[at[n]]
         sender = scene.viewers[1 + helper]
         items = (node["id"] for node in scene.record["graphs"][sender]["nodes"])

@@ -20,12 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
-from harness.evaluate.walk import Decided, Due
+from harness.evaluate.walk import Decided, Due, Fuses
 from harness.radio.channel import Draws
 from harness.studies.play import Walked, walk_through
 
@@ -141,11 +140,9 @@ class CalibratedWorld:
         """Nobody is asked blindly: no point of the study has it."""
         raise NotImplementedError
 
-    def fusion_call(
-        self, moments: Sequence[int], codes: Ints, blind: bool = False
-    ) -> Callable[[Ints], FusionCall]:
+    def fusion_call(self, moments: Sequence[int], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """Nobody calls: no point of the study has its model fuse."""
-        return lambda at: lambda on_time: (np.empty((0, ACTIONS)), np.empty(0))
+        raise NotImplementedError
 
     def due(self, point: OperatingPoint) -> Due:
         """Every episode."""

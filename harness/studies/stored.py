@@ -15,10 +15,9 @@ from harness.backends.cache import default_file
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
-from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import nearest
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.core.arrays import Bools, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -29,6 +28,7 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
+from harness.evaluate.walk import Fuses
 from harness.prompts import versions
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
@@ -157,9 +157,7 @@ class Stored:
         with self._writing():
             return self._asker.blind(moments, at)
 
-    def fusion_call(
-        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
-    ) -> Callable[[Ints], FusionCall]:
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """The ego's answers to these sets of messages; what the run has not is asked, and kept in it."""
         if not self._asks:
             raise UserError(
@@ -167,7 +165,7 @@ class Stored:
                 "consensus ego-prompt needs; leave it out"
             )
         with self._writing():
-            return self._asker.fusion_call(moments, codes, blind)
+            return self._asker.fusion_call(moments, codes, rewrites)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -230,7 +228,5 @@ class _Nearest:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
 
-    def fusion_call(
-        self, moments: Sequence[Scene], codes: Ints, blind: bool = False
-    ) -> Callable[[Ints], FusionCall]:
-        return self._stored.fusion_call(moments, codes, blind)
+    def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+        return self._stored.fusion_call(moments, codes, rewrites)

@@ -94,7 +94,7 @@ def pairs(run: Run) -> Iterator[dict[str, Any]]:
                 )
             agent = run.agent(one)
             prompt = prompts[agent["prompt"]["version"]]
-            q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard))
+            q = question(lessons, scene, one.viewer, prompt, messages_of(answers, one.heard, run.actions))
             texts = shown(agent["image"], q.messages)
             messages = in_mode(agent["answer"], prompt, texts, q.graph["role"], q.actions)
             said = answer(prompt, q.graph, q.label, q.actions)

@@ -195,7 +195,7 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
 def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer]) -> Iterator[Asked]:
     """The ego's fusion call with the messages of all helpers, and its twin."""
     by_viewer = {v: answers[f"{scene.id}/{v}"] for v in spec.viewers(scene)}
-    senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:])]
+    senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:], spec.actions)]
     if senders and twin.senders:
         question = fusion_request(spec, scene, by_viewer, senders)
         other = fusion_request(spec, _named(scene, twin), by_viewer, twin.senders(senders))
