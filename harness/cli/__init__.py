@@ -20,7 +20,18 @@ from harness.core import extras
 from harness.core.errors import UserError, printable
 
 PANELS = {
-    "Evaluate": ("eval", "drive", "grid", "sweep", "compare", "twins", "attribute", "fidelity", "campaign"),
+    "Evaluate": (
+        "eval",
+        "drive",
+        "grid",
+        "sweep",
+        "compare",
+        "twins",
+        "attribute",
+        "trust",
+        "fidelity",
+        "campaign",
+    ),
     "Look": ("ls", "history", "view", "report", "export", "video", "parse"),
     "Data": ("init", "prompt", "dataset", "scenario", "channel"),
     "Models": ("model", "distill", "parity", "doctor"),

@@ -32,6 +32,7 @@ def command(
     engine: options.Engine = None,
     prompt: options.ScenarioPrompt = None,
     condition: options.Conditions = None,
+    attack: options.Attacks = None,
     scenario: str | None = typer.Option(
         None,
         help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons. Default: occluded-intersection.",
@@ -104,7 +105,7 @@ def command(
             helper_thinking,
         ).agents(source.scenario),
         source=source,
-        points=options.points(tuple(names)),
+        points=options.points(tuple(names), attacks=attack),
         seeds=options.parse_seeds(seeds),
         batch_size=batch_size,
         device=device,

@@ -40,6 +40,7 @@ def command(
     ),
     condition: options.Conditions = None,
     control: options.Controls = None,
+    attack: options.Attacks = None,
     seeds: options.Seeds = "0:5",
     limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
     only: str | None = typer.Option(None, help="Episodes by number: 3,10:20 is 3 and 10 to 19."),
@@ -101,7 +102,7 @@ def command(
         Spec(
             **swarm.agents(each.scenario),
             source=FrozenSource(each, selection),
-            points=options.points(condition or tuple(POINTS), control),
+            points=options.points(condition or tuple(POINTS), control, attack),
             seeds=channel_seeds,
             batch_size=batch_size,
             device=device,

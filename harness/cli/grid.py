@@ -27,6 +27,7 @@ def command(
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
     control: options.Controls = None,
+    attack: options.Attacks = None,
     seeds: options.Seeds = "0:5",
     limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
     batch_size: options.BatchSize = 8,
@@ -73,7 +74,7 @@ def command(
     spec = Spec(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
-        points=options.points(condition or tuple(POINTS), control),
+        points=options.points(condition or tuple(POINTS), control, attack),
         seeds=options.parse_seeds(seeds),
         batch_size=batch_size,
         device=device,

@@ -46,6 +46,14 @@ Controls = Annotated[
         "another layout; no-messages: one that loses all; blind: one whose helpers see nothing. Repeatable.",
     ),
 ]
+Attacks = Annotated[
+    list[str] | None,
+    Option(
+        "--attack",
+        help="Beside each condition with a channel, one whose helpers attack: liar:share=1/3, or several at "
+        "once: liar+spoof. Repeatable. `harness trust --help`.",
+    ),
+]
 Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
 FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
 Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
@@ -90,17 +98,20 @@ CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "
 
 
 def points(
-    conditions: "Sequence[str]", controls: "Sequence[str] | None" = None
+    conditions: "Sequence[str]",
+    controls: "Sequence[str] | None" = None,
+    attacks: "Sequence[str] | None" = None,
 ) -> "tuple[OperatingPoint, ...]":
-    """Operating points by name, each once, followed by their controls where they have a channel."""
+    """Operating points by name, each once, and with a channel their controls, and attacks on them."""
     from harness.coordination.operating_point import named_point
 
     given = [named_point(name) for name in dict.fromkeys(conditions)]
-    found = list(given)
+    found, beside = list(given), []
     for control in dict.fromkeys(controls or ()):
         if control not in CONTROLS:
             raise unknown("--control", control, CONTROLS)
-        setting = CONTROLS[control]
+        beside.append(CONTROLS[control])
+    for setting in (*beside, *(f"attack={attack}" for attack in dict.fromkeys(attacks or ()))):
         for point in given:
             if point.profile and setting.partition("=")[0] not in point.name:
                 found.append(named_point(point.name + ("," if ":" in point.name else ":") + setting))

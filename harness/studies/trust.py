@@ -1,0 +1,365 @@
+"""`harness trust`: what every consensus rule makes of every attack, and what it costs while nobody attacks.
+
+A stored run's answers are walked again under each rule, attack and share of attackers; no model is asked
+what the run has. All cells have the same episodes, channel draws and attackers, so contrasts are paired by
+episode.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.coordination.attacks import attacks_of
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import EGO_PROMPT
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import digest
+from harness.core.multiplicity import LEVEL, holm
+from harness.core.statistics import (
+    Estimate,
+    negative_log_likelihood,
+    resampled,
+)
+from harness.dataset.load import Scene
+from harness.evaluate.frozen_world import FrozenWorld
+from harness.evaluate.walk import Decided, walk
+from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
+from harness.studies.stored import Stored
+from harness.studies.sweep import point_of
+
+RESAMPLES = 2000
+TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
+PEACE, EXCLUDED = "", "absent"
+BASE = "linear"
+# What `--attacks all` is: each alone, and a spoofed pose and several voices with a lie.
+USUAL = (
+    "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
+    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A rule under an attack by a share of the helpers.
+
+    Attributes:
+        rule: of consensus.
+        attack: without its share; empty for peace.
+        share: of the helpers that attack.
+        success: which episodes succeed, (S, E).
+        unsafe: which end unsafely, (S, E).
+        nats: mean of -ln of the probability that the policy gives to safe actions, of an episode's decisions
+            where some action was safe, (S, E); NaN where there is none.
+        flagged: messages heard, by episode: of attackers that were taken for such, of attackers that were
+            not, of honest helpers that were, and that were not, (4, E); None of a rule that judges nobody.
+        first: how many decisions with an attacker's message it took until it was taken for one, for each
+            attacker of an episode and seed; 0 where it never was.
+    """
+
+    rule: str
+    attack: str
+    share: float
+    success: Floats
+    unsafe: Floats
+    nats: Floats
+    flagged: Floats | None
+    first: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Names the cell among those of its study."""
+        return f"{self.rule}|{self.attack}|{self.share:.6g}"
+
+    def detection(self) -> Mapping[str, Estimate] | None:
+        """Precision, recall and F1 of messages, with a bootstrap over episodes; None if it judges nobody."""
+        if self.flagged is None:
+            return None
+        hit, missed, wrong, _ = self.flagged
+        times = resampled(noise.generator("trust", "detection"), len(hit), RESAMPLES)
+        hits, misses, wrongs = times @ hit, times @ missed, times @ wrong
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = {
+                "precision": hits / (hits + wrongs),
+                "recall": hits / (hits + misses),
+                "f1": 2 * hits / (2 * hits + wrongs + misses),
+            }
+        return {name: _bootstrapped(of, len(hit)) for name, of in found.items()}
+
+    @property
+    def time_to_detection(self) -> float:
+        """Median of how many messages it takes until an attacker is found, of those that are; NaN if none."""
+        found = [n for n in self.first if n]
+        return float(np.median(found)) if found else float("nan")
+
+
+def _bootstrapped(values: Floats, n: int) -> Estimate:
+    """A figure of n episodes, the first of the values, and its interval by those of resampled ones."""
+    if np.isnan(values[0]):
+        return Estimate(np.nan, np.nan, np.nan, 0, 0)
+    low, high = np.nanpercentile(values[1:], (2.5, 97.5)).tolist()
+    return Estimate(float(values[0]), low, high, n, 0)
+
+
+def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
+    """The operating point with a rule and attackers; every part of the attack has the same share."""
+    parts = [f"{part}:share={share:.10g}" for part in attack.split("+")] if attack else []
+    text = "+".join(parts)
+    attacks_of(text)
+    name = f"{point.name} · {rule}" + (f" · {text}" if text else "")
+    return replace(point, name=name, consensus=rule, attack=text)
+
+
+def names_of(option: str, text: str, usual: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    """The names of a list such as `liar,brake`, or the usual ones for `all`. Raises UserError."""
+    if text == "all":
+        return tuple(usual)
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    for name in names:
+        for part in name.split("+"):
+            if part.partition(":")[0] not in known:
+                raise unknown(option, part.partition(":")[0], ("all", *known))
+            if "share=" in part:
+                raise UserError(f"{option} {printable(name)}: give shares with --share")
+    return names
+
+
+def shares_of(text: str) -> tuple[float, ...]:
+    """Shares above 0 of a list such as `0,1/3,2/3`; peace is always played. Raises UserError."""
+    found = []
+    for part in text.split(","):
+        above, slash, below = part.strip().partition("/")
+        try:
+            share = float(above) / (float(below) if slash else 1.0)
+        except (ValueError, ZeroDivisionError):
+            share = np.nan
+        if not 0 <= share <= 1:
+            raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
+        found.append(share)
+    return tuple(dict.fromkeys(share for share in found if share))
+
+
+def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[str, str, float]) -> Cell:
+    """Walk one cell: a rule, an attack and a share."""
+    at = under(point, *of)
+    world = FrozenWorld(stored.dataset, [at], seeds)
+    parts = [part for [part] in walk(world, [at], stored)]
+    ends = world.ends(at)
+    place = {number: n for n, number in enumerate(world.numbers.tolist())}
+    row = {seed: n for n, seed in enumerate(seeds)}
+    cells = [
+        np.array([row[s] * len(place) + place[e] for e, s in part.due.episodes], dtype=int) for part in parts
+    ]
+    nats = np.concatenate([_nats(stored, part) for part in parts])
+    flagged, first = _flagged(parts, len(place), place)
+    shape = len(seeds), len(place)
+    return Cell(
+        *of,
+        ends["success_rate"],
+        ends["unsafe_rate"],
+        _means(np.concatenate(cells), nats, shape),
+        flagged,
+        first,
+    )
+
+
+def _nats(stored: Stored, part: Decided[Scene]) -> Floats:
+    """-ln of what each decision's policy gives to safe actions, (n,); NaN where none is safe."""
+    forest = stored.dataset.forest
+    at = np.array([forest.place[scene.id] for scene in part.moments])[part.due.at]
+    return negative_log_likelihood(part.result.fused, forest.safe[at])
+
+
+def _means(places: Any, values: Floats, shape: tuple[int, int]) -> Floats:
+    known = ~np.isnan(values)
+    n = np.bincount(places[known], minlength=shape[0] * shape[1])
+    total = np.bincount(places[known], values[known], minlength=shape[0] * shape[1])
+    return np.where(n > 0, total / np.maximum(n, 1), np.nan).reshape(shape)
+
+
+def _flagged(
+    parts: Sequence[Decided[Scene]], episodes: int, place: Mapping[int, int]
+) -> tuple[Floats | None, tuple[int, ...]]:
+    counts = np.zeros((4, episodes))
+    heard: dict[tuple[int, int, int], int] = {}
+    first: dict[tuple[int, int, int], int] = {}
+    judged = False
+    for part in parts:
+        trust, attackers = part.result.trust, part.said.attackers
+        for n, h in zip(*np.nonzero(~np.isnan(trust)), strict=True):
+            judged = True
+            who = (*part.due.episodes[n], int(h))
+            suspect, attacks = bool(trust[n, h] < TRUSTED), bool(attackers[n, h])
+            counts[(0 if suspect else 1) if attacks else (2 if suspect else 3), place[who[0]]] += 1
+            if attacks:
+                heard[who] = heard.get(who, 0) + 1
+                if suspect:
+                    first.setdefault(who, heard[who])
+    return (counts if judged else None), tuple(first.get(who, 0) for who in heard)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """All cells of a study.
+
+    Attributes:
+        name: of the run.
+        source: its dataset.
+        condition: the operating point that is attacked.
+        cells: by rule, attack and share.
+        alone: success of an ego that never asks, (S, E).
+    """
+
+    name: str
+    source: str
+    condition: str
+    cells: Mapping[tuple[str, str, float], Cell]
+    alone: Floats
+
+    @cached_property
+    def rules(self) -> tuple[str, ...]:
+        """Rules, the paper's first."""
+        return tuple(dict.fromkeys(rule for rule, _, _ in self.cells))
+
+    @cached_property
+    def attacks(self) -> tuple[str, ...]:
+        """Attacks, without peace and without the reference."""
+        return tuple(dict.fromkeys(a for _, a, _ in self.cells if a not in (PEACE, EXCLUDED)))
+
+    @cached_property
+    def shares(self) -> tuple[float, ...]:
+        """Shares above 0."""
+        return tuple(dict.fromkeys(share for _, _, share in self.cells if share))
+
+    def at(self, rule: str, attack: str = PEACE, share: float = 0.0) -> Cell:
+        """A cell."""
+        return self.cells[rule, attack, share]
+
+    def success(self, *of: Any) -> Estimate:
+        """Success, over episodes."""
+        return over_episodes(SUCCESS, self.at(*of).success)
+
+    def price(self, rule: str) -> Estimate:
+        """What a rule costs while nobody attacks: its success less the linear pool's, paired."""
+        return difference(SUCCESS, self.at(rule).success.T, self.at(BASE).success.T)
+
+    def loss(self, rule: str, attack: str, share: float) -> Estimate:
+        """What an attack takes from a rule: success under it less success in peace, paired."""
+        return difference(SUCCESS, self.at(rule, attack, share).success.T, self.at(rule).success.T)
+
+    @cached_property
+    def holm(self) -> Mapping[tuple[str, str, float], float]:
+        """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
+        places = [of for of in self.cells if of[0] != BASE and of[1] not in (PEACE, EXCLUDED)]
+        p_values = {
+            of: p
+            for of in places
+            if (p := p_value(SUCCESS, self.cells[of].success.T, self.at(BASE, *of[1:]).success.T)) is not None
+        }
+        return dict(zip(p_values, holm(list(p_values.values())), strict=True))
+
+    def clear(self, *of: Any) -> bool:
+        """Whether a rule differs from the linear pool under an attack by more than chance explains."""
+        return self.holm.get(of, 1.0) <= LEVEL
+
+    def worst(self, rule: str, share: float) -> str:
+        """The attack under which it succeeds least."""
+        return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
+
+    def mean(self, rule: str, share: float) -> Estimate:
+        """Success as a mean over all attacks, over episodes."""
+        each = [self.at(rule, attack, share).success for attack in self.attacks]
+        return over_episodes(SUCCESS, np.mean(each, axis=0))
+
+
+def run_bench(
+    stored: Stored, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
+    seeds: Sequence[int], out: Path, progress: Callable[[int], None], more: Callable[[int], None],
+) -> Bench:  # fmt: skip
+    """Play every cell that the folder has not.
+
+    Args:
+        stored: the run.
+        condition: an operating point with a channel.
+        rules: of consensus; the linear pool is added.
+        attacks: without shares.
+        shares: above 0.
+        seeds: of the channel.
+        out: the study's folder, in which finished cells are kept.
+        progress: called with 1 whenever a cell is done.
+        more: called with the number of cells that are to be played.
+
+    Raises:
+        UserError: the point has no channel, or its rule is a fusion call.
+    """
+    point = point_of([stored], condition)
+    if point.attack or EGO_PROMPT in rules:
+        raise UserError(
+            "harness trust: give a condition without attack, and rules that are arithmetic; a fusion call is "
+            f"attacked by `harness eval --condition {condition}:consensus={EGO_PROMPT} --attack injection`"
+        )
+    every = [
+        *((rule, PEACE, 0.0) for rule in dict.fromkeys([BASE, *rules])),
+        *((BASE, EXCLUDED, share) for share in shares),
+        *product(dict.fromkeys([BASE, *rules]), attacks, shares),
+    ]
+    kept = _Kept(out / "cells.jsonl", stored, point, seeds)
+    more(len(every))
+    cells = {}
+    for of in every:
+        cells[of] = kept.get(of) or kept.add(play(stored, point, seeds, of))
+        progress(1)
+    never = FrozenWorld(stored.dataset, [alone := OperatingPoint("never asks", None)], seeds)
+    for _ in walk(never, [alone], stored):
+        pass
+    return Bench(stored.name, stored.run.source, condition, cells, never.ends(alone)["success_rate"])
+
+
+class _Kept:
+    """Finished cells in a file, a line each; those of another study are left behind."""
+
+    def __init__(self, path: Path, stored: Stored, point: OperatingPoint, seeds: Sequence[int]) -> None:
+        self._path, self._episodes = path, len(stored.dataset.episodes)
+        plain = {
+            key: value for key, value in vars(point).items() if isinstance(value, str | float | int | None)
+        }
+        self._of = digest([stored.manifest(), str(stored.run.manifest.identity), plain, list(seeds)])
+        self._cells: dict[tuple[str, str, float], Cell] = {}
+        lines = path.read_bytes().splitlines() if path.is_file() else []
+        for line in lines:
+            self._read(line)
+
+    def _read(self, line: bytes) -> None:
+        try:
+            plain = json.loads(line)
+            if plain.pop("of") != self._of:
+                return
+            success, unsafe, nats = (np.array(plain[k], dtype=float) for k in ("success", "unsafe", "nats"))
+            flagged = None if plain["flagged"] is None else np.array(plain["flagged"], dtype=float)
+            of = str(plain["rule"]), str(plain["attack"]), float(plain["share"])
+            self._cells[of] = Cell(*of, success, unsafe, nats, flagged, tuple(plain["first"]))
+        except (ValueError, KeyError, TypeError):
+            return  # a torn line is played again
+
+    def get(self, of: tuple[str, str, float]) -> Cell | None:
+        return self._cells.get(of)
+
+    def add(self, cell: Cell) -> Cell:
+        plain = {key: _plain(value) for key, value in vars(cell).items()}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("ab") as file:
+            file.write(json.dumps({"of": self._of, **plain}).encode() + b"\n")
+        return cell
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [[None if np.isnan(x) else round(float(x), 6) for x in row] for row in value]
+    return list(value) if isinstance(value, tuple) else value
