@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from harness.coordination.consensus import Messages, inverse_distance_weights
+from harness.coordination.consensus import Messages, capped, inverse_distance_weights
 from harness.coordination.robust import HEADS, bayes, centred_clipping, geometric_median, head_trimmed_mean
 from harness.coordination.rules import RULES
 from harness.coordination.trust import Trust, divergence
@@ -158,3 +158,20 @@ def test_who_is_not_heard_keeps_its_reputation():
     quiet = messages([CAREFUL] * 4, [10, 10, 10, 10], heard=[True, True, False])
     later = TRUST.fuse(quiet, lied.state)
     assert later.trust[2] == pytest.approx(lied.trust[2])
+
+
+def test_a_cap_takes_weight_from_one_helper_and_gives_it_to_all_others_in_proportion():
+    """Of .1, .2, .1 and .6 the last may have .3: the other .7 are shared as 1 to 2 to 1, and .35 is too much.
+
+    So that one has .3 as well, and the ego and the third helper share the rest.
+    """
+    assert capped(np.array([0.1, 0.2, 0.1, 0.6]), 0.5) == pytest.approx([0.125, 0.25, 0.125, 0.5])
+    assert capped(np.array([0.1, 0.2, 0.1, 0.6]), 0.3) == pytest.approx([0.2, 0.3, 0.2, 0.3])
+
+
+@given(raw=arrays(float, (5, 4), elements=st.floats(0.01, 1)), most=st.floats(0.05, 1))
+def test_capped_weights_sum_to_one_and_no_helper_has_more(raw: Any, most: float):
+    weights = capped(raw / raw.sum(axis=-1, keepdims=True), most)
+    assert weights.sum(axis=-1) == pytest.approx(1.0)
+    assert (weights[:, 1:] <= most + 1e-12).all()
+    assert (weights >= 0).all()

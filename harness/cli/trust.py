@@ -19,7 +19,7 @@ def command(
     attacks: str = typer.Option(
         "all", help="Attacks, such as liar,liar+spoof,stale:decisions=2. `harness trust --help` lists them."
     ),
-    rules: str = typer.Option("all", help="Consensus rules, such as median,trust."),
+    rules: str = typer.Option("all", help="Consensus rules, such as median,trust,linear:weight_cap=0.3."),
     share: str = typer.Option("0,1/3,2/3", help="Shares of the helpers that attack; 0 is always played."),
     condition: str = typer.Option("6g", help="Operating point that is attacked, or a change of one."),
     seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
@@ -37,12 +37,12 @@ def command(
     from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES
     from harness.studies.stored import Stored
-    from harness.studies.trust import USUAL, names_of, run_bench, shares_of
+    from harness.studies.trust import CAPPED, USUAL, names_of, run_bench, shares_of
     from harness.studies.trust_page import as_json as plain
     from harness.studies.trust_page import in_a_sentence, price, write_bench
 
     chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
-    ways, parts = names_of("--rules", rules, tuple(RULES), tuple(RULES)), shares_of(share)
+    ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
     with bar("rules under attack", quiet=as_json or quiet) as progress:
         stored = Stored(run, more=progress.more, done=progress, asks=not no_model)
         draws = options.parse_seeds(seeds) if seeds else stored.seeds

@@ -103,6 +103,22 @@ def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: f
     return closeness / total
 
 
+def capped(weights: Floats, most: float) -> Floats:
+    """The weights `(..., 1+H)` with no helper's above `most`; what one loses goes to all others in proportion.
+
+    The ego's may grow beyond it. Weights that sum to 1 still do.
+    """
+    fixed = np.zeros(weights.shape, dtype=bool)
+    scaled = weights
+    for _ in range(weights.shape[-1] - 1):
+        fixed[..., 1:] |= scaled[..., 1:] > most
+        rest = np.where(fixed, 0.0, weights)
+        total = np.sum(rest, axis=-1, keepdims=True)
+        left = 1.0 - most * np.sum(fixed, axis=-1, keepdims=True)
+        scaled = np.where(fixed, most, rest * left / np.where(total > 0, total, 1.0))
+    return scaled
+
+
 def linear_pool(p: Floats, weights: Floats) -> Floats:
     """Weighted mean of intents, `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
 

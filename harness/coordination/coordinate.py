@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from harness.coordination.consensus import Messages, inverse_distance_weights
+from harness.coordination.consensus import Messages, capped, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange, inferred_s
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -88,6 +88,8 @@ def fuse(
     if point.ego_distance_m is not None:
         distance_m = np.insert(distance_m[..., 1:], 0, point.ego_distance_m, axis=-1)
     weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
+    if point.weight_cap < 1:
+        weights = capped(weights, point.weight_cap)
     anybody = np.any(heard.on_time, axis=-1)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)

@@ -73,6 +73,7 @@ class OperatingPoint:
         defence: what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted`, evidence is a JSON
             string; `schema`, messages have no free text; `majority`, an action that most of the voices agree
             on stands against the call's.
+        weight_cap: largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
     """
 
     name: str
@@ -97,6 +98,7 @@ class OperatingPoint:
     radio: str = ""
     attack: str = ""
     defence: str = ""
+    weight_cap: float = 1.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -115,6 +117,7 @@ class OperatingPoint:
         self._number("min_distance_m", "metres above 0")
         if self.ego_distance_m is not None:
             self._number("ego_distance_m", "metres above 0")
+        self._number("weight_cap", "a share above 0, up to 1", most=1.0)
         self._number("request_bits", "bits, 0 or more", zero=True)
         if self.loss is not None:
             self._number("loss", "a probability from 0 to 1", zero=True, most=1.0)

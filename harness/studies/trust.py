@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.attacks import attacks_of
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, setting_of
 from harness.coordination.rules import EGO_PROMPT
 from harness.core import noise
 from harness.core.arrays import Floats
@@ -39,6 +38,7 @@ RESAMPLES = 2000
 TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
+CAPPED = "linear:weight_cap=0.3"
 # What `--attacks all` is: each alone, and a spoofed pose and several voices with a lie.
 USUAL = (
     "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
@@ -109,12 +109,19 @@ def _bootstrapped(values: Floats, n: int) -> Estimate:
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
-    """The operating point with a rule and attackers; every part of the attack has the same share."""
-    parts = [f"{part}:share={share:.10g}" for part in attack.split("+")] if attack else []
-    text = "+".join(parts)
-    attacks_of(text)
+    """The operating point with a rule and attackers; every part of the attack has the same share.
+
+    A rule may have a cap on weights: `linear:weight_cap=0.3`.
+    """
+    text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
+    consensus, *settings = rule.split(":")
+    more: dict[str, Any] = {
+        key: setting_of(key, value) for key, _, value in (each.partition("=") for each in settings)
+    }
+    if more.keys() - {"weight_cap"}:
+        raise UserError(f"--rules {printable(rule)}: a rule may have a weight_cap, such as {CAPPED}")
     name = f"{point.name} · {rule}" + (f" · {text}" if text else "")
-    return replace(point, name=name, consensus=rule, attack=text)
+    return replace(point, name=name, consensus=consensus, attack=text, **more)
 
 
 def names_of(option: str, text: str, usual: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:

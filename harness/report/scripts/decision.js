@@ -36,8 +36,11 @@ function endings(ends) {
 }
 
 function reply(m) {
-  if (!m.delivered) return `${m.from}: lost`;
-  return `${m.from}: ${m.arrival_ms.toFixed(1)} ms, ${m.on_time ? `weight ${m.weight.toFixed(3)}` : "too late"}`;
+  const who = m.attacker ? `${m.from} (attacker)` : m.from;
+  if (!m.delivered) return `${who}: lost`;
+  const worth = [m.weight == null ? "on time" : `weight ${m.weight.toFixed(3)}`];
+  if (m.trust != null) worth.push(`trust ${m.trust.toFixed(2)}`);
+  return `${who}: ${m.arrival_ms.toFixed(1)} ms, ${m.on_time ? worth.join(", ") : "too late"}`;
 }
 
 const acted = (d) => d.acts_at_s != null
@@ -51,8 +54,10 @@ function policyRows(told, chosen, actions, run) {
   const rows = [];
   const add = (who, what, p) => actions.forEach((action, n) => rows.push({ who, what, action, p: p[n] }));
   for (const a of first(told.answers, run.points[chosen.condition])) {
-    const weight = a.role === "ego" ? chosen.own_weight : chosen.messages.find((m) => m.from === sender(a))?.weight;
-    const what = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
+    const message = chosen.messages.find((m) => m.from === sender(a));
+    const weight = a.role === "ego" ? chosen.own_weight : message?.weight;
+    const before = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
+    const what = message?.attacker ? "what it intends; what it sent is the attack's" : before;
     if (a.intent) add(who(a), what, a.intent);
   }
   add(`fused, ${chosen.condition}`, "after fusion", chosen.fused);

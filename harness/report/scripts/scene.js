@@ -114,7 +114,8 @@ function birdsEye(world, ground, viewer, messages, zoom) {
   }
   for (const v of world.vehicles.filter(within)) {
     const fate = messages.find((m) => m.from === v.id);
-    const said = !fate ? "" : fate.delivered ? `, ${fate.arrival_ms.toFixed(0)} ms${fate.on_time ? "" : " late"}` : ", lost";
+    const arrived = !fate ? "" : fate.delivered ? `, ${fate.arrival_ms.toFixed(0)} ms${fate.on_time ? "" : " late"}` : ", lost";
+    const said = fate?.attacker ? `${arrived}, attacks` : arrived;
     label(`${v.id} ${v.speed.toFixed(0)} m/s${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
   }
   for (const c of sees.conflicts) label(both(c), c.x, -c.y, 1.6, "crossing");
