@@ -104,7 +104,7 @@ def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: f
 
 
 def capped(weights: Floats, most: float) -> Floats:
-    """The weights `(..., 1+H)` with no helper's above `most`; what one loses goes to all others in proportion.
+    """The weights `(..., 1+H)` with no helper's above `most`; all others share what it loses.
 
     The ego's may grow beyond it. Weights that sum to 1 still do.
     """

@@ -115,11 +115,10 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
     """
     text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
-    more: dict[str, Any] = {
-        key: setting_of(key, value) for key, _, value in (each.partition("=") for each in settings)
-    }
-    if more.keys() - {"weight_cap"}:
+    pairs = dict(setting.partition("=")[::2] for setting in settings)
+    if pairs.keys() - {"weight_cap"}:
         raise UserError(f"--rules {printable(rule)}: a rule may have a weight_cap, such as {CAPPED}")
+    more: dict[str, Any] = {key: setting_of(key, value) for key, value in pairs.items()}
     name = f"{point.name} · {rule}" + (f" · {text}" if text else "")
     return replace(point, name=name, consensus=consensus, attack=text, **more)
 

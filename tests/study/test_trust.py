@@ -1,0 +1,133 @@
+"""The bench of rules under attack: its cells are runs, its figures paired, and it goes on when stopped."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import figure, run, spec_of
+
+from harness.coordination.operating_point import named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.evaluate.run import Evaluated
+from harness.studies import trust
+from harness.studies.stored import Stored
+from harness.studies.trust import EXCLUDED, PEACE, Bench, names_of, run_bench, shares_of
+from harness.studies.trust_page import in_a_sentence, write_bench
+
+ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")
+RULES, ATTACKS, THIRD = ("linear", "trust", "linear:weight_cap=0.3"), ("liar+spoof", "stale"), 1 / 3
+
+
+@pytest.fixture(scope="module")
+def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    spec = spec_of(small, points=(*spec_of(small).points, ATTACKED))
+    return run(spec, tmp_path_factory.mktemp("trust") / "run")
+
+
+def played(done: Evaluated, out: Path, told: Any = lambda n: None) -> Bench:
+    stored = Stored(done.out)
+    return run_bench(stored, "6g", RULES, ATTACKS, (THIRD,), stored.seeds, out, told, lambda n: None)
+
+
+@pytest.fixture(scope="module")
+def bench(done: Evaluated, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    return played(done, tmp_path_factory.mktemp("trust") / "bench")
+
+
+def test_its_cells_are_what_a_run_says_under_the_same_condition(done: Evaluated, bench: Bench) -> None:
+    assert bench.success("linear").value == pytest.approx(figure(done, "6g", "success_rate").value)
+    attacked = bench.success("linear", "liar+spoof", THIRD)
+    assert attacked.value == pytest.approx(figure(done, ATTACKED.name, "success_rate").value)
+    alone = float(np.mean(bench.alone))
+    assert alone == pytest.approx(figure(done, "single-local", "success_rate").value)
+
+
+def test_every_rule_meets_every_attack_and_peace_and_the_reference_is_there(bench: Bench) -> None:
+    assert bench.rules == RULES
+    assert bench.attacks == ATTACKS
+    assert {of[1] for of in bench.cells} == {PEACE, EXCLUDED, *ATTACKS}
+    assert len(bench.cells) == 3 + 1 + 3 * 2
+
+
+def test_a_liar_at_a_false_place_is_found_and_nobody_is_while_nobody_lies(bench: Bench) -> None:
+    found = bench.at("trust", "liar+spoof", THIRD).detection()
+    assert found is not None
+    assert found["recall"].value > 0.5
+    assert found["precision"].value > 0.5
+    peace = bench.at("trust").flagged
+    assert peace is not None
+    assert peace[:2].sum() == 0
+    assert bench.at("linear", "liar+spoof", THIRD).detection() is None
+
+
+def test_a_loss_is_paired_with_the_same_rule_in_peace(bench: Bench) -> None:
+    loss = bench.loss("linear", "liar+spoof", THIRD)
+    parts = bench.success("linear", "liar+spoof", THIRD).value - bench.success("linear").value
+    assert loss.value == pytest.approx(parts)
+    assert bench.price("linear").value == 0
+
+
+def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
+    done: Evaluated, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = played(done, tmp_path)
+    kept = tmp_path / "cells.jsonl"
+    lines = kept.read_bytes().splitlines(keepends=True)
+    assert len(lines) == len(first.cells)
+    kept.write_bytes(b"".join(lines[:4]) + lines[4][:50])
+    again: list[tuple[str, str, float]] = []
+    real = trust.play
+
+    def counting(stored: Any, point: Any, seeds: Any, of: Any) -> Any:
+        again.append(of)
+        return real(stored, point, seeds, of)
+
+    monkeypatch.setattr(trust, "play", counting)
+    second = played(done, tmp_path)
+    assert len(again) == len(lines) - 4
+    for of, cell in first.cells.items():
+        assert np.array_equal(second.cells[of].success, cell.success)
+        assert second.cells[of].first == cell.first
+        assert second.cells[of].nats == pytest.approx(cell.nats, abs=1e-6, nan_ok=True)
+
+
+def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Path) -> None:
+    page = write_bench(bench, tmp_path).read_text()
+    assert "liar+spoof" in page
+    assert in_a_sentence(bench)[0].startswith("While nobody attacks")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"index.html", "trust.json", "figures.csv", "figures.jsonl", "heat-map.svg"} <= names
+    rows = [json.loads(line) for line in (tmp_path / "figures.jsonl").read_text().splitlines()]
+    assert {row["metric"] for row in rows} >= {
+        "success_rate",
+        "unsafe_rate",
+        "nats",
+        "detection_f1",
+        "price_in_peace",
+    }
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        (lambda: shares_of("0,2"), "--share 0,2"),
+        (lambda: shares_of("1/0"), "--share 1/0"),
+        (lambda: names_of("--attacks", "liar,lair", (), ("liar",)), "unknown --attacks 'lair'"),
+        (lambda: names_of("--attacks", "liar:share=1", (), ("liar",)), "--share"),
+        (lambda: trust.under(named_point("6g"), "linear:tau=1", "", 0.0), "weight_cap"),
+    ],
+)
+def test_what_it_cannot_play_is_one_line(act: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said) as problem:
+        act()
+    assert "\n" not in str(problem.value)
+
+
+def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) -> None:
+    stored = Stored(done.out)
+    for condition, rules in (("6g", ("ego-prompt",)), ("6g:attack=liar", ("linear",))):
+        with pytest.raises(UserError, match="harness eval"):
+            run_bench(stored, condition, rules, (), (THIRD,), (0,), tmp_path, lambda n: None, lambda n: None)
