@@ -112,11 +112,11 @@ def test_a_channel_may_lose_each_link_by_itself():
 
 def test_a_points_overrides_are_fields_of_its_channel():
     point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
-    assert point.channel() == Fog(latency_s=0.05)
+    assert point.channel == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
     v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
-    assert v2x.channel() == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
-    assert OperatingPoint("x", None, loss=0.5).channel() == NO_CHANNEL
+    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel == NO_CHANNEL
 
 
 @pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
@@ -222,7 +222,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    slow, v2x = (OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x"))
+    slow, v2x = (OperatingPoint("x", name).channel for name in ("slow-radio", "v2x"))
     assert isinstance(slow, Radio)
     assert isinstance(v2x, Radio)
     assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)

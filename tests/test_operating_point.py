@@ -94,7 +94,7 @@ def test_every_other_channel_profile_is_a_point_of_its_own_name(monkeypatch):
     monkeypatch.setitem(CHANNELS._loaded, "fog", fog)
     assert named_point("fog") == OperatingPoint("fog", "fog")
     assert named_point("fog:loss=0.2") == OperatingPoint("fog:loss=0.2", "fog", loss=0.2)
-    assert named_point("fog:window_s=0.3").channel() == fog
+    assert named_point("fog:window_s=0.3").channel == fog
     with pytest.raises(
         UserError, match="setting of operating point fog 'windows_s'; did you mean 'window_s'"
     ):

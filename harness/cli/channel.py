@@ -261,4 +261,4 @@ def _of(text: str) -> "tuple[str, Channel]":
     point = named_point(text)
     if point.profile is None:
         raise UserError(f"{printable(text)} has no channel; `harness channel list` shows those there are")
-    return point.profile, point.channel()
+    return point.profile, point.channel

@@ -115,7 +115,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     inference_s = inferred_s(point, intents)
     inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
-    channel = point.channel()
+    channel = point.channel
     heard_s, air_s = channel.request(point.request_bits, draws)
     heard_s = np.asarray(heard_s)[..., None]
     ready_s = heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from harness.coordination.attacks import attacks_of, in_text
@@ -141,7 +142,7 @@ class OperatingPoint:
                 raise unknown("defence", part, DEFENCES)
             if self.consensus != EGO_PROMPT:
                 raise self._wrong("defence", f"left out where consensus is not {EGO_PROMPT}")
-        self.channel()
+        _ = self.channel
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
@@ -157,8 +158,12 @@ class OperatingPoint:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
+    @cached_property
     def channel(self) -> Channel:
-        """The profile's, with the point's overrides. Raises UserError for one that the profile has not."""
+        """The profile's, with the point's overrides, as its file was when the point was made.
+
+        Raises UserError for an override that the profile has not.
+        """
         if self.profile is None:
             return NO_CHANNEL
         channel = CHANNELS[self.profile]
@@ -242,7 +247,7 @@ def named_point(text: str) -> OperatingPoint:
     if name not in named and name not in CHANNELS:
         raise unknown("operating point", name, {*named, *CHANNELS})
     point = named.get(name) or OperatingPoint(name, name)
-    its_own = [key for key in settable(point.channel()) if key not in OVERRIDES] if point.profile else []
+    its_own = [key for key in settable(point.channel) if key not in OVERRIDES] if point.profile else []
     settings: dict[str, Any] = {}
     radio: dict[str, str] = {}
     for setting in rest.split(",") if colon else ():

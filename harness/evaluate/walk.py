@@ -123,7 +123,7 @@ def walk(
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
-        if any(point.channel().needs_site for point in due):
+        if any(point.channel.needs_site for point in due):
             intents = replace(intents, site=world.site())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
