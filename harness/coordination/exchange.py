@@ -30,7 +30,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.statistics import known_mean
-from harness.radio.channel import Draws, Links
+from harness.radio.channel import Draws, Links, Physical
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         point.request_bits, intents.site,
     )  # fmt: skip
     up, delay_s, loss, airtime_s = channel.deliver(links, draws)
-    if channel.needs_site and point.loss is not None:
+    if isinstance(channel, Physical) and point.loss is not None:
         up, loss = np.all(draws.packet >= point.loss, axis=-1), np.full_like(loss, point.loss)
     requested = np.any(asked, axis=-1)
     delivered = asked & up if intents.silent is None else asked & up & ~intents.silent

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
-from harness.radio.channel import Channel
+from harness.radio.channel import Channel, Physical
 from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
 
 FALLBACKS = ("uniform", "brake")
@@ -171,7 +171,7 @@ class OperatingPoint:
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
-        if channel.needs_site:  # its loss is no setting: `exchange` puts another in place of it
+        if isinstance(channel, Physical):  # its loss is no setting: `exchange` puts another in place of it
             overrides.pop("loss", None)
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:

@@ -21,7 +21,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.fusion import codes_of
-from harness.radio.channel import Draws, Site
+from harness.radio.channel import Draws, Physical, Site
 from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
@@ -123,7 +123,7 @@ def walk(
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
-        if any(point.channel.needs_site for point in due):
+        if any(isinstance(point.channel, Physical) for point in due):
             intents = replace(intents, site=world.site())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None

@@ -41,6 +41,11 @@ class Site:
         apart: Floats = np.linalg.norm(self.xy_m[..., 1:, :] - self.xy_m[..., :1, :], axis=-1)
         return apart
 
+    @property
+    def between(self) -> tuple[Ints, Floats, Floats]:
+        """What `Propagation` wants to know of what stands between: sight, blocker and corner."""
+        return self.sight, self.blocker_m, self.corner_m
+
     def take(self, at: Any) -> "Site":
         """The sites at these places of the leading dimension."""
         return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at])
@@ -124,7 +129,7 @@ class Links:
         in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
         request_bits: size of the request.
-        site: where they are; None where the channel does not need it, or the world has no places.
+        site: where they are; None where the channel is not `Physical`, or the world has no places.
     """
 
     asked: Bools
@@ -135,6 +140,13 @@ class Links:
     rounds: Bools
     request_bits: float = 0.0
     site: Site | None = None
+
+    @property
+    def where(self) -> Site:
+        """The site. Raises UserError in a world without places."""
+        if self.site is None:
+            raise UserError(NO_SITE)
+        return self.site
 
     def take(self, at: Any) -> "Links":
         """The links of these places of the leading dimension."""
@@ -180,7 +192,6 @@ class Channel(Protocol):
     """A frozen dataclass. The operating point's overrides replace the fields of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-    needs_site: ClassVar[bool]  # whether `Links.site` and the draws of trips are looked at
 
     def request(self, bits: float, draws: Draws) -> Broadcast:
         """When helpers have a request of so many bits."""
@@ -191,7 +202,14 @@ class Channel(Protocol):
 
 @runtime_checkable
 class Physical(Channel, Protocol):
-    """A channel whose losses follow from where vehicles are and what stands between them."""
+    """A channel whose losses follow from where vehicles are and what stands between them.
+
+    Only such a channel looks at `Links.site` and the draws of trips.
+    """
+
+    @property
+    def decorrelation_m(self) -> float:
+        """How far shadowing reaches (`fading.Trips.shadow`); inf where there is none."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of packets of the background's size that are received at these distances `(n,)`.

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +45,6 @@ class Fog:
 
     latency_s: float = 0.01
     loss_per_m: float = 0.01
-    needs_site: ClassVar[bool] = False
 
     def request(self, bits: float, draws: Draws) -> Broadcast:
         """A message's time on air is not modelled."""
