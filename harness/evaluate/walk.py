@@ -24,6 +24,8 @@ from harness.evaluate.fusion import codes_of
 from harness.radio.channel import Draws, Physical, Site
 from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
+from harness.world.scenario import Scenario
+from harness.world.sight_lines import site
 
 Moment = TypeVar("Moment")
 AskedMoment = TypeVar("AskedMoment", contravariant=True)
@@ -88,6 +90,22 @@ class World(Protocol[Moment]):
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
+
+
+class Placed:
+    """A world whose moments are scenes.
+
+    Attributes:
+        scenario: of the scenes.
+        scenes: those just shown.
+    """
+
+    scenario: Scenario
+    scenes: Sequence[Scene]
+
+    def site(self) -> Site:
+        """Where the vehicles of each scene are."""
+        return site([(scene.state, scene.viewers) for scene in self.scenes])
 
 
 class Fuses(Protocol):
