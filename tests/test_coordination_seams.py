@@ -14,7 +14,7 @@ from swarm_extras import FOG, SMOOTHING, Fog
 from harness.coordination.consensus import Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
@@ -151,9 +151,9 @@ def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws
     return links, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
 
 
-@pytest.mark.parametrize("name", [*CHANNELS, "fog"])
+@pytest.mark.parametrize("name", [*CHANNELS, "fog", "mode2:loss=0.3"])
 def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
-    channel = CHANNELS[name]
+    channel = named_point(name).channel
     links, draws = links_and_draws((40, 4))
     up, delay_s, loss, airtime_s = channel.deliver(links, draws)
     assert up.shape == delay_s.shape == (40, 4)

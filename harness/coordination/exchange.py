@@ -30,7 +30,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.statistics import known_mean
-from harness.radio.channel import Draws, Links, Physical
+from harness.radio.channel import Draws, Links
 
 
 @dataclass(frozen=True)
@@ -115,17 +115,14 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     inference_s = inferred_s(point, intents)
     inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
-    channel = point.channel
-    heard_s, air_s = channel.request(point.request_bits, draws)
+    heard_s, air_s = point.channel.request(point.request_bits, draws)
     heard_s = np.asarray(heard_s)[..., None]
     ready_s = heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
     links = Links(
         asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
         point.request_bits, intents.site,
     )  # fmt: skip
-    up, delay_s, loss, airtime_s = channel.deliver(links, draws)
-    if isinstance(channel, Physical) and point.loss is not None:
-        up, loss = np.all(draws.packet >= point.loss, axis=-1), np.full_like(loss, point.loss)
+    up, delay_s, loss, airtime_s = point.channel.deliver(links, draws)
     requested = np.any(asked, axis=-1)
     delivered = asked & up if intents.silent is None else asked & up & ~intents.silent
     slot_end_s = request_s + delay_s

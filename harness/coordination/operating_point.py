@@ -11,6 +11,7 @@ from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical
 from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
+from harness.radio.wrapped import AtLoss
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
@@ -171,14 +172,15 @@ class OperatingPoint:
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
-        if isinstance(channel, Physical):  # its loss is no setting: `exchange` puts another in place of it
-            overrides.pop("loss", None)
+        loss = overrides.pop("loss", None) if isinstance(channel, Physical) else None  # no setting of its own
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
         if self.radio:
             channel = changed(channel, pairs(self.radio), f"channel profile {self.profile}")
         channel = replace(channel, **overrides)
+        if loss is not None and isinstance(channel, Physical):
+            channel = AtLoss(channel, loss)
         if self.loss is not None and getattr(channel, "density_coupled", False):
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
         return channel
