@@ -40,7 +40,7 @@ class Radio:
     density_coupled: bool = False
     roadside_edge: bool = False
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Serialisation alone: the rest of a request's time is in the nominal latency."""
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 

@@ -89,7 +89,7 @@ class Trace:
         """Channel busy ratio, of which a table of receptions says nothing."""
         return math.nan
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Heard when the longest latency is over; how much of it is time on air is not known."""
         return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
 

@@ -75,9 +75,9 @@ class Transceiver(Propagation):
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """All helpers have it when it has waited for its turn and been on air."""
-        airtime_s = float(self.message_s(bits))
+        airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:

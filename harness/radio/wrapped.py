@@ -23,7 +23,7 @@ class Wrapped:
         """The channel's."""
         return self.channel.decorrelation_m
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """The channel's."""
         return self.channel.request(bits, draws)
 

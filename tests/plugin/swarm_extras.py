@@ -46,7 +46,7 @@ class Fog:
     latency_s: float = 0.01
     loss_per_m: float = 0.01
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """A message's time on air is not modelled."""
         return Broadcast(0.0, 0.0)
 
