@@ -1,6 +1,6 @@
 """Channel profiles as files: what ships, a project's own, their settings, and mistakes in them."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -45,12 +45,16 @@ def test_a_projects_profile_is_a_condition_and_changes_with_its_file(project: Pa
     point = named_point("mine:access=parallel,window=300")
     assert point.profile == "mine"
     assert point.window_s == pytest.approx(0.3)
-    assert point.channel() == Radio(0.01, 0.3, 6e6, "parallel")
-    assert point == OperatingPoint.from_dict({**vars(point)}), "as a manifest has it"
+    assert point.channel == Radio(0.01, 0.3, 6e6, "parallel")
+    assert point == OperatingPoint.from_dict(asdict(point)), "as a manifest has it"
     before = CHANNELS.record("mine")
     assert before["parameters"]["loss"] == 0.3
     (project / "mine.toml").write_text(MINE.replace("0.3", "0.25"))
     assert CHANNELS.record("mine") != before
+    assert named_point("mine").channel == Radio(0.01, 0.25, 6e6, "serial")
+    assert point.channel == Radio(0.01, 0.3, 6e6, "parallel"), (
+        "a point keeps the channel that it was made with"
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,8 +99,8 @@ def test_a_setting_of_a_channel_that_is_not_allowed_is_one_line(text: str, says:
 def test_a_setting_of_a_channel_is_an_axis():
     axis = axis_of("jitter_s")
     swept = [axis.at(named_point("6g:access=serial"), value) for value in grid(axis, "0,0.001")]
-    assert [point.channel().jitter_s for point in swept] == [0.0, 0.001]  # type: ignore[attr-defined]
-    assert {point.channel().access for point in swept} == {"serial"}  # type: ignore[attr-defined]
+    assert [point.channel.jitter_s for point in swept] == [0.0, 0.001]  # type: ignore[attr-defined]
+    assert {point.channel.access for point in swept} == {"serial"}  # type: ignore[attr-defined]
     switch = axis_of("access")
     assert grid(switch, "serial,parallel") == ("serial", "parallel")
     with pytest.raises(UserError, match="unknown --over 'jiter_s'; did you mean 'jitter_s'"):

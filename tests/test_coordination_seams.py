@@ -14,11 +14,11 @@ from swarm_extras import FOG, SMOOTHING, Fog
 from harness.coordination.consensus import Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
-from harness.radio.channel import Channel, Draws, Links, Site
+from harness.radio.channel import Channel, Draws, Links, Site, Unit
 from harness.radio.constant import Radio
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
@@ -112,14 +112,14 @@ def test_a_channel_may_lose_each_link_by_itself():
 
 def test_a_points_overrides_are_fields_of_its_channel():
     point = OperatingPoint("x", "fog", tau_nats=0.5, latency_s=0.05)
-    assert point.channel() == Fog(latency_s=0.05)
+    assert point.channel == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
-    v2x = OperatingPoint("x", "v2x", loss=0.0, roadside_edge=True)
-    assert v2x.channel() == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
-    assert OperatingPoint("x", None, loss=0.5).channel() == NO_CHANNEL
+    v2x = OperatingPoint("x", "v2x", loss=0.0, edge="relay")
+    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    assert OperatingPoint("x", None, loss=0.5).channel == NO_CHANNEL
 
 
-@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"roadside_edge": True}])
+@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"edge": "relay"}])
 def test_an_override_that_a_channel_does_not_have_is_refused(override):
     [name] = override
     with pytest.raises(
@@ -129,6 +129,15 @@ def test_an_override_that_a_channel_does_not_have_is_refused(override):
 
 
 # -- every plug-in, those of installed packages included ---------------------------------------------------
+
+
+def somewhere(shape: tuple[int, ...], rng: np.random.Generator) -> Site:
+    return Site(
+        rng.uniform(-90, 90, (shape[0], 1 + shape[1], 2)),
+        rng.integers(0, 3, shape),
+        rng.choice([0.0, 1.5, 3.6], shape),
+        rng.choice([30.0, np.nan], (*shape, 1)) * np.ones(2),
+    )
 
 
 def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws]:
@@ -142,18 +151,18 @@ def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws
         asked | (rng.random(shape) < 0.5),
         asked & (rng.random(shape) < 0.5),
         400.0,
-        Site(
-            rng.uniform(-90, 90, (shape[0], 1 + shape[1], 2)), rng.integers(0, 3, shape),
-            rng.choice([0.0, 1.5, 3.6], shape), rng.choice([30.0, np.nan], (*shape, 1)) * np.ones(2),
-        ),
-    )  # fmt: skip
+        replace(somewhere(shape, rng), units={Unit(0.0, 0.0, 5.0): somewhere((shape[0], 1 + shape[1]), rng)}),
+    )
     trips = Trips(rng.integers(0, 3, shape[0]), rng.integers(0, 9, shape[0]), rng.integers(0, 6, shape[0]), 6)
     return links, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
 
 
-@pytest.mark.parametrize("name", [*CHANNELS, "fog"])
+RELAYED = ["mode4:edge=relay,edge_delay_s=0.01", "its-g5:edge=relay", "mode2:edge=relay,loss=0.3"]
+
+
+@pytest.mark.parametrize("name", [*CHANNELS, "fog", "mode2:loss=0.3", *RELAYED])
 def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
-    channel = CHANNELS[name]
+    channel = named_point(name).channel
     links, draws = links_and_draws((40, 4))
     up, delay_s, loss, airtime_s = channel.deliver(links, draws)
     assert up.shape == delay_s.shape == (40, 4)
@@ -222,7 +231,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_package_adds_a_channel_and_replaces_none():
-    slow, v2x = (OperatingPoint("x", name).channel() for name in ("slow-radio", "v2x"))
+    slow, v2x = (OperatingPoint("x", name).channel for name in ("slow-radio", "v2x"))
     assert isinstance(slow, Radio)
     assert isinstance(v2x, Radio)
     assert (slow.latency_s, v2x.latency_s) == (0.5, 0.025)

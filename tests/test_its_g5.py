@@ -44,7 +44,7 @@ def test_on_an_idle_medium_one_waits_an_aifs_and_half_the_window_and_nothing_col
     """110 µs, and 0 to 15 slots of 13 µs, all equally likely: 97.5 µs on average."""
     assert QUIET.aifs_s == pytest.approx(110e-6)
     assert back_off.mean_access_s(0.0, 3e-4, QUIET.aifs_s, 15) == pytest.approx(207.5e-6)
-    waits_s = QUIET.access_s(EVENLY)
+    waits_s = QUIET.wait_s(EVENLY)
     assert waits_s.mean() == pytest.approx(207.5e-6, abs=1e-6)
     assert sorted(set(np.round((waits_s - 110e-6) / SLOT_S, 0))) == list(range(16))
     assert QUIET.busy_ratio() == 0
@@ -101,7 +101,7 @@ def test_farther_denser_and_oftener_is_never_better():
         assert replace(ItsG5(), **more).busy_ratio() > ItsG5().busy_ratio()
     longer = CROWD.loss(site(100.0), np.zeros(1), np.array([800.0, 8000.0]))
     assert longer[0] < longer[1]
-    assert CROWD.access_s(EVENLY).mean() > ItsG5().access_s(EVENLY).mean() > QUIET.access_s(EVENLY).mean()
+    assert CROWD.wait_s(EVENLY).mean() > ItsG5().wait_s(EVENLY).mean() > QUIET.wait_s(EVENLY).mean()
 
 
 def test_what_stands_between_costs_reception():

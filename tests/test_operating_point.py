@@ -66,7 +66,22 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ({"max_helpers": 2.0}, "max_helpers is 2.0; it must be a whole number, 0 or more"),
         ({"max_helpers": True}, "max_helpers is True"),
         ({"max_helpers": -1}, "max_helpers is -1"),
-        ({"roadside_edge": 1}, "roadside_edge is 1; it must be true or false"),
+        ({"edge": "relays"}, "unknown edge 'relays'; did you mean 'relay'?"),
+        (
+            {"edge": "fusion"},
+            "edge is 'fusion'; it must be none or relay: links of channel profile 6g have no",
+        ),
+        (
+            {"edge": "relay", "edge_x_m": 3},
+            "edge_x_m is 3.0; it must be left out: links of channel profile 6g",
+        ),
+        ({"edge_delay_s": -1}, "edge_delay_s is -1; it must be seconds, 0 or more"),
+        ({"edge_antenna_m": 0.5}, "edge_antenna_m is 0.5; it must be metres from 1 to 100"),
+        (
+            {"profile": "mode2", "edge": "fusion", "consensus": "ego-prompt"},
+            "edge is 'fusion'; it must be none or relay where consensus is ego-prompt",
+        ),
+        ({"density_coupled": 1}, "density_coupled is 1; it must be true or false"),
         ({"loss": 0.1, "density_coupled": True}, "loss is 0.1; it must be left out where density_coupled"),
         ({"name": " "}, "operating point name ' ': give it some text"),
     ],
@@ -94,7 +109,7 @@ def test_every_other_channel_profile_is_a_point_of_its_own_name(monkeypatch):
     monkeypatch.setitem(CHANNELS._loaded, "fog", fog)
     assert named_point("fog") == OperatingPoint("fog", "fog")
     assert named_point("fog:loss=0.2") == OperatingPoint("fog:loss=0.2", "fog", loss=0.2)
-    assert named_point("fog:window_s=0.3").channel() == fog
+    assert named_point("fog:window_s=0.3").channel == fog
     with pytest.raises(
         UserError, match="setting of operating point fog 'windows_s'; did you mean 'window_s'"
     ):
@@ -150,7 +165,7 @@ def test_only_a_point_with_a_channel_asks_again():
 
 
 @pytest.mark.parametrize(
-    "setting", ["loss=.1", "latency_s=0.1", "density_coupled=true", "roadside_edge=true"]
+    "setting", ["loss=.1", "latency_s=0.1", "density_coupled=true", "edge=relay", "edge_x_m=3"]
 )
 def test_a_setting_of_the_channel_is_refused_where_there_is_none(setting: str) -> None:
     with pytest.raises(UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"):

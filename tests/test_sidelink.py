@@ -44,9 +44,11 @@ def draws(n, helpers):
 
 def links(site, n, helpers, payload_bits=800.0):
     shape = (n, helpers)
-    places = Site(
-        *(np.broadcast_to(a, (n, *a.shape)) for a in (site.xy_m, site.sight, site.blocker_m, site.corner_m))
-    )
+
+    def wide(array):
+        return np.broadcast_to(array, (n, *array.shape))
+
+    places = Site(wide(site.xy_m), wide(site.sight), wide(site.blocker_m), wide(site.corner_m))
     return Links(
         asked=np.ones(shape, bool), ready_s=np.full(shape, 0.1), range_m=np.full(shape, 50.0),
         payload_bits=np.full(shape, payload_bits), in_radius=np.ones(shape, bool),

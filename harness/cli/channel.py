@@ -46,7 +46,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     from harness.cli.docstrings import attributes
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.studies.reception import DISTANCES_M, SIGHTS
+    from harness.studies.reception import DISTANCES_M, by_sight
 
     profile_name, channel = _of(name)
     profile, meanings = CHANNELS.profile(profile_name), attributes(type(channel))
@@ -55,8 +55,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     curves: dict[str, list[float]] = {}
     busy = None
     if isinstance(channel, Physical):
-        distances = np.array(DISTANCES_M, dtype=float)
-        curves = {sight: channel.reception(distances, code).tolist() for sight, code in SIGHTS.items()}
+        curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
         busy = channel.busy_ratio()
     if as_json:
         about = {key: value for key, value in asdict(profile).items() if key != "parameters"}
@@ -109,7 +108,7 @@ def check(
     from harness.core.figures import as_mapping, shown
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.studies.reception import DISTANCES_M, SIGHTS, compared, curves_of, drawn
+    from harness.studies.reception import DISTANCES_M, by_sight, compared, curves_of, drawn
 
     if not 100 <= n <= MOST_TRIPS:
         raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
@@ -120,15 +119,14 @@ def check(
     where = f"channel profile {profile}"
     messages = drawn(channel, DISTANCES_M, n)
     of_others = [compared(channel, curve, where) for path in against or () for curve in curves_of(path)]
-    model = channel.reception(np.array(DISTANCES_M, dtype=float), SIGHTS["clear"]).tolist()
+    model = by_sight(channel, DISTANCES_M)["clear"].tolist()
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
         from harness.studies.figures import reception
 
         every = np.linspace(1, DISTANCES_M[-1], 250)
-        curves = {sight: channel.reception(every, code) for sight, code in SIGHTS.items()}
-        save(reception(name, curves, every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
+        save(reception(name, by_sight(channel, every), every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         echo_json({
             "name": name, "n": n, "outside": beyond,
@@ -257,8 +255,12 @@ def _picture(out: Path | None) -> None:
 def _of(text: str) -> "tuple[str, Channel]":
     """The profile that a condition's text names, and its channel with the text's settings."""
     from harness.coordination.operating_point import named_point
+    from harness.radio.wrapped import Wrapped
 
     point = named_point(text)
     if point.profile is None:
         raise UserError(f"{printable(text)} has no channel; `harness channel list` shows those there are")
-    return point.profile, point.channel()
+    channel = point.channel
+    while isinstance(channel, Wrapped):
+        channel = channel.channel
+    return point.profile, channel

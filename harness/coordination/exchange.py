@@ -20,17 +20,19 @@ whole exchange as the decision's latency even when it outlasts the window, and s
 is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import FUSION, OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.statistics import known_mean
-from harness.radio.channel import Draws, Links
+from harness.radio.channel import Channel, Draws, Links, Physical
+from harness.radio.roadside import Consulted, by_unit
 
 
 @dataclass(frozen=True)
@@ -43,14 +45,16 @@ class Exchange:
         entropy_nats: entropy of `own`, `(...)`.
         triggered: the entropy is above tau and the point has a channel, `(...)`.
         asked: helpers asked, each a scheduled reply, `(..., H)`.
-        request_bits: size of the request; 0 where nobody is asked, `(...)`.
-        reply_bits: size of all scheduled replies together, `(...)`.
+        requests: requests broadcast, `(...)`: 1 for all who are asked together, and 1 of a unit that asks for
+            the ego; else 0.
+        request_bits: size of the requests; 0 where nobody is asked, `(...)`.
+        reply_bits: size of all scheduled replies together, and of the policy that a unit sends, `(...)`.
         airtime_s: how long the request and the scheduled replies occupy the medium in all, `(...)`; NaN where
             the channel model does not know.
         loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
             asked, where links differ; NaN without a channel.
-        delivered: asked, and request and reply crossed, `(..., H)`.
-        arrival_s: end of the reply, `(..., H)`; inf where lost or not asked.
+        delivered: asked, and request and reply crossed, `(..., H)`; where a unit fuses, its policy as well.
+        arrival_s: end of the reply at whoever fuses, `(..., H)`; inf where lost or not asked.
         on_time: arrived within the window, so fused, `(..., H)`.
         exchange_s: end of the whole exchange, `(...)`.
     """
@@ -60,6 +64,7 @@ class Exchange:
     entropy_nats: Floats
     triggered: Bools
     asked: Bools
+    requests: Ints
     request_bits: Floats
     reply_bits: Floats
     airtime_s: Floats
@@ -78,11 +83,6 @@ class Exchange:
     def messages(self) -> Ints:
         """Replies scheduled, `(...)`. As in the paper's count, the request is none."""
         return np.asarray(np.sum(self.asked, axis=-1))
-
-    @cached_property
-    def requests(self) -> Ints:
-        """Requests broadcast, `(...)`: 1 for all who are asked together, else 0."""
-        return np.asarray(np.any(self.asked, axis=-1)).astype(int)
 
     @cached_property
     def lost(self) -> Ints:
@@ -115,36 +115,59 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     inference_s = inferred_s(point, intents)
     inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
-    channel = point.channel()
-    heard_s, air_s = channel.request(point.request_bits, draws)
-    heard_s = np.asarray(heard_s)[..., None]
-    ready_s = heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
+
+    def ready(heard_s: Floats | float) -> Floats:
+        return heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
+
     links = Links(
-        asked, ready_s, intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
+        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
         point.request_bits, intents.site,
     )  # fmt: skip
-    up, delay_s, loss, airtime_s = channel.deliver(links, draws)
-    if channel.needs_site and point.loss is not None:
-        up, loss = np.all(draws.packet >= point.loss, axis=-1), np.full_like(loss, point.loss)
-    requested = np.any(asked, axis=-1)
-    delivered = asked & up if intents.silent is None else asked & up & ~intents.silent
-    slot_end_s = request_s + delay_s
-    arrival_s = np.where(delivered, slot_end_s, np.inf)
-    ends_s = np.where(asked, slot_end_s, request_s)
+    waits_until_s: Floats = np.array(np.inf)
+    if point.edge == FUSION and point.unit and isinstance(point.channel, Physical):
+        waits_until_s = np.maximum(point.window_s, request_s[..., 0])
+        left_s = waits_until_s - request_s[..., 0]
+        sent = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, left_s)
+    else:
+        sent = _directly(point.channel, links, draws, ready)
+    delivered = sent.up if intents.silent is None else sent.up & ~intents.silent
+    loss, arrival_s = sent.loss, np.where(delivered, request_s + sent.end_s, np.inf)
     return Exchange(
         own=own,
         own_failed=own_failed,
         entropy_nats=entropy,
         triggered=asks,
-        asked=asked,
-        request_bits=np.where(requested, point.request_bits, 0.0),
-        reply_bits=np.sum(np.where(asked, intents.payload_bits, 0.0), axis=-1),
-        airtime_s=np.where(requested, air_s, 0.0) + np.sum(np.where(asked, airtime_s, 0.0), axis=-1),
-        loss=loss[..., 0] if loss.shape[-1] == 1 else known_mean(np.where(asked, loss, np.nan), axis=-1),
+        asked=sent.asked,
+        requests=sent.requests,
+        request_bits=sent.request_bits,
+        reply_bits=np.sum(np.where(sent.asked, intents.payload_bits, 0.0), axis=-1) + sent.policy_bits,
+        airtime_s=sent.airtime_s,
+        loss=loss[..., 0] if loss.shape[-1] == 1 else known_mean(np.where(sent.asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,
-        on_time=arrival_s <= point.window_s,
-        exchange_s=np.maximum(inference_s[..., 0], np.max(ends_s, axis=-1, initial=0.0)),
+        on_time=sent.fused & (arrival_s <= point.window_s),
+        exchange_s=np.minimum(request_s[..., 0] + sent.acts_s, waits_until_s),
+    )
+
+
+def _directly(channel: Channel, links: Links, draws: Draws, ready: Callable[[Floats], Floats]) -> Consulted:
+    """The ego asks the helpers itself, and waits until the last slot has ended."""
+    request = channel.request(links.request_bits, draws)
+    heard_s = np.asarray(request.heard_s)[..., None]
+    up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready(heard_s)), draws)
+    requested, delivered = np.any(links.asked, axis=-1), links.asked & up
+    replies_s = np.sum(np.where(links.asked, airtime_s, 0.0), axis=-1)
+    return Consulted(
+        asked=links.asked,
+        up=delivered,
+        end_s=end_s,
+        fused=delivered,
+        acts_s=np.max(np.where(links.asked, end_s, 0.0), axis=-1, initial=0.0),
+        loss=loss,
+        requests=requested.astype(int),
+        request_bits=np.where(requested, links.request_bits, 0.0),
+        policy_bits=np.zeros(requested.shape),
+        airtime_s=np.where(requested, request.airtime_s, 0.0) + replies_s,
     )
 
 

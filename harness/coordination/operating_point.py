@@ -3,18 +3,24 @@
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
-from harness.radio.channel import Channel
+from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
+from harness.radio.roadside import Relay
+from harness.radio.wrapped import AtLoss
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
 DEFENCES = ("quoted", "schema", "majority")
-OVERRIDES = ("loss", "latency_s", "density_coupled", "roadside_edge")  # fields of a channel
+OVERRIDES = ("loss", "latency_s", "density_coupled")  # fields of a channel
+RELAY, FUSION = "relay", "fusion"
+EDGES = ("none", RELAY, FUSION)
+UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # of a unit with a place
 _LARGEST = sys.float_info.max
 
 
@@ -59,7 +65,14 @@ class OperatingPoint:
         latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
         density_coupled: loss follows the number of active vehicles, in place of the profile's.
         helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
-        roadside_edge: replies travel over a roadside edge node as well (`channel.Radio`).
+        edge: what a roadside unit does: `relay`, it sends replies once more; `fusion`, it asks the helpers
+            for the ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
+            (`constant.Radio`).
+        edge_delay_s: between what the unit has received and what it sends for that: processing and backhaul.
+            0 is a declared default, a unit that has nothing to wait for.
+        edge_x_m: its place, m to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it.
+        edge_y_m: m to the south of it.
+        edge_antenna_m: height of its antenna; by default 5 m (TR 37.885, table 6.1.4-1, a roadside unit).
         on_demand: a helper infers when it is asked, and not in parallel with the ego.
         messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
             (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
@@ -91,7 +104,11 @@ class OperatingPoint:
     latency_s: float | None = None
     density_coupled: bool = False
     helper_rounds: bool = False
-    roadside_edge: bool = False
+    edge: str = "none"
+    edge_delay_s: float = 0.0
+    edge_x_m: float = 0.0
+    edge_y_m: float = 0.0
+    edge_antenna_m: float = 5.0
     on_demand: bool = False
     messages: str = "own"
     round_trip_s: float | None = None
@@ -127,7 +144,15 @@ class OperatingPoint:
             self._number("round_trip_s", "seconds, 0 or more", zero=True)
         if type(self.max_helpers) is not int or self.max_helpers < 0:
             raise self._wrong("max_helpers", "a whole number, 0 or more")
-        for flag in ("density_coupled", "helper_rounds", "roadside_edge", "on_demand"):
+        if self.edge not in EDGES:
+            raise unknown("edge", str(self.edge), EDGES)
+        self._number("edge_delay_s", "seconds, 0 or more", zero=True)
+        for key in ("edge_x_m", "edge_y_m"):
+            self._number(key, "metres from -10000 to 10000", least=-10_000.0, zero=True, most=10_000.0)
+        self._number("edge_antenna_m", "metres from 1 to 100", least=1.0, most=100.0)
+        if self.edge == FUSION and self.consensus == EGO_PROMPT:
+            raise self._wrong("edge", f"none or relay where consensus is {EGO_PROMPT}: a unit has no model")
+        for flag in ("density_coupled", "helper_rounds", "on_demand"):
             if type(getattr(self, flag)) is not bool:
                 raise self._wrong(flag, "true or false")
         if self.messages == "shuffled" and self.consensus == EGO_PROMPT:
@@ -144,7 +169,7 @@ class OperatingPoint:
                 raise unknown("defence", part, DEFENCES)
             if self.consensus != EGO_PROMPT:
                 raise self._wrong("defence", f"left out where consensus is not {EGO_PROMPT}")
-        self.channel()
+        _ = self.channel
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
@@ -160,8 +185,12 @@ class OperatingPoint:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
+    @cached_property
     def channel(self) -> Channel:
-        """The profile's, with the point's overrides. Raises UserError for one that the profile has not."""
+        """The profile's, with the point's overrides, as its file was when the point was made.
+
+        Raises UserError for an override that the profile has not.
+        """
         if self.profile is None:
             return NO_CHANNEL
         channel = CHANNELS[self.profile]
@@ -169,17 +198,43 @@ class OperatingPoint:
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
-        if channel.needs_site:  # its loss is no setting: `exchange` puts another in place of it
-            overrides.pop("loss", None)
+        loss = overrides.pop("loss", None) if isinstance(channel, Physical) else None  # no setting of its own
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
         if self.radio:
             channel = changed(channel, pairs(self.radio), f"channel profile {self.profile}")
         channel = replace(channel, **overrides)
+        if isinstance(channel, Physical):
+            channel = channel if loss is None else AtLoss(channel, loss)
+            return Relay(channel, self._unit, self.edge_delay_s) if self.edge == RELAY else channel
+        if self.edge != "none":
+            channel = self._relayed(channel)
         if self.loss is not None and getattr(channel, "density_coupled", False):
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
         return channel
+
+    def _relayed(self, channel: Channel) -> Channel:
+        """A channel without places, whose relay is a second path of the same kind."""
+        if self.edge == FUSION:
+            raise self._wrong(
+                "edge", f"none or relay: links of channel profile {self.profile} have no places"
+            )
+        if not hasattr(channel, "roadside_edge"):
+            raise self._wrong("edge", f"left out: channel profile {self.profile} has no such setting")
+        for key in UNIT:
+            if getattr(self, key) != getattr(POINTS["6g"], key):
+                raise self._wrong(key, f"left out: links of channel profile {self.profile} have no places")
+        return replace(channel, roadside_edge=True)
+
+    @property
+    def _unit(self) -> Unit:
+        return Unit(self.edge_x_m, self.edge_y_m, self.edge_antenna_m)
+
+    @property
+    def unit(self) -> Unit | None:
+        """The roadside unit, where there is one with a place."""
+        return self._unit if self.edge != "none" and isinstance(self.channel, Physical) else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
         """The same with these settings of its channel. Raises UserError for one that it has not."""
@@ -207,9 +262,11 @@ class OperatingPoint:
         shows = tuple(part for part in self.guards if part != "majority")
         return Rewrites(self.asks_blind, in_text(self.attack), shows)
 
-    def _number(self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST) -> None:
+    def _number(
+        self, key: str, allowed: str, zero: bool = False, most: float = _LARGEST, least: float = 0.0
+    ) -> None:
         value = getattr(self, key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
             raise self._wrong(key, allowed)
         if value == 0 and not zero:
             raise self._wrong(key, allowed)
@@ -245,7 +302,7 @@ def named_point(text: str) -> OperatingPoint:
     if name not in named and name not in CHANNELS:
         raise unknown("operating point", name, {*named, *CHANNELS})
     point = named.get(name) or OperatingPoint(name, name)
-    its_own = [key for key in settable(point.channel()) if key not in OVERRIDES] if point.profile else []
+    its_own = [key for key in settable(point.channel) if key not in OVERRIDES] if point.profile else []
     settings: dict[str, Any] = {}
     radio: dict[str, str] = {}
     for setting in rest.split(",") if colon else ():
@@ -261,7 +318,7 @@ def named_point(text: str) -> OperatingPoint:
             continue
         given = setting_of(field, value)
         settings[field] = given * scale if isinstance(given, float) else given
-    for key in OVERRIDES:
+    for key in (*OVERRIDES, "edge", *UNIT):
         if key in settings and point.profile is None:
             raise UserError(
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes nothing; "

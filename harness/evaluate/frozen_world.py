@@ -10,13 +10,11 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.select import ALL, Selection
-from harness.evaluate.walk import Decided, Due, channel_draws
-from harness.radio.channel import Site
+from harness.evaluate.walk import Decided, Due, Placed, channel_draws
 from harness.runs.decisions import by_action
 from harness.runs.metrics import World
 from harness.runs.records import Episode, FrozenScenes
 from harness.world.scenario import Scenario, frames
-from harness.world.sight_lines import site
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class _Walks:
         self.dropped = np.zeros(shape, dtype=bool)
 
 
-class FrozenWorld:
+class FrozenWorld(Placed):
     """Every episode of a dataset, under all conditions and seeds.
 
     A decision acts the dataset's lag after its moment, however long it took.
@@ -90,6 +88,7 @@ class FrozenWorld:
 
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
+        self.scenario = dataset.scenario
         self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
         self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
 
@@ -97,23 +96,19 @@ class FrozenWorld:
         """Every decision point to which some walk has come."""
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._moments = places[places >= 0]
-        self._scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
-        self._helpers = max((len(scene.viewers) for scene in self._scenes), default=1) - 1
-        return self._scenes
+        self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._moments.tolist()])
+        self._helpers = max((len(scene.viewers) for scene in self.scenes), default=1) - 1
+        return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
         """Each walk of the condition that is not at its end."""
         walks, forest = self._walks[point.name], self._forest
         of_seed, tree = np.nonzero(walks.at >= 0)
         at = np.searchsorted(self._moments, walks.at[of_seed, tree])
-        p = self._dataset.scenario.parameters
+        p = self.scenario.parameters
         seed, step = self._seeds[of_seed], forest.step[self._moments[at]]
         draws = channel_draws(seed, forest.seeds[tree], step, p.decisions, self._helpers)
         return Due(at, forest.episodes[tree], seed, draws)
-
-    def site(self) -> Site:
-        """Where the vehicles of each moment are."""
-        return site([(scene.state, scene.viewers) for scene in self._scenes])
 
     def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
         """End the walks that have come to these of the moments just shown, and count them no longer."""
@@ -140,7 +135,7 @@ class FrozenWorld:
     def columns(self) -> dict[str, Any]:
         """What each decision was worth, and every other action, in the order of decisions."""
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
-        forest, p = self._forest, self._dataset.scenario.parameters
+        forest, p = self._forest, self.scenario.parameters
         off_lag = [frames(each, p.simulation_hz) != p.lag_frames for each in np.nan_to_num(latency_s)]
         return {
             "value": forest.value[at], "safe": forest.safe[at, action],

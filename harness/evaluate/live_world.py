@@ -18,15 +18,13 @@ from harness.dataset.freeze import moment
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate.branches import Course, Decision, Trajectory
-from harness.evaluate.walk import Decided, Due, channel_draws
-from harness.radio.channel import Site
+from harness.evaluate.walk import Decided, Due, Placed, channel_draws
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode
 from harness.world import reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import Outcome
 from harness.world.scenario import Scenario, frames
-from harness.world.sight_lines import site
 from harness.world.world import World
 
 
@@ -98,7 +96,7 @@ class LiveSource:
         return scenes
 
 
-class LiveWorld:
+class LiveWorld(Placed):
     """Some episodes of a scenario under all conditions and seeds, which share worlds until they part."""
 
     def __init__(
@@ -115,7 +113,7 @@ class LiveWorld:
             seeds: of the channel's draws.
             ego_alone: whether helpers are not asked, so need not look.
         """
-        self._scenario, self._p = scenario, scenario.parameters
+        self.scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone
         ways = list(product(points, seeds))
         self._going = [
@@ -134,8 +132,8 @@ class LiveWorld:
                     course.skipped += course.open is not None
             self._deciding = [t for t in self._going if any(c.open is None for c in t.courses)]
             if self._deciding:
-                self._moments = [look(t, self._step, self._ego_alone) for t in self._deciding]
-                return self._moments
+                self.scenes = [look(t, self._step, self._ego_alone) for t in self._deciding]
+                return self.scenes
             self._advance()
         return ()
 
@@ -145,18 +143,14 @@ class LiveWorld:
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
         episode = np.array([trajectory.number for trajectory in self._deciding])[at]
-        helpers = max(len(scene.viewers) for scene in self._moments) - 1
+        helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
         return Due(at, episode, seed, draws)
 
-    def site(self) -> Site:
-        """Where the vehicles of each moment are."""
-        return site([(scene.state, scene.viewers) for scene in self._moments])
-
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Open every decision, and simulate until the next are due."""
-        actions, hz = self._scenario.actions, self._p.simulation_hz
+        actions, hz = self.scenario.actions, self._p.simulation_hz
         begun = self._p.due_frame(self._step)
         for part in decided:
             latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
@@ -190,7 +184,7 @@ class LiveWorld:
     def episodes(self) -> list[Episode]:
         """How each episode ended; late against a full-view driver whose decisions act after the lag."""
         references = {
-            number: reference.drive(self._scenario, PRIVILEGED, self._first_seed + number)
+            number: reference.drive(self.scenario, PRIVILEGED, self._first_seed + number)
             for number in sorted({t.number for t in self._ended if t.world.outcome.success})
         }
         return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]

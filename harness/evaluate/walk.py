@@ -4,7 +4,7 @@ Frozen scenes, the closed loop and the calibrated proxy of the paper's study are
 their moments come from and in where an action leads, and in nothing else. A moment is one decision point.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Generic, Protocol, TypeVar
@@ -21,9 +21,11 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.fusion import codes_of
-from harness.radio.channel import Draws, Site
+from harness.radio.channel import Draws, Physical, Site, Unit
 from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
+from harness.world.scenario import Scenario
+from harness.world.sight_lines import site
 
 Moment = TypeVar("Moment")
 AskedMoment = TypeVar("AskedMoment", contravariant=True)
@@ -81,13 +83,30 @@ class World(Protocol[Moment]):
         """The decisions of a condition that are due in the moments just shown."""
         ...
 
-    def site(self) -> Site | None:
-        """Where the vehicles are in the moments just shown, (n, ...); None in a world without places."""
+    def site(self, units: Collection[Unit]) -> Site | None:
+        """Where vehicles and units are in the moments just shown, (n, ...); None without places."""
         ...
 
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
+
+
+class Placed:
+    """A world whose moments are scenes.
+
+    Attributes:
+        scenario: of the scenes.
+        scenes: those just shown.
+    """
+
+    scenario: Scenario
+    scenes: Sequence[Scene]
+
+    def site(self, units: Collection[Unit]) -> Site:
+        """Where the vehicles of each scene are, and these units."""
+        moments = [(scene.state, scene.viewers) for scene in self.scenes]
+        return site(moments, units, self.scenario.road().zone_m)
 
 
 class Fuses(Protocol):
@@ -123,8 +142,8 @@ def walk(
     while moments := world.observe():
         intents = ask(moments)
         due = {point: each for point in points if len((each := world.due(point)).at)}
-        if any(point.channel().needs_site for point in due):
-            intents = replace(intents, site=world.site())
+        if any(isinstance(point.channel, Physical) for point in due):
+            intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
         said = {

@@ -4,7 +4,8 @@ A consultation is a round trip, so the request and the reply must both cross. A 
 this one, with a frozen record that has `request` and `deliver`; its profiles are in `profiles.py`.
 """
 
-from dataclasses import Field, dataclass
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -18,6 +19,20 @@ from harness.radio.fading import Trips
 CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
+class Unit(NamedTuple):
+    """A roadside unit, which stays where it is.
+
+    Attributes:
+        x_m: m to the east of the centroid of the conflict zone.
+        y_m: m to the south of it.
+        antenna_m: height of its antenna.
+    """
+
+    x_m: float
+    y_m: float
+    antenna_m: float
+
+
 @dataclass(frozen=True)
 class Site:
     """Where the ego and its helpers truly are, and what stands between them.
@@ -28,12 +43,16 @@ class Site:
         blocker_m: height of the tallest vehicle between them, `(..., H)`; 0 where there is none.
         corner_m: distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN
             where the streets do not cross.
+        first_m: height of the antenna at the first place; None where it is as high as all others.
+        units: the same from roadside units: of each a site with the unit first, the ego, then the helpers.
     """
 
     xy_m: Floats
     sight: Ints
     blocker_m: Floats
     corner_m: Floats
+    first_m: float | None = None
+    units: Mapping[Unit, "Site"] = field(default_factory=dict)
 
     @property
     def distance_m(self) -> Floats:
@@ -41,18 +60,32 @@ class Site:
         apart: Floats = np.linalg.norm(self.xy_m[..., 1:, :] - self.xy_m[..., :1, :], axis=-1)
         return apart
 
+    @property
+    def between(self) -> tuple[Ints, Floats, Floats, float | None]:
+        """What `Propagation` wants to know besides distances: sight, blocker, corner, the first's antenna."""
+        return self.sight, self.blocker_m, self.corner_m, self.first_m
+
     def take(self, at: Any) -> "Site":
         """The sites at these places of the leading dimension."""
-        return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at])
+        units = {unit: its.take(at) for unit, its in self.units.items()}
+        return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at], self.first_m, units)
+
+    def to(self, links: slice) -> "Site":
+        """Some of the links alone, `(..., h)`."""
+        xy_m = np.concatenate([self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2)
+        sight, blocker_m = self.sight[..., links], self.blocker_m[..., links]
+        return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
     def of_helpers(self, places: Ints) -> "Site":
         """The same with the helpers of these places, `(n, H')`; one may come again."""
-        with_ego = np.insert(places + 1, 0, 0, axis=-1)[..., None]
+        with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return Site(
-            np.take_along_axis(self.xy_m, with_ego, axis=-2),
+            np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
             np.take_along_axis(self.sight, places, axis=-1),
             np.take_along_axis(self.blocker_m, places, axis=-1),
             np.take_along_axis(self.corner_m, places[..., None], axis=-2),
+            self.first_m,
+            {unit: its.of_helpers(with_ego) for unit, its in self.units.items()},
         )
 
 
@@ -65,15 +98,18 @@ class Draws:
             block fading.
         jitter: delay of each reply, `(..., H)`.
         trips: whose the other draws are, which only physical radios make; None where there are none.
+        given: draws of packets, `(..., 1+2H)`, in place of the trips'.
     """
 
     link: Floats
     jitter: Floats
     trips: Trips | None = None
+    given: Floats | None = None
 
     def take(self, at: Any) -> "Draws":
         """The draws at these places of the leading dimension."""
-        return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at))
+        given = None if self.given is None else self.given[at]
+        return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
         """The draws of the helpers of these places, `(n, H')`; voices of one share its link."""
@@ -94,9 +130,25 @@ class Draws:
         """Shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
         return self._trips.shadow(xy_m, decorrelation_m)
 
+    def of(self, links: str) -> "Draws":
+        """Draws of other links, by what they are for, such as those of a roadside unit."""
+        return replace(self, trips=replace(self._trips, links=links), given=None)
+
+    @cached_property
+    def first_packets(self) -> Floats:
+        """A wait and two packets of a link that is there without helpers too, `(..., 3)`."""
+        return self._trips.uniforms(1)
+
+    @cached_property
+    def requested(self) -> "Draws":
+        """The same where every request crosses, however much is lost."""
+        given = self._uniforms.copy()
+        given[..., 1::2] = 1.0
+        return replace(self, given=given)
+
     @cached_property
     def _uniforms(self) -> Floats:
-        return self._trips.uniforms(self.jitter.shape[-1])
+        return self._trips.uniforms(self.jitter.shape[-1]) if self.given is None else self.given
 
     @property
     def _trips(self) -> Trips:
@@ -124,7 +176,7 @@ class Links:
         in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
         request_bits: size of the request.
-        site: where they are; None where the channel does not need it, or the world has no places.
+        site: where they are; None where the channel is not `Physical`, or the world has no places.
     """
 
     asked: Bools
@@ -135,6 +187,13 @@ class Links:
     rounds: Bools
     request_bits: float = 0.0
     site: Site | None = None
+
+    @property
+    def where(self) -> Site:
+        """The site. Raises UserError in a world without places."""
+        if self.site is None:
+            raise UserError(NO_SITE)
+        return self.site
 
     def take(self, at: Any) -> "Links":
         """The links of these places of the leading dimension."""
@@ -149,11 +208,11 @@ class Broadcast(NamedTuple):
 
     Attributes:
         heard_s: seconds from the decision to ask until the helpers have it, `(...)` or one number.
-        airtime_s: seconds that it occupies the medium.
+        airtime_s: seconds that it occupies the medium, `(...)` or one number.
     """
 
     heard_s: Floats | float
-    airtime_s: float
+    airtime_s: Floats | float
 
 
 class Delivery(NamedTuple):
@@ -180,10 +239,9 @@ class Channel(Protocol):
     """A frozen dataclass. The operating point's overrides replace the fields of these names."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-    needs_site: ClassVar[bool]  # whether `Links.site` and the draws of trips are looked at
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
-        """When helpers have a request of so many bits."""
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
+        """When helpers have a request, or any other broadcast, of so many bits, `(...)` or one number."""
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """What happens to the request and the reply of each link."""
@@ -191,7 +249,14 @@ class Channel(Protocol):
 
 @runtime_checkable
 class Physical(Channel, Protocol):
-    """A channel whose losses follow from where vehicles are and what stands between them."""
+    """A channel whose losses follow from where vehicles are and what stands between them.
+
+    Only such a channel looks at `Links.site` and the draws of trips.
+    """
+
+    @property
+    def decorrelation_m(self) -> float:
+        """How far shadowing reaches (`fading.Trips.shadow`); inf where there is none."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of packets of the background's size that are received at these distances `(n,)`.

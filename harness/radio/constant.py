@@ -5,7 +5,7 @@ step of an episode: a blocked link then stays blocked.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -39,9 +39,8 @@ class Radio:
     jitter_s: Seconds = 0.0
     density_coupled: bool = False
     roadside_edge: bool = False
-    needs_site: ClassVar[bool] = False
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Serialisation alone: the rest of a request's time is in the nominal latency."""
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 

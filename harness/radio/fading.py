@@ -30,16 +30,18 @@ class Trips:
         layout_seed: of the episode's layout, `(...)`.
         step: of the decision, `(...)`.
         steps: how many an episode can have.
+        links: which links' draws: those among vehicles, or others, by what they are for.
     """
 
     seed: Ints
     layout_seed: Ints
     step: Ints
     steps: int
+    links: str = ""
 
     def take(self, at: Any) -> "Trips":
         """The trips at these places of the leading dimension."""
-        return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps)
+        return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:
         """The draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
@@ -57,8 +59,11 @@ class Trips:
         helpers = xy_m.shape[-2] - 1
         waves, place = self._of_pairs(_waves, helpers)
         ego = np.broadcast_to(xy_m[..., :1, :], xy_m[..., 1:, :].shape)
-        ends = np.concatenate([ego, xy_m[..., 1:, :]], axis=-1).reshape(-1, helpers, 4, 1) / decorrelation_m
-        place, total = place.reshape(-1), np.empty((ends.shape[0], helpers))
+        ends = (
+            np.concatenate([ego, xy_m[..., 1:, :]], axis=-1).reshape(place.size, helpers, 4, 1)
+            / decorrelation_m
+        )
+        place, total = place.reshape(-1), np.empty((place.size, helpers))
         for start in range(0, len(place), BLOCK):
             block = slice(start, start + BLOCK)
             of = waves[place[block]]
@@ -74,18 +79,18 @@ class Trips:
         layouts, layout = np.unique(self.layout_seed, return_inverse=True)
         pairs, place = np.unique(seed * len(layouts) + layout, return_inverse=True)
         keys = zip(seeds[pairs // len(layouts)].tolist(), layouts[pairs % len(layouts)].tolist(), strict=True)
-        return np.array([drawn(*pair, *args) for pair in keys]), place.reshape(self.seed.shape)
+        return np.array([drawn(self.links, *pair, *args) for pair in keys]), place.reshape(self.seed.shape)
 
 
 # Each helper's draws come after the last one's, so that a batch with more helpers changes nobody's.
 @lru_cache(maxsize=1 << 14)
-def _packets(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
-    return noise.uniforms((1 + 2 * helpers, steps), "packets", seed, layout_seed).T
+def _packets(links: str, seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
+    return noise.uniforms((1 + 2 * helpers, steps), f"packets{links}", seed, layout_seed).T
 
 
 @lru_cache(maxsize=1 << 14)
-def _waves(seed: int, layout_seed: int, helpers: int) -> Floats:
+def _waves(links: str, seed: int, layout_seed: int, helpers: int) -> Floats:
     """A phase and a wave vector in four dimensions, in turns a decorrelation distance, (H, WAVES, 5)."""
-    drawn = noise.generator("shadowing", seed, layout_seed).standard_normal((helpers, WAVES, 7))
+    drawn = noise.generator(f"shadowing{links}", seed, layout_seed).standard_normal((helpers, WAVES, 7))
     phase = np.arctan2(drawn[..., :1], drawn[..., 1:2])
     return np.concatenate([phase, drawn[..., 2:6] / np.abs(drawn[..., 6:])], axis=-1) / (2 * np.pi)

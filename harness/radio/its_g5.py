@@ -24,10 +24,9 @@ frame however long it is; 802.11 would split one of more than 2304 bytes.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.special import ndtr, ndtri
 
 from harness.core.arrays import Bools, Floats, Ints
@@ -35,14 +34,15 @@ from harness.core.errors import UserError
 from harness.radio import back_off
 from harness.radio.back_off import SLOT_S, free_share
 from harness.radio.block_error import block_error
-from harness.radio.channel import CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site, served_s
-from harness.radio.propagation import Propagation, noise_dbm
+from harness.radio.channel import CLEAR, VEHICLE, Links, served_s
+from harness.radio.propagation import noise_dbm
+from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
 BANDWIDTH_HZ = 10e6
 SIFS_S, SYMBOL_S, PREAMBLE_S = 32e-6, 8e-6, 40e-6  # IEEE 802.11-2012, 10 MHz OFDM
 SERVICE_AND_TAIL_BITS = 22
 REACH_M, SENSED_M = 1000.0, 1500.0  # of interferers round a receiver; of who is sensed
-CELL_M, STEP_DB, STRONGEST_DB = 10.0, 0.5, 80.0  # of the tables
+STRONGEST_DB = 80.0  # of the tables
 QUANTILES = 400  # of shadowing, in `reception`
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 BY_BIT = "11p-goubet"  # a curve over the energy of a bit
@@ -51,7 +51,7 @@ IMPLEMENTATION = 0.37  # of Shannon's rate: Wu et al., arXiv 2203.17114
 
 
 class Hazards(NamedTuple):
-    """What a packet meets on average, by distance in CELL_M, and by power received in STEP_DB.
+    """What a packet meets on average, by distance in STEP_M, and by power received in STEP_DB.
 
     Attributes:
         before: packets begun before it or with it that the receiver is locked to or that spoil it, `(D, P)`.
@@ -63,21 +63,15 @@ class Hazards(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ItsG5(Propagation):
+class ItsG5(Transceiver):
     """802.11p beside background traffic, which sends packets of one size at one rate.
 
     Attributes:
         frequency_ghz: carrier, here the control channel's.
         environment_height_m: see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m.
-        density_per_km: vehicles of the background on a kilometre of road, all lanes and both ways.
-        rate_hz: packets a second of each of them.
-        packet_bytes: of these.
+        packet_bytes: size of the background's packets.
         header_bytes: what the layers below add to a packet and to a message.
         data_rate_mbps: of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
-        power_dbm: transmitted by everybody.
-        gain_dbi: gain of each antenna.
-        noise_figure_db: of the receiver.
-        sensing_dbm: weakest packet that is sensed.
         aifs_slots: slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663).
         contention_window: back-off is uniform from 0 to so many slots; a broadcast never doubles it.
             There is always one, as after a packet of one's own.
@@ -89,18 +83,13 @@ class ItsG5(Propagation):
     frequency_ghz: float = 5.89
     environment_height_m: float = 0.5
     density_per_km: float = 60.0
-    rate_hz: float = 10.0
+    sensing_dbm: float = -85.0
     packet_bytes: int = 190
     header_bytes: int = 30
     data_rate_mbps: float = 6.0
-    power_dbm: float = 23.0
-    gain_dbi: float = 0.0
-    noise_figure_db: float = 9.0
-    sensing_dbm: float = -85.0
     aifs_slots: int = 6
     contention_window: int = 15
     curve: str = "11p-goubet"
-    needs_site: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Refuse settings that are no radio's."""
@@ -165,7 +154,8 @@ class ItsG5(Propagation):
         distance_m = np.asarray(distance_m, dtype=float)[:, None]
 
         def received(sight: Ints | int) -> Floats:
-            unspoilt, spoils_hz = self._fate(distance_m, (sight,), shadow)
+            mean_dbm = self.received_dbm(self.path_loss_db(distance_m, sight))
+            unspoilt, spoils_hz = self._fate(distance_m, mean_dbm + self.shadowing_db(sight) * shadow)
             return np.asarray(np.mean(unspoilt * np.exp(-self.packet_s * spoils_hz), axis=-1))
 
         if sight is not None:
@@ -173,59 +163,29 @@ class ItsG5(Propagation):
         clear = self.clear_probability(distance_m[:, 0])
         return clear * received(CLEAR) + (1 - clear) * received(VEHICLE)
 
-    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Probability `(..., H)` that a message of so many bits is lost, given the link's shadowing."""
-        return self._lost(self._fate_at(site, shadow), self.message_s(bits))
-
-    def request(self, bits: float, draws: Draws) -> Broadcast:
-        """Heard when the medium was taken and the frame is through."""
-        airtime_s = float(self.message_s(bits))
-        return Broadcast(self.access_s(draws.wait) + airtime_s, airtime_s)
-
-    def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each reply has an access delay of its own, and waits for those who were faster."""
-        site = links.site
-        if site is None:
-            raise UserError(NO_SITE)
-        fate = self._fate_at(site, draws.shadow(site.xy_m, self.decorrelation_m))
-        airtime_s = self.message_s(links.payload_bits)
-        request_loss, loss = (self._lost(fate, s) for s in (self.message_s(links.request_bits), airtime_s))
-        begins_s = np.where(links.asked, links.ready_s + self.access_s(draws.jitter), np.inf)
+    def _turns(
+        self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
+    ) -> tuple[Bools, Floats]:
+        """One after another; those that end their back-off in one slot are lost together."""
+        begins_s = np.where(links.asked, begins_s, np.inf)
         alone = np.sum(_near(begins_s, SLOT_S / 2), axis=-1) == 1
-        up = (draws.packet[..., 0] >= request_loss) & (draws.packet[..., 1] >= loss) & alone
-        on_air_s = np.where(links.asked, airtime_s, 0.0)
-        return Delivery(up, served_s(begins_s, on_air_s, links.range_m), loss, airtime_s)
+        return alone, served_s(begins_s, np.where(links.asked, airtime_s, 0.0), links.range_m)
 
-    def _lost(self, fate: tuple[Floats, Floats], airtime_s: Floats | float) -> Floats:
+    def _lost(self, fate: tuple[Floats, Floats], bits: Floats | float) -> Floats:
         unspoilt, spoils_hz = fate
-        return 1 - unspoilt * np.exp(-airtime_s * spoils_hz)
+        return 1 - unspoilt * np.exp(-self.message_s(bits) * spoils_hz)
 
-    def _fate_at(self, site: Site, shadow: Floats) -> tuple[Floats, Floats]:
-        return self._fate(site.distance_m, (site.sight, site.blocker_m, site.corner_m), shadow)
+    def _fate(self, distance_m: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
+        """Probability that a message gets through all that does not depend on its length.
 
-    def _fate(self, distance_m: Floats, between: tuple[Any, ...], shadow: Floats) -> tuple[Floats, Floats]:
-        """What becomes of messages on links with this shadowing, standard normal.
-
-        Args:
-            distance_m: of the links.
-            between: what `path_loss_db` wants to know besides: sight, blocker and corner.
-            shadow: of the links.
-
-        Returns:
-            Probability that a message gets through all that does not depend on its length; packets that would
-            spoil it, for each second that it is on air.
+        And the packets that would spoil it, for each second that it is on air.
         """
-        mean_dbm = self.power_dbm + 2 * self.gain_dbi - self.path_loss_db(distance_m, *between)
-        power_dbm = mean_dbm + self.shadowing_db(*between) * shadow
         sinr_db = power_dbm - noise_dbm(BANDWIDTH_HZ, self.noise_figure_db)
-        # A helper that is not there has no place, and the tables must be read somewhere.
-        place = np.broadcast_arrays(distance_m / CELL_M, (power_dbm - self.sensing_dbm) / STEP_DB)
-        at = np.nan_to_num(place)
-        before, during_hz = (map_coordinates(met, at, order=1, mode="nearest") for met in _hazards(self))
+        before, during_hz = (self._read(met, distance_m, power_dbm, 0.0) for met in _hazards(self))
         sensed = power_dbm >= self.sensing_dbm
         return sensed * (1 - self.lost_share(sinr_db)) * np.exp(-before), during_hz
 
-    def access_s(self, uniforms: Floats) -> Floats:
+    def wait_s(self, uniforms: Floats) -> Floats:
         """Seconds from the wish to send until the medium is taken: the quantiles at these draws."""
         return np.interp(
             uniforms, *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window)
@@ -239,22 +199,22 @@ def _shannon_db(rate_mbps: float) -> float:
 
 def _sensed(radio: ItsG5, distance_m: Floats) -> Floats:
     """Probability (13) that vehicles so far apart sense each other's packets."""
-    mean_dbm = radio.power_dbm + 2 * radio.gain_dbi - radio.path_loss_db(distance_m)
+    mean_dbm = radio.received_dbm(radio.path_loss_db(distance_m))
     return np.asarray(ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db()))
 
 
 @lru_cache(maxsize=64)
 def _hazards(radio: ItsG5) -> Hazards:
     per_m, rate_hz, packet_s = radio.density_per_km / 1000, radio.rate_hz, radio.packet_s
-    distance_m = np.arange(0.0, REACH_M + CELL_M, CELL_M)
+    distance_m = np.arange(0.0, REACH_M + STEP_M, STEP_M)
     power_dbm = radio.sensing_dbm + np.arange(0.0, STRONGEST_DB + STEP_DB, STEP_DB)
-    from_receiver_m = np.arange(CELL_M / 2 - REACH_M, REACH_M, CELL_M)[:, None]
+    from_receiver_m = np.arange(STEP_M / 2 - REACH_M, REACH_M, STEP_M)[:, None]
     apart_m = np.abs(from_receiver_m + distance_m)  # of interferer and sender: (interferers, D)
 
     heard, hears = _sensed(radio, np.abs(from_receiver_m)), _sensed(radio, apart_m)
     busy = radio.busy_ratio()
     alike = busy * _overlap(radio, apart_m)
-    begins_hz = rate_hz / free_share(alike, packet_s, radio.aifs_s) * per_m * CELL_M
+    begins_hz = rate_hz / free_share(alike, packet_s, radio.aifs_s) * per_m * STEP_M
     slot_s = SLOT_S * back_off.crowding(busy, packet_s, radio.aifs_s, radio.contention_window)
     same_slot, hidden = slot_s * begins_hz * hears, begins_hz * (1 - hears)  # (22), (18)
     nearer = np.abs(from_receiver_m) < distance_m
@@ -275,7 +235,7 @@ def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
     """Probability (31) that a packet on air at once spoils one that noise would not, `(P, interferers)`."""
     noise = noise_dbm(BANDWIDTH_HZ, radio.noise_figure_db)
     shadow, weights = np.polynomial.hermite_e.hermegauss(15)
-    mean_dbm = radio.power_dbm + 2 * radio.gain_dbi - radio.path_loss_db(interferer_m)
+    mean_dbm = radio.received_dbm(radio.path_loss_db(interferer_m))
     others_dbm = 10 * np.log10(10 ** (noise / 10) + 10 ** ((mean_dbm + radio.shadowing_db() * shadow) / 10))
     lost = radio.lost_share(power_dbm[:, None, None] - others_dbm) @ (weights / weights.sum())
     survives = 1 - radio.lost_share(power_dbm - noise)[:, None]

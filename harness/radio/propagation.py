@@ -55,6 +55,7 @@ class Propagation:
         sight: Ints | int = CLEAR,
         blocker_m: Floats | float | None = None,
         corner_m: Floats | None = None,
+        first_m: float | None = None,
     ) -> Floats:
         """Mean loss `(...)` of links `(...)` with what stands between them, a vehicle's blockage included.
 
@@ -64,15 +65,16 @@ class Propagation:
             blocker_m: height of the vehicle between; without, the model's own.
             corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN where a building
                 does not stand at a corner. Then it is the NLOS law of TR 37.885, on the straight distance.
+            first_m: height of the antenna at one end, where it is not `antenna_m`.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
-        clear_db = self.clear_db(distance_m)
+        clear_db = self.clear_db(distance_m, first_m)
         if np.ndim(sight) == 0 and sight == CLEAR:
             return clear_db
-        blocked_db = self.blockage_db(distance_m, blocker_m)[0]
+        blocked_db = self.blockage_db(distance_m, blocker_m, first_m)[0]
         behind_db = nlos_db(distance_m, self.frequency_ghz)
         if corner_m is not None:
-            round_db = self.corner_db(corner_m)
+            round_db = self.corner_db(corner_m, first_m)
             behind_db = np.where(np.isnan(round_db), behind_db, round_db)
         return np.select(
             [np.equal(sight, CLEAR), np.equal(sight, VEHICLE)],
@@ -81,16 +83,26 @@ class Propagation:
             np.maximum(behind_db, clear_db),
         )
 
-    def clear_db(self, distance_m: Floats) -> Floats:
+    def clear_db(self, distance_m: Floats, first_m: float | None = None) -> Floats:
         """Loss in line of sight."""
         if self.environment == "winner-b1":
-            return winner_b1_db(distance_m, self.frequency_ghz, self.antenna_m - self.environment_height_m)
+            effective_m = self._mean_height_m(first_m, self.environment_height_m)
+            return winner_b1_db(distance_m, self.frequency_ghz, effective_m)
         if self.environment == "tr37885-highway":
             return 32.4 + 20 * np.log10(distance_m) + 20 * math.log10(self.frequency_ghz)
         return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
 
+    def _mean_height_m(self, first_m: float | None, less_m: float = 0.0) -> float:
+        """Geometric mean of both antennas' heights above `less_m`, by whose square two rays go."""
+        heights_m = (self.antenna_m, self.antenna_m if first_m is None else first_m)
+        one_m, other_m = (max(height - less_m, 0.1) for height in heights_m)
+        return one_m if first_m is None else math.sqrt(one_m * other_m)
+
     def blockage_db(
-        self, distance_m: Floats, blocker_m: Floats | float | None = None
+        self,
+        distance_m: Floats,
+        blocker_m: Floats | float | None = None,
+        first_m: float | None = None,
     ) -> tuple[Floats, Floats]:
         """What a vehicle between adds (TR 37.885, 6.2.1): mean and deviation of max(0, X), `(...)`.
 
@@ -99,23 +111,27 @@ class Propagation:
         15 log10 d - 41.
         """
         blocker_m = self.blocker_m if blocker_m is None else blocker_m
-        higher = np.sign(np.subtract(blocker_m, self.antenna_m)).astype(np.int64)  # 1, 0 or -1
+        other_m = self.antenna_m if first_m is None else first_m
+        low_m, high_m = sorted((self.antenna_m, other_m))
+        higher = np.greater(blocker_m, high_m).astype(np.int64) - np.less(blocker_m, low_m)  # 1, 0 or -1
         mean_db, deviation_db = np.array(_BLOCKAGE_DB).T
         growth_db = np.maximum(0.0, 15 * np.log10(np.maximum(distance_m, NEAREST_M)) - 41)
         return np.where(higher < 0, 0.0, mean_db[higher] + growth_db), deviation_db[higher]
 
-    def corner_db(self, corner_m: Floats) -> Floats:
+    def corner_db(self, corner_m: Floats, first_m: float | None = None) -> Floats:
         """Loss `(...)` round a corner, from the ends' distances to the crossing's centre, `(..., 2)`.
 
         The law is not quite reciprocal, a radio link is: the mean of both directions, in dB.
         """
         one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
-        return 0.5 * (self._corner_one_way_db(one_m, other_m) + self._corner_one_way_db(other_m, one_m))
+        height_m = self._mean_height_m(first_m)
+        there_db = self._corner_one_way_db(one_m, other_m, height_m)
+        return 0.5 * (there_db + self._corner_one_way_db(other_m, one_m, height_m))
 
-    def _corner_one_way_db(self, transmitter_m: Floats, receiver_m: Floats) -> Floats:
+    def _corner_one_way_db(self, transmitter_m: Floats, receiver_m: Floats, height_m: float) -> Floats:
         # The breakpoint is that of two rays, which Abbas et al. write with the same symbol.
         wave_m = LIGHT_M_PER_S / (self.frequency_ghz * 1e9)
-        break_m = 4 * self.antenna_m**2 / wave_m
+        break_m = 4 * height_m**2 / wave_m
         spread: Floats = transmitter_m**0.957 / (self.wall_m * self.street_m) ** 0.81
         ratio = spread * 4 * np.pi * receiver_m / wave_m * np.maximum(1.0, receiver_m / break_m)
         return 3.75 + 2.94 * self.suburban + 26.9 * np.log10(ratio)
@@ -125,6 +141,7 @@ class Propagation:
         sight: Ints | int = CLEAR,
         blocker_m: Floats | float | None = None,
         corner_m: Floats | None = None,
+        first_m: float | None = None,
     ) -> Floats:
         """Standard deviation `(...)` of shadowing and blockage together.
 
@@ -134,7 +151,7 @@ class Propagation:
         behind: Floats | float = 4.0
         if corner_m is not None:
             behind = np.where(np.isnan(corner_m).any(axis=-1), 4.0, 4.1)
-        vehicle_db = np.hypot(3.0, self.blockage_db(np.array(NEAREST_M), blocker_m)[1])
+        vehicle_db = np.hypot(3.0, self.blockage_db(np.array(NEAREST_M), blocker_m, first_m)[1])
         return np.select([np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind)
 
     @property

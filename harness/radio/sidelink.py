@@ -17,35 +17,27 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.radio.block_error import BlockError
-from harness.radio.channel import BUILDING, CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
-from harness.radio.propagation import Propagation
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
 from harness.radio.sps import Scheduling
+from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
 FURTHEST_M = 1000
 """Interferers further from the receiver do not count, as in the source; beyond, links have its collisions."""
 
-STEP_M = 10
-CELL_DB, CELLS = 0.5, 160
-"""The grid on which success is computed once: distances, and powers from the sensing threshold on."""
+CELLS = 160
+"""Of power, from the sensing threshold on; with the distances the grid on which success is computed once."""
 
 
 @dataclass(frozen=True)
-class Sidelink(Propagation):
-    """What LTE Mode 4 and NR Mode 2 have in common; its fields and `Propagation`'s are settings of both.
+class Sidelink(Transceiver):
+    """What LTE Mode 4 and NR Mode 2 have in common; its fields and `Transceiver`'s are settings of both.
 
     Attributes:
-        density_per_km: background vehicles on one kilometre of road, all lanes together.
-        rate_hz: packets a second of each of them.
-        power_dbm: transmit power of everyone.
-        gain_dbi: gain of each antenna.
-        noise_figure_db: of the receivers.
-        sensing_dbm: least power at which a packet is received or sensed; of the whole packet.
         keep: probability that a vehicle keeps its resource when it might choose anew.
         transmissions: how often each block is sent, blindly, everyone's. Copies are received independently
             and not combined, given the link's shadowing.
@@ -54,18 +46,11 @@ class Sidelink(Propagation):
             triggered has no reservation.
     """
 
-    density_per_km: float = 100.0
-    rate_hz: float = 10.0
-    power_dbm: float = 23.0
-    gain_dbi: float = 0.0
-    noise_figure_db: float = 9.0
-    sensing_dbm: float = -90.5
     keep: float = 0.0
     transmissions: int = 1
     t1_slots: int = 1
     t2_slots: int = 100
 
-    needs_site: ClassVar[bool] = True
     ranks: ClassVar[bool]
     """Whether vehicles rank what they have left by received power (Step 3 of Mode 4)."""
 
@@ -123,48 +108,26 @@ class Sidelink(Propagation):
         received: Floats = 1 - (1 - success) ** self.transmissions
         return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
 
-    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Probability that a message of so many bits is lost on each link, `(..., H)`, given its shadowing.
+    def wait_s(self, uniforms: Floats) -> Floats:
+        """From the wish to send to the start of the slot chosen."""
+        return (self.t1_slots + np.floor(uniforms * self._window)) * self.slot_s
 
-        Args:
-            site: where the links are; links to helpers that are not there have any loss.
-            shadow: standard normal, `(..., H)`.
-            bits: `(..., H)` or one number.
-        """
-        return self._lost(self._block_loss(site, shadow), bits)
+    def message_s(self, bits: Floats | float) -> Floats:
+        """One slot a block and copy, one after another."""
+        return self._blocks(bits) * (self.transmissions * self.slot_s)
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
-        """All helpers have it when its last block was sent."""
-        airtime_s = float(self._airtime_s(bits))
-        return Broadcast(self._wait_s(draws.wait) + airtime_s, airtime_s)
-
-    def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each reply takes a slot and a sub-channel of its window at random."""
-        if links.site is None:
-            raise UserError(NO_SITE)
-        block_loss = self._block_loss(links.site, draws.shadow(links.site.xy_m, self.decorrelation_m))
-        loss = self._lost(block_loss, links.payload_bits)
-        request_loss = self._lost(block_loss, links.request_bits)
-        airtime_s = self._airtime_s(links.payload_bits)
-        start_s = links.ready_s + self._wait_s(draws.jitter)
-        replied = links.asked & (draws.packet[..., 0] >= request_loss)
-        clear = ~self._clash(start_s, airtime_s, draws.jitter, replied)
-        up = replied & (draws.packet[..., 1] >= loss) & clear
-        return Delivery(up, np.where(links.asked, start_s + airtime_s, np.inf), loss, airtime_s)
-
-    def _clash(self, start_s: Floats, airtime_s: Floats, uniform: Floats, replied: Bools) -> Bools:
-        """Whose slots and sub-channel another reply has, wholly or in part, `(..., H)`."""
-        first = np.floor(start_s / self.slot_s + 1e-6)
+    def _turns(
+        self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
+    ) -> tuple[Bools, Floats]:
+        """Each reply takes a slot and a sub-channel at random; what another has in part is lost."""
+        first = np.floor(begins_s / self.slot_s + 1e-6)
         after = first + np.rint(airtime_s / self.slot_s)
         # What of the draw did not choose the slot chooses the sub-channel.
-        lane = np.floor(np.mod(uniform * self._window, 1.0) * self.blocks_per_slot)
+        lane = np.floor(np.mod(uniforms * self._window, 1.0) * self.blocks_per_slot)
         meet = (first[..., None] < after[..., None, :]) & (first[..., None, :] < after[..., None])
         meet &= (lane[..., None] == lane[..., None, :]) & replied[..., None, :]
-        return np.asarray((meet & ~np.eye(start_s.shape[-1], dtype=bool)).any(axis=-1))
-
-    def _wait_s(self, uniform: Floats) -> Floats:
-        """From the wish to send to the start of the slot chosen."""
-        return (self.t1_slots + np.floor(uniform * self._window)) * self.slot_s
+        clash = np.asarray((meet & ~np.eye(begins_s.shape[-1], dtype=bool)).any(axis=-1))
+        return ~clash, np.where(links.asked, begins_s + airtime_s, np.inf)
 
     @property
     def _window(self) -> int:
@@ -173,26 +136,14 @@ class Sidelink(Propagation):
     def _blocks(self, bits: Floats | float) -> Floats:
         return np.maximum(np.ceil(np.divide(bits, self.block_bits)), 1.0)
 
-    def _airtime_s(self, bits: Floats | float) -> Floats:
-        """One slot a block and copy, one after another."""
-        return self._blocks(bits) * (self.transmissions * self.slot_s)
+    def _lost(self, fate: Floats, bits: Floats | float) -> Floats:
+        return 1 - (1 - fate) ** self._blocks(bits)
 
-    def _lost(self, block_loss: Floats, bits: Floats | float) -> Floats:
-        return 1 - (1 - block_loss) ** self._blocks(bits)
-
-    def _block_loss(self, site: Site, shadow: Floats) -> Floats:
-        between = (site.sight, site.blocker_m, site.corner_m)
-        distance_m = site.distance_m
-        deviation_db = self.shadowing_db(*between)
-        power_dbm = self._received_dbm(self.path_loss_db(distance_m, *between)) + deviation_db * shadow
-        # A helper that is not there has no place, and the grid must be read somewhere.
-        place = [distance_m / STEP_M, (power_dbm - self.sensing_dbm) / CELL_DB - 0.5]
-        success = map_coordinates(_success(self), np.nan_to_num(place), order=1, mode="nearest")
+    def _fate(self, distance_m: Floats, power_dbm: Floats) -> Floats:
+        """Probability that a block is lost in all its copies."""
+        success = self._read(_success(self), distance_m, power_dbm, STEP_DB / 2)
         copies = np.where(power_dbm >= self.sensing_dbm, (1 - success) ** self.transmissions, 1.0)
         return np.clip(copies, 0.0, 1.0)
-
-    def _received_dbm(self, path_loss_db: Floats) -> Floats:
-        return self.power_dbm + 2 * self.gain_dbi - path_loss_db
 
     def _scheduling(self) -> Scheduling:
         return Scheduling(
@@ -211,7 +162,7 @@ class Sidelink(Propagation):
         if sight is not None:
             shares = {state: (sight == state) * np.ones_like(clear) for state in (CLEAR, VEHICLE, BUILDING)}
         return [
-            (share, self._received_dbm(self.path_loss_db(distance_m, state)), float(self.shadowing_db(state)))
+            (share, self.received_dbm(self.path_loss_db(distance_m, state)), float(self.shadowing_db(state)))
             for state, share in shares.items()
             if share.any()
         ]
@@ -223,7 +174,7 @@ class Sidelink(Propagation):
 
     def _shares(self, distance_m: Floats, sight: Ints | int | None) -> Floats:
         """Shares of the power cells, `(n, CELLS)`; what is missing to 1 is below the threshold (10)."""
-        edges = self.sensing_dbm + CELL_DB * np.arange(CELLS + 1)
+        edges = self.sensing_dbm + STEP_DB * np.arange(CELLS + 1)
         edges[-1] = np.inf
         states = self._states(distance_m, sight)
         below = [share[:, None] * ndtr((edges - mean[:, None]) / sd) for share, mean, sd in states]
@@ -236,7 +187,7 @@ _DISTANCE_M: Floats = np.arange(0.0, FURTHEST_M + STEP_M, STEP_M)
 @lru_cache(maxsize=64)
 def _success(radio: Sidelink) -> Floats:
     """Share of packets received of those that are sensed, by distance and received power, `(D, CELLS)`."""
-    power_dbm: Floats = radio.sensing_dbm + CELL_DB * (np.arange(CELLS, dtype=np.float64) + 0.5)
+    power_dbm: Floats = radio.sensing_dbm + STEP_DB * (np.arange(CELLS, dtype=np.float64) + 0.5)
     noise_lost = radio.block_error(power_dbm - radio.noise_dbm)
     shares = radio._shares(_DISTANCE_M, None) * (1 - noise_lost)
     shares /= np.maximum(shares.sum(axis=-1, keepdims=True), 1e-300)

@@ -19,7 +19,7 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import sha256_file
-from harness.radio.channel import BUILDING, CLEAR, NO_SITE, VEHICLE, Broadcast, Delivery, Draws, Links, Site
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Broadcast, Delivery, Draws, Links, Site
 from harness.radio.constant import link_up
 
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
@@ -75,7 +75,7 @@ class Trace:
     receptions: Table
     latency_s: Seconds = 0.025
     beyond: Literal["zero", "held"] = "zero"
-    needs_site: ClassVar[bool] = True
+    decorrelation_m: ClassVar[float] = math.inf
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Share of packets received at these distances; in clear sight if nothing else is said."""
@@ -89,16 +89,14 @@ class Trace:
         """Channel busy ratio, of which a table of receptions says nothing."""
         return math.nan
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Heard when the longest latency is over; how much of it is time on air is not known."""
         return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Each link has the loss and the latency of its distance."""
-        if links.site is None:
-            raise UserError(NO_SITE)
-        loss = self.loss(links.site, np.zeros(()), links.payload_bits)
-        latency_s = self._at(links.site.distance_m, links.site.sight, "latency_s")
+        loss = self.loss(links.where, np.zeros(()), links.payload_bits)
+        latency_s = self._at(links.where.distance_m, links.where.sight, "latency_s")
         delay_s = np.where(links.asked, links.ready_s + latency_s, np.inf)
         return Delivery(link_up(draws.packet, loss), delay_s, loss, np.full_like(loss, np.nan))
 

@@ -27,6 +27,7 @@ class Axis:
         field: the operating point's setting; None for the number of vehicles.
         scale: what a value is multiplied by to be that setting.
         usual: the grid if none is given; empty if one must be.
+        worded: its values are words, not numbers.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Axis:
     field: str | None
     scale: float
     usual: str
+    worded: bool = False
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
         """The operating point with this setting. Raises UserError where it is not allowed."""
@@ -61,7 +63,7 @@ AXES = {
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
         Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
-        Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS)),
+        Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
     )
 }
 
@@ -70,10 +72,10 @@ def axis_of(name: str) -> Axis:
     """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
     if name in AXES:
         return AXES[name]
-    of_radios = {field for channel in CHANNELS.values() for field in settable(channel)}
-    if name not in SETTINGS and name not in of_radios:
-        raise unknown("--over", name, {*AXES, *SETTINGS, *of_radios})
-    return Axis(name, name.replace("_", " "), name, 1.0, "")
+    usual = _usual()
+    if name not in usual:
+        raise unknown("--over", name, {*AXES, *usual})
+    return Axis(name, name.replace("_", " "), name, 1.0, "", isinstance(usual[name], str | bool))
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
@@ -87,7 +89,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     if not text and not axis.usual:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in (text or axis.usual).split(",")]
-    if axis.field and isinstance(usual_of(axis.field), str | bool):
+    if axis.worded:
         for part in parts:
             if axis.field == "consensus" and part not in names():
                 raise unknown("--grid", part, names())
@@ -100,11 +102,10 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     return tuple(dict.fromkeys(values))
 
 
-def usual_of(field: str) -> object:
-    """What a setting of an operating point or of a channel usually is."""
-    if field in SETTINGS:
-        return getattr(POINTS["6g"], field)
-    return next(getattr(channel, field) for channel in CHANNELS.values() if field in settable(channel))
+def _usual() -> dict[str, object]:
+    """What every setting of an operating point or of a channel usually is."""
+    of_radios = {name: getattr(channel, name) for channel in CHANNELS.values() for name in settable(channel)}
+    return of_radios | {name: getattr(POINTS["6g"], name) for name in SETTINGS}
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:

@@ -13,7 +13,7 @@ What decides success is drawn stratified. Every seed has each kind of episode, b
 and who reads it rightly, in its share to within one, and each link's luck is spread evenly over each kind.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -25,7 +25,7 @@ from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrit
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.walk import Decided, Due, Fuses
-from harness.radio.channel import Draws
+from harness.radio.channel import Draws, Unit
 from harness.studies.play import Walked, walk_through
 
 VERSION = "3"
@@ -149,7 +149,7 @@ class CalibratedWorld:
         draws = Draws(self._now(lambda d: d.draws.link), self._now(lambda d: d.draws.jitter))
         return Due(np.arange(len(self._knows)), self._episode, self._seed, draws)
 
-    def site(self) -> None:
+    def site(self, units: Collection[Unit]) -> None:
         """The study's vehicles are nowhere in particular."""
 
     def step(self, decided: Sequence[Decided[int]]) -> None:

@@ -40,6 +40,12 @@ class Drawn:
     delay_s: float
 
 
+def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[str, Floats]:
+    """The channel's own curve behind each of `SIGHTS`."""
+    metres = np.asarray(distances_m, dtype=float)
+    return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
+
+
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
     """`n` trips with one helper at each distance, in sight along one road."""
     result = []

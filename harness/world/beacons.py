@@ -34,7 +34,6 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.radio.fading import Trips
-from harness.radio.propagation import Propagation
 from harness.world.scenario import Parameters, beacon_radio
 from harness.world.sight_lines import site
 from harness.world.state import Beacon, VehicleState, WorldState
@@ -212,8 +211,6 @@ def losses(
         declared = np.full(len(radios) - 1, p.beacon_loss)
         return lambda frame: declared
     state = world()
-    # Of the models only these have shadowing.
-    decorrelation_m = radio.decorrelation_m if isinstance(radio, Propagation) else np.inf
     trips = Trips(np.array([NO_SEED]), np.array([state.episode_seed]), np.zeros(1, dtype=int), 1)
 
     @cache
@@ -221,7 +218,7 @@ def losses(
         there = zip(state.vehicles, poses[frame].tolist(), strict=True)
         vehicles = tuple(replace(v, x_m=x, y_m=y, heading_rad=heading) for v, (x, y, heading, _) in there)
         links = site([(replace(state, vehicles=vehicles), radios)])
-        return np.asarray(radio.loss(links, trips.shadow(links.xy_m, decorrelation_m), BITS)[0])
+        return np.asarray(radio.loss(links, trips.shadow(links.xy_m, radio.decorrelation_m), BITS)[0])
 
     return at
 

@@ -1,43 +1,71 @@
 """What stands between the antennas of the ego and its helpers: geometry for channel models that need it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Site
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Site, Unit
 from harness.world.perception.rays import meetings
 from harness.world.state import HEIGHTS_M, VehicleState, WorldState
 
 LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at less run side by side, or merge
 
 
-def site(moments: Sequence[tuple[WorldState, Sequence[str]]]) -> Site:
-    """The links of some moments, (n, ...).
+Place = tuple[float, float]
+
+
+def site(
+    moments: Sequence[tuple[WorldState, Sequence[str]]],
+    units: Collection[Unit] = (),
+    zone_m: Place = (0.0, 0.0),
+) -> Site:
+    """The links of some moments, (n, ...), those of roadside units among them.
 
     An antenna is at the centre of its vehicle. Of what stands between two, a building counts for more than a
     vehicle.
 
     Args:
         moments: the state, and the ids of the ego and its helpers, in this order.
+        units: roadside units.
+        zone_m: the centroid of the conflict zone, from which their places are counted.
     """
-    n, helpers = len(moments), max((len(viewers) for _, viewers in moments), default=1) - 1
-    xy_m = np.full((n, 1 + helpers, 2), np.nan)
-    sight, blocker_m = np.full((n, helpers), CLEAR), np.zeros((n, helpers))
-    corner_m = np.full((n, helpers, 2), np.nan)
-    for i, (state, viewers) in enumerate(moments):
-        ego, *others = (state.vehicle(name) for name in viewers)
-        xy_m[i, : len(viewers)] = [(v.x_m, v.y_m) for v in (ego, *others)]
-        for h, helper in enumerate(others):
-            sight[i, h], blocker_m[i, h] = _between(state, ego, helper)
-            corner_m[i, h] = corner(ego, helper)
+    there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in moments]
+    among = _site([(state, ego, helpers) for state, (ego, *helpers) in there])
+    of_units = {
+        unit: replace(
+            _site([(state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_) for state, all_ in there]),
+            first_m=unit.antenna_m,
+        )
+        for unit in units
+    }
+    return replace(among, units=of_units)
+
+
+def _site(moments: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
+    """The links from one end, a vehicle or a place, to some vehicles."""
+    n, most = len(moments), max((len(others) for _, _, others in moments), default=0)
+    xy_m = np.full((n, 1 + most, 2), np.nan)
+    sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
+    corner_m = np.full((n, most, 2), np.nan)
+    for i, (state, first, others) in enumerate(moments):
+        xy_m[i, : 1 + len(others)] = [_xy(end) for end in (first, *others)]
+        for h, other in enumerate(others):
+            sight[i, h], blocker_m[i, h] = _between(state, first, other)
+            if isinstance(first, VehicleState):
+                corner_m[i, h] = corner(first, other)
     return Site(xy_m, sight, blocker_m, corner_m)
 
 
-def _between(state: WorldState, a: VehicleState, b: VehicleState) -> tuple[int, float]:
-    """What stands between two vehicles, and the height of the tallest vehicle that does."""
-    origin, line = np.array([a.x_m, a.y_m]), np.array([[b.x_m - a.x_m, b.y_m - a.y_m]])
-    vehicles = [v for v in state.vehicles if v.id not in (a.id, b.id)]
+def _xy(end: VehicleState | Place) -> Place:
+    return (end.x_m, end.y_m) if isinstance(end, VehicleState) else end
+
+
+def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tuple[int, float]:
+    """What stands between two ends, and the height of the tallest vehicle that does."""
+    origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
+    vehicles = [v for v in state.vehicles if v not in (a, b)]
     corners = [*(v.corners() for v in vehicles), *(building.corners() for building in state.buildings)]
     if not corners:
         return CLEAR, 0.0

@@ -11,10 +11,11 @@ from evaluating import spec_of
 
 from harness.coordination.operating_point import named_point
 from harness.dataset.load import Dataset
+from harness.radio.channel import Physical
 from harness.radio.profiles import CHANNELS
 
 Said = tuple[int, str, str]
-PHYSICAL = [name for name in ("mode4", "mode2", "its-g5") if CHANNELS[name].needs_site]
+PHYSICAL = [name for name in ("mode4", "mode2", "its-g5") if isinstance(CHANNELS[name], Physical)]
 
 
 def test_list_says_what_each_radio_rests_on(harness: Callable[..., Said]) -> None:

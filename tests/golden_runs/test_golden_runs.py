@@ -37,7 +37,7 @@ FROZEN = {
         "eval", "--model", "proxy-faulty", "--limit", "5", "--seeds", "0,7",
         *conditions(
             "single-local:fallback=brake", "6g:on_demand=true", "6g:max_helpers=2,density_coupled=true",
-            "v2x:helper_rounds=true", "v2x:roadside_edge=true,window_s=0.3",
+            "v2x:helper_rounds=true", "v2x:edge=relay,window_s=0.3",
         ),
     ],
     "frozen-local-view": [

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -45,9 +45,8 @@ class Fog:
 
     latency_s: float = 0.01
     loss_per_m: float = 0.01
-    needs_site: ClassVar[bool] = False
 
-    def request(self, bits: float, draws: Draws) -> Broadcast:
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """A message's time on air is not modelled."""
         return Broadcast(0.0, 0.0)
 

@@ -1,0 +1,159 @@
+"""A roadside unit: a place with an antenna, a link of its own to each vehicle, and a delay between them.
+
+Its links are the channel's: the unit is one end, with its own antenna height and what stands between it and
+each vehicle; their shadowing and packets are drawn apart, so that a unit changes nobody else's. In both modes
+`delay_s` lies between all that the unit has received and what it sends for that: its processing and its
+backhaul.
+
+As a relay it sends every reply that reaches it once more. As a place of fusion it gets the ego's request and
+intent, asks the helpers, fuses, and sends the ego a policy. An intent or a policy alone counts as large as a
+request: a distribution over three actions is about 50 bytes of compact JSON.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.radio.channel import Delivery, Draws, Links, Physical, Site, Unit
+from harness.radio.wrapped import Wrapped
+
+EGO, HELPERS = slice(0, 1), slice(1, None)  # of a unit's links
+
+
+@dataclass(frozen=True)
+class Relay(Wrapped):
+    """A channel beside a unit that sends replies once more; requests go directly.
+
+    A reply arrives if it crosses to the ego, or to the unit and from there; the ego takes what comes first,
+    the direct one. Copies are on air whether or not the ego needs them, since the unit cannot know, and wait
+    for no one.
+
+    Attributes:
+        unit: where it is.
+        delay_s: from a reply's end at the unit until its copy is to be sent.
+    """
+
+    unit: Unit
+    delay_s: float
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """A lost reply keeps its slot, and that of its copy if there is one."""
+        up, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
+        has_request = draws.packet[..., 0] >= loss_of(self.channel, links.where, draws, links.request_bits)
+        at_unit = links.where.units[self.unit]
+        heard = self.channel.deliver(
+            replace(links, asked=links.asked & has_request, site=at_unit.to(HELPERS)),
+            draws.of(".roadside").requested,
+        ).up
+        heard &= links.asked & has_request
+        copies = draws.of(".roadside-ego")
+        copy = self.channel.request(links.payload_bits, replace(copies, given=copies.packet))
+        copied = heard & (
+            copies.packet[..., 1] >= loss_of(self.channel, at_unit.to(EGO), copies, links.payload_bits)
+        )
+        copy_end_s = delay_s + self.delay_s + copy.heard_s
+        return Delivery(
+            up | copied,
+            np.where(heard & ~up, copy_end_s, delay_s),
+            loss,
+            airtime_s + np.where(heard, copy.airtime_s, 0.0),
+        )
+
+
+class Consulted(NamedTuple):
+    """What became of a question to the helpers, in seconds from the ego's request.
+
+    Attributes:
+        asked: helpers that were asked, `(..., H)`: by a unit, nobody where the ego's request was lost.
+        up: request and reply crossed, `(..., H)`; with a unit its policy as well, if it sent one.
+        end_s: end of each reply at whoever fuses, `(..., H)`; inf where not asked.
+        fused: replies that a policy may have in it, `(..., H)`.
+        acts_s: when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy.
+        loss: probability that a reply is lost, `(..., H)` or `(..., 1)`.
+        requests: the ego's and the unit's, `(...)`.
+        request_bits: of these, with the ego's intent in its request to a unit, `(...)`.
+        policy_bits: of what a unit sent back, `(...)`.
+        airtime_s: of all messages, `(...)`.
+    """
+
+    asked: Bools
+    up: Bools
+    end_s: Floats
+    fused: Bools
+    acts_s: Floats
+    loss: Floats
+    requests: Ints
+    request_bits: Floats
+    policy_bits: Floats
+    airtime_s: Floats
+
+
+def by_unit(
+    channel: Physical,
+    unit: Unit,
+    delay_s: float,
+    links: Links,
+    draws: Draws,
+    ready: Callable[[Floats], Floats],
+    left_s: Floats,
+) -> Consulted:
+    """A unit asks the helpers for the ego, and sends the ego a policy in time.
+
+    The unit sends when the last reply's slot has ended, or as late as its own wait and time on air leave the
+    policy within the window: it knows the slot that it has taken, and until when the ego waits. An ego that
+    has no policy by then acts alone.
+
+    Args:
+        channel: of all links.
+        unit: where it is.
+        delay_s: between what the unit has received and what it sends for that.
+        links: whom the ego wants to be asked; when they are ready counts for nothing.
+        draws: of the channel.
+        ready: when replies can leave, `(..., H)`, by when helpers have the request, `(..., 1)`.
+        left_s: until the window closes, `(...)`.
+    """
+    bits, at_unit = links.request_bits, links.where.units[unit]
+    to_ego, to_helpers = draws.of(".roadside-ego"), draws.of(".roadside")
+    back_draw, request_draw, policy_draw = np.moveaxis(to_ego.first_packets, -1, 0)
+
+    def lost(size_bits: float) -> Floats:
+        return loss_of(channel, at_unit.to(EGO), to_ego, size_bits)[..., 0]
+
+    wanted = np.any(links.asked, axis=-1)
+    to_unit = channel.request(2 * bits, draws)
+    reached = wanted & (request_draw >= lost(2 * bits))
+    ask = channel.request(bits, to_helpers)
+    heard_s = np.asarray(to_unit.heard_s + delay_s + ask.heard_s)
+    asked = links.asked & reached[..., None]
+    replies = channel.deliver(
+        replace(links, asked=asked, ready_s=ready(heard_s[..., None]), site=at_unit.to(HELPERS)), to_helpers
+    )
+    back = channel.request(bits, replace(to_ego, given=back_draw[..., None]))
+    back_s = delay_s + back.heard_s
+    latest_s = left_s - back_s
+    sent = reached & (latest_s >= to_unit.heard_s)
+    crossed = sent & (policy_draw >= lost(bits))
+    replied_s = np.max(np.where(asked, replies.delay_s, 0.0), axis=-1, initial=0.0)
+    up = asked & replies.up & (crossed | ~sent)[..., None]
+    parts = ((wanted, to_unit), (reached, ask), (sent, back))
+    airtime_s = sum(np.where(happened, part.airtime_s, 0.0) for happened, part in parts)
+    return Consulted(
+        asked=asked,
+        up=up,
+        end_s=replies.delay_s,
+        fused=up & crossed[..., None] & (replies.delay_s <= latest_s[..., None]),
+        acts_s=np.where(wanted, np.where(crossed, np.minimum(replied_s + back_s, left_s), left_s), 0.0),
+        loss=replies.loss,
+        requests=wanted.astype(int) + reached,
+        request_bits=bits * (2.0 * wanted + reached),
+        policy_bits=bits * sent,
+        airtime_s=airtime_s + np.sum(np.where(asked, replies.airtime_s, 0.0), axis=-1),
+    )
+
+
+def loss_of(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
+    """Probability that one crossing of so many bits is lost on each link, `(..., H)`."""
+    return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -1,0 +1,69 @@
+"""Channels round another one, with something about it changed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.core.arrays import Floats, Ints
+from harness.radio.channel import Broadcast, Delivery, Draws, Links, Physical, Site
+
+
+@dataclass(frozen=True)
+class Wrapped:
+    """A physical channel that does what another one does.
+
+    Attributes:
+        channel: the other one.
+    """
+
+    channel: Physical
+
+    @property
+    def decorrelation_m(self) -> float:
+        """The channel's."""
+        return self.channel.decorrelation_m
+
+    def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
+        """The channel's."""
+        return self.channel.request(bits, draws)
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """The channel's."""
+        return self.channel.deliver(links, draws)
+
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
+        """The channel's."""
+        return self.channel.reception(distance_m, sight)
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """The channel's."""
+        return self.channel.loss(site, shadow, bits)
+
+    def busy_ratio(self) -> float:
+        """The channel's."""
+        return self.channel.busy_ratio()
+
+
+@dataclass(frozen=True)
+class AtLoss(Wrapped):
+    """A physical channel, every crossing of which is lost with one probability, wherever its ends are.
+
+    Attributes:
+        probability: that one crossing is lost.
+    """
+
+    probability: float
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        """When replies arrive is the channel's; they do nothing to each other besides."""
+        _, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
+        up = np.all(draws.packet >= self.probability, axis=-1)
+        return Delivery(up, delay_s, np.full_like(loss, self.probability), airtime_s)
+
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
+        """The same at any distance, behind anything."""
+        return np.full(np.shape(distance_m), 1 - self.probability)
+
+    def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
+        """The same on every link."""
+        return np.full(site.sight.shape, self.probability)
