@@ -113,6 +113,8 @@ def test_a_sybil_is_several_vehicles_two_metres_apart():
     assert voices.voice_of is not None
     assert voices.voice_of[0].tolist() == [0, 1, 2, 0, 0]
     assert voices.valid.all()
+    assert voices.sensed_m is not None
+    assert np.isnan(voices.sensed_m[0]).tolist() == [False, False, False, True, True], "nobody sees a voice"
 
 
 def test_a_flood_says_nothing_with_many_voices():

@@ -370,7 +370,17 @@ def with_voices(said: Intents, by: Bools, voices: int) -> Intents:
     distance_m = wide.distance_m + np.insert(shift_m, 0, 0.0)
     alive = np.concatenate([np.ones((n, helpers), dtype=bool), there], axis=-1)
     range_m = np.where(alive, wide.range_m + shift_m, np.nan)
-    return replace(wide, valid=wide.valid & alive, distance_m=distance_m, range_m=range_m, voice_of=index)
+    sensed_m = None  # no sensor sees a vehicle that is not there
+    if wide.sensed_m is not None:
+        sensed_m = np.where(np.arange(index.shape[1]) < helpers, wide.sensed_m, np.nan)
+    return replace(
+        wide,
+        valid=wide.valid & alive,
+        distance_m=distance_m,
+        range_m=range_m,
+        sensed_m=sensed_m,
+        voice_of=index,
+    )
 
 
 def _sure_of(action: Ints, actions: int) -> Floats:
