@@ -149,6 +149,8 @@ def shares_of(text: str) -> tuple[float, ...]:
         if not 0 <= share <= 1:
             raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
         found.append(share)
+    if not any(found):
+        raise UserError(f"--share {printable(text)}: nobody attacks; give a share above 0 as well, such as 1/3")
     return tuple(dict.fromkeys(share for share in found if share))
 
 

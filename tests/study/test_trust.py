@@ -115,6 +115,7 @@ def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Pat
     [
         (lambda: shares_of("0,2"), "--share 0,2"),
         (lambda: shares_of("1/0"), "--share 1/0"),
+        (lambda: shares_of("0"), "nobody attacks"),
         (lambda: names_of("--attacks", "liar,lair", (), ("liar",)), "unknown --attacks 'lair'"),
         (lambda: names_of("--attacks", "liar:share=1", (), ("liar",)), "--share"),
         (lambda: trust.under(named_point("6g"), "linear:tau=1", "", 0.0), "weight_cap"),
