@@ -115,10 +115,10 @@ START = TRUST.start((), 3, 3)
 
 
 def test_who_is_not_where_it_claims_is_trusted_no_more_and_counts_by_where_it_is():
-    """Helper 1 claims 3 m and is seen at 30 m: all that can speak against it does. 1.2 to .4 + 3."""
+    """Helper 1 claims 3 m and is seen at 30 m: all that can speak against it does. 1.5 to .3 + 4."""
     told = messages([DOUBT] * 4, [20, 3, 10, 10], sensed_m=[30, np.nan, 10])
     fused = TRUST.fuse(told, START)
-    assert fused.trust == pytest.approx([1.2 / 4.6, 2.2 / 2.6, 2.2 / 2.6])
+    assert fused.trust == pytest.approx([1.5 / 5.8, 2.5 / 2.8, 2.5 / 2.8])
     assert fused.weights == pytest.approx([0.05 / 0.25, 0, 0.1 / 0.25, 0.1 / 0.25])
 
 

@@ -27,14 +27,14 @@ class Trust:
 
     Attributes:
         faith: what speaks for a helper before it has said anything, and against it.
-        forgets: share of what speaks for and against that is left at the next step.
+        kept: share of what speaks for and against that is left at the next step.
         contradiction: how much more a full contradiction counts than a full agreement.
         place_tolerance_m: how far a claimed distance may be from the sensed one.
     """
 
-    faith: tuple[float, float] = (1.5, 0.5)
-    forgets: float = 0.8
-    contradiction: float = 3.0
+    faith: tuple[float, float] = (2.5, 0.5)
+    kept: float = 0.6
+    contradiction: float = 4.0
     place_tolerance_m: float = 5.0
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
@@ -51,12 +51,12 @@ class Trust:
         counts = np.stack([1 - against, self.contradiction * against], axis=-1)
         # Who is not heard keeps its reputation.
         before = remembered[..., :2]
-        reputation = np.where(heard[..., None], self.forgets * before + counts, before)
+        reputation = np.where(heard[..., None], self.kept * before + counts, before)
         trust = reputation[..., 0] / np.sum(reputation, axis=-1)
         weights = self._weights(messages, trust)
         intended = np.where(heard[..., None], p[..., 1:, :], remembered[..., 2:])
-        kept = np.concatenate([reputation, intended], axis=-1).reshape(state.shape)
-        return Fused(linear_pool(p, weights), weights, kept, trust)
+        memory = np.concatenate([reputation, intended], axis=-1).reshape(state.shape)
+        return Fused(linear_pool(p, weights), weights, memory, trust)
 
     def _against(self, messages: Messages, intended: Floats) -> Floats:
         """What speaks against each helper now, from 0 to 1, `(..., H)`."""

@@ -150,7 +150,7 @@ def shares_of(text: str) -> tuple[float, ...]:
             raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
         found.append(share)
     if not any(found):
-        raise UserError(f"--share {printable(text)}: nobody attacks; give a share above 0 as well, such as 1/3")
+        raise UserError(f"--share {printable(text)}: nobody attacks; give a share above 0 as well: 0,1/3")
     return tuple(dict.fromkeys(share for share in found if share))
 
 
