@@ -68,8 +68,10 @@ class Attackers:
             of_this = attackers(attack.share, there, uniforms[..., 0])
             said = attack.act(said, Turn(truth, of_this, first, past, uniforms[..., 1]))
             by |= of_this
-        for intents, (number, seed) in zip(truth.helpers, episodes, strict=True):
-            self._intended.setdefault((number, seed), []).append(intents)
+        for intents, episode in zip(truth.helpers, episodes, strict=True):
+            steps = self._intended.setdefault(episode, [])
+            steps.append(intents)
+            del steps[1 : -self._steps or None]  # but the first and those that an attack looks at
         if said.voice_of is None:
             return Said(said, draws, by)
         voices = np.take_along_axis(by, said.voice_of, axis=-1)
