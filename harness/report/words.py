@@ -119,9 +119,13 @@ def latency_source(latency: Latency) -> str:
         "card": "stated by the model card, not measured here",
         "paper": "the paper's, not measured here",
         "declared": "declared by who ran it, not measured here",
+        "device": "each answer's own, by its tokens, on a declared device",
     }[latency.source]
-    of_helpers = latency.helpers_s or (latency.helper_s,)
-    by_role = {"ego": (latency.ego_s,), "helper": of_helpers, "ego with messages": (latency.fusion_s,)}
+    if latency.ego_s is None or latency.fusion_s is None:
+        return f"{source} ({latency.basis})"
+    by_role = {
+        "ego": (latency.ego_s,), "helper": latency.helper_times_s(), "ego with messages": (latency.fusion_s,),
+    }  # fmt: skip
     times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
     return f"{times}; {source} ({latency.basis})"
 
