@@ -51,7 +51,11 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
         whose = agent.card.name + ("" if own else f"'s answers at the speed of {row.model}")
         rates = [cast("Constant", getattr(row, rate)) for rate in devices.RATES]
         origin = "; ".join(dict.fromkeys(f"{each.status}: {each.source}" for each in rates))
-        said.append(f"{whose} on {device.name} ({row.precision}, batch {row.batch_size}; {origin})")
+        joules = {c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES}
+        said.append(
+            f"{whose} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
+            f"{' and '.join(sorted(joules)) or 'unknown'}; rates {origin})"
+        )
     speeds = tuple(devices.speed(device, row) for row in rows)
     return Latency("device", "; ".join(dict.fromkeys(said)), speeds=speeds)
 
