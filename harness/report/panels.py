@@ -104,8 +104,8 @@ def panels(runs: Runs) -> Iterator[Panel]:
         yield Panel(
             "energy", "communication", "What a decision takes",
             "Joules of inference on the declared device and of sending, mean over decisions; the total's "
-            "interval is over episodes. A helper's inference counts where it was asked. Where the radios' part "
-            "cannot be seen, asking costs energy because helpers think, not because they transmit.",
+            "interval is over episodes. A helper's inference counts where it was asked. Where the radios' "
+            "part cannot be seen, asking costs energy because helpers think, not because they transmit.",
             charts.energies(rows),
         )  # fmt: skip
     if rows := joined(statistics.arrivals):
