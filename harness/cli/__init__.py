@@ -34,7 +34,7 @@ PANELS = {
     ),
     "Look": ("ls", "history", "view", "report", "export", "video", "parse"),
     "Data": ("init", "prompt", "dataset", "scenario", "channel"),
-    "Models": ("model", "distill", "parity", "doctor"),
+    "Models": ("model", "device", "distill", "parity", "doctor"),
 }
 
 app = typer.Typer(

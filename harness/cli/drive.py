@@ -56,6 +56,8 @@ def command(
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
+    device_profile: options.DeviceProfile = None,
+    device_model: options.DeviceModel = None,
     out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
     save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
     no_cache: options.NoCache = False,
@@ -64,6 +66,7 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Drive closed-loop episodes in highway-env. The same command continues one that was stopped."""
+    from harness.backends import devices
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
@@ -111,6 +114,8 @@ def command(
         device=device,
         dtype=dtype,
         latency=latency,
+        device_profile=devices.load(device_profile) if device_profile else None,
+        device_model=device_model,
         tags=tuple(dict.fromkeys(tag or ())),
     )
     where = out or default_out(spec)

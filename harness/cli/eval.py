@@ -63,6 +63,8 @@ def command(
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
+    device_profile: options.DeviceProfile = None,
+    device_model: options.DeviceModel = None,
     out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-<dataset>."),
     no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
@@ -72,6 +74,7 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes. The same command continues one that was stopped."""
+    from harness.backends import devices
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS
     from harness.dataset import load, suites
@@ -110,6 +113,8 @@ def command(
             temperature=temperature,
             sampling_seed=sampling_seed,
             latency=latency,
+            device_profile=devices.load(device_profile) if device_profile else None,
+            device_model=device_model,
             tags=tuple(dict.fromkeys(tag or ())),
         )
         for each in frozen

@@ -84,6 +84,13 @@ Latency = Annotated[
         "(batch 1, on this machine if it is idle). Default: the card's, else the paper's."
     ),
 ]
+DeviceProfile = Annotated[
+    str | None,
+    Option(help="Computer of every vehicle, in place of --latency: agx-orin. `harness device list`."),
+]
+DeviceModel = Annotated[
+    str | None, Option(help="Model whose row of it times all answers. Default: each answer's own model.")
+]
 Temperature = Annotated[
     float, Option(help="Draw answers at this temperature, 0 to 2; 0 takes the likeliest token each time.")
 ]

@@ -206,10 +206,11 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
 
 def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
     """Where a run's times come from and how its answers were read."""
-    from harness.report.words import pace
+    from harness.report.words import energy, pace
 
     yield from pace(m)
     yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
+    yield from energy(m, lambda condition, metric: figures.get((condition, metric)))
     for role, took in m.answer_times.items():
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
         yield f"{role} answers took {half} ms (5-95 %: {low} to {high}, n = {took.n}); not used"

@@ -1,4 +1,4 @@
-"""Inference times that decide who is heard: the paper's, the card's, the user's, or measured by name.
+"""Inference times that decide who is heard: the paper's, a card's, the user's, a device's, or measured ones.
 
 They are fixed before a run, so that its own speed changes none of its rows. What its answers took is shown
 beside them.
@@ -17,6 +17,7 @@ from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
+from harness.evaluate.device import answer_s
 from harness.runs import percentiles
 from harness.runs.records import Answer, Latency, Times
 
@@ -57,6 +58,11 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
     """The ego's times, and those of helpers that are others."""
     if not helpers:
         return ego
+    if any(each.speeds for each in (ego, *helpers)):
+        raise UserError(
+            "a replay of a run with a device profile has that run's times; give --device-profile anew, or "
+            "--latency"
+        )
     basis = " + ".join(dict.fromkeys(each.basis for each in helpers))
     return replace(
         ego, basis=ego.basis if basis == ego.basis else f"ego: {ego.basis}; helpers: {basis}",
@@ -101,16 +107,22 @@ def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) ->
 
     A repair turn is one more. What an answer is declared to be slower than its card comes on top.
     """
+    if latency.speeds:
+        return np.array([
+            [answer_s(latency.speed(place), a) if a else np.nan for place, a in enumerate(row)]
+            for row in answers
+        ])  # fmt: skip
     turns = np.array([[a.turns if a else np.nan for a in row] for row in answers])
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
-    of_helpers = latency.helpers_s or (latency.helper_s,)
-    by_place = [latency.ego_s, *islice(cycle(of_helpers), slow.shape[1] - 1)]
-    return np.asarray(slow + turns * np.array(by_place))
+    by_place = [latency.ego_s, *islice(cycle(latency.helper_times_s()), slow.shape[1] - 1)]
+    return np.asarray(slow + turns * np.array(by_place, dtype=float))
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
     """Seconds of each fusion call, (K,), as `inference_s` has those of the first answers."""
-    return np.array([latency.fusion_s * a.turns + a.slow_s for a in answers])
+    if latency.speeds:
+        return np.array([answer_s(latency.speeds[0], a) for a in answers])
+    return np.array([cast("float", latency.fusion_s) * a.turns + a.slow_s for a in answers])
 
 
 def times(answers: Iterable[Answer]) -> dict[str, Times]:

@@ -22,8 +22,8 @@ from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import spread
 from harness.dataset.load import Scene
+from harness.evaluate import device, timing
 from harness.evaluate import latency as latencies
-from harness.evaluate import timing
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.spec import Spec, versions
@@ -115,7 +115,12 @@ class Walked:
 
 def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
-    decisions = table(decided, world.columns(), spec.actions).rounded()
+    decisions = table(decided, world.columns(), spec.actions)
+    if spec.device_profile:
+        answers = asker.answers.values()
+        taken = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
+        decisions = decisions.replace(**taken)
+    decisions = decisions.rounded()
     return Walked(decisions, world.episodes(), asker.answers)
 
 
@@ -188,6 +193,8 @@ def _latency(
     """What the run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
     if begun:
         return begun.latency
+    if spec.device_profile:
+        return device.of_device(spec.device_profile, spec.device_model, spec.agents)
     declared = latencies.known(spec.latency, spec.agents, models)
     return declared or timing.measured(spec, together(spec.cards, models), trial())
 

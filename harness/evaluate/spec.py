@@ -17,11 +17,12 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
+from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs.metrics import World
-from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.runs.records import ClosedLoop, Device, FrozenScenes
 from harness.world.scenario import Scenario
 
 TAG_CHARACTERS = 40
@@ -88,6 +89,9 @@ class Spec:
         sampling_seed: of their draws, so that the same question has other answers under another one.
         latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
             reads them; None for each card's, else the paper's.
+        device_profile: the computer that every vehicle has, in place of `latency`: each answer takes what its
+            own tokens take there. None for none.
+        device_model: whose row of it times all answers; None for each agent's own.
         tags: words to find the run by, which change nothing in it.
     """
 
@@ -102,6 +106,8 @@ class Spec:
     temperature: float = 0.0
     sampling_seed: int = 0
     latency: str | None = None
+    device_profile: Device | None = None
+    device_model: str | None = None
     tags: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -135,6 +141,7 @@ class Spec:
                     f"--latency {printable(self.latency)}: {several} times for {len(self.helpers)} helper "
                     "models; give one, or one each"
                 )
+        self._check_device()
         for point in self.points:
             self._check_point(point)
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
@@ -144,6 +151,19 @@ class Spec:
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "
                     f"(engines {' and '.join(able)} have); leave it out"
                 )
+
+    def _check_device(self) -> None:
+        if self.device_profile is None:
+            if self.device_model is not None:
+                shown = printable(self.device_model)
+                raise UserError(f"--device-model {shown} is a device's row; give --device-profile as well")
+            return
+        if self.latency is not None:
+            raise UserError(
+                f"--device-profile {printable(self.device_profile.name)} says how long answers take, as "
+                f"--latency {printable(self.latency)} does; give one of the two"
+            )
+        rows_of(self.device_profile, self.device_model, self.agents)
 
     def _check_sampling(self) -> None:
         shown = f"--temperature {self.temperature:g}"
@@ -271,6 +291,8 @@ class Spec:
             "temperature": self.temperature,
             "sampling_seed": self.sampling_seed,
             "latency_source": self.latency,
+            "device_profile": msgspec.to_builtins(self.device_profile),
+            "device_model": self.device_model,
         }
 
     def command(self, out: Path) -> str:
@@ -284,7 +306,9 @@ class Spec:
             ("--image", None if self.ego.image == "own" else self.ego.image),
             ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
-            ("--latency", self.latency), *(("--tag", tag) for tag in self.tags), ("--out", out),
+            ("--latency", self.latency),
+            ("--device-profile", self.device_profile and self.device_profile.name),
+            ("--device-model", self.device_model), *(("--tag", tag) for tag in self.tags), ("--out", out),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []

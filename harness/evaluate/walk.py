@@ -251,6 +251,13 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step], trips)
 
 
+@lru_cache(maxsize=64)
+def busy_ratio(point: OperatingPoint) -> float:
+    """Channel busy ratio under the background load; NaN where the channel does not know."""
+    channel = point.channel()
+    return channel.busy_ratio() if isinstance(channel, Physical) else float("nan")
+
+
 def columns(decided: Decided[Any]) -> dict[str, Any]:
     """Numbers of decisions (n,) by name, NaN where unknown."""
     c, point = decided.result, decided.point
@@ -258,6 +265,7 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
     return {
         "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
         "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
+        "busy_ratio": np.full(c.messages.shape, busy_ratio(point)),
         "own_failed": c.own_failed,
         "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
         "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,

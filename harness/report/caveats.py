@@ -27,7 +27,7 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Sentences for a run's headline; none for a language model whose answers could be read."""
-    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest)]
+    return [*unread(scores), *no_prompt([manifest]), *beyond_sources(manifest), *on_device(manifest)]
 
 
 def said(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
@@ -69,12 +69,27 @@ def of_run(run: Run) -> Iterator[str]:
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from beyond_sources(run.manifest)
+    yield from on_device(run.manifest)
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
     if off:
         yield (
             f"With {', '.join(off)} most decisions take longer than these frozen scenes allow for: driving "
             "may end otherwise (harness fidelity)."
         )
+
+
+def on_device(manifest: Manifest) -> Iterator[str]:
+    """Whose answers, and on what computer, the times and the joules of a run with a device profile are of."""
+    if (device := manifest.device_profile) is None:
+        return
+    agents = (manifest.agent(0), *manifest.helpers)
+    for agent, speed in zip(agents, manifest.latency.speeds, strict=True):
+        name = str(agent["model"]["name"])
+        if name.partition(":")[0] != speed.model:
+            yield (
+                f"Times and energy are conditional: {printable(name, 30)}'s answers, in its own tokens, at "
+                f"the speed of {printable(speed.model)} on {printable(device.name)}."
+            )
 
 
 def beyond_sources(manifest: Manifest) -> Iterator[str]:

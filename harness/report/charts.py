@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from harness.report import statistics
 from harness.report.drawing import colours
 from harness.report.drawing.colours import BAD, GOOD, GREY, LATE, PALE, ROLES
 from harness.report.layers import (
@@ -32,6 +33,7 @@ VERDICTS = {
     "failed": [BAD, "#E2685A", "#9C2416", "#F0988D", "#6E160B", "#F7C4BD"],
 }
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
+ENERGIES = dict(zip(statistics.ENERGIES, (ROLES["ego"], ROLES["helper"], BAD), strict=True))
 TIMES = {
     "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD, "fusion": ROLES["merge"],
     "decision": GREY,
@@ -127,6 +129,11 @@ def replies(rows: Rows) -> Spec:
     return _stacked(rows, "condition", "reply", REPLIES, "replies")
 
 
+def energies(rows: Rows) -> Spec:
+    """What a decision takes, a stacked bar a run and condition."""
+    return _stacked(rows, "condition", "part", ENERGIES, "J of a decision", amount="joules")
+
+
 def reliability(rows: Rows) -> Spec:
     """How often the action taken was safe over how probable it was held; on the diagonal the two agree."""
     return _shares(rows, "certainty", "fused probability of the action taken", "share safe", diagonal=True)
@@ -199,8 +206,13 @@ def timeline() -> Spec:
     )
 
 
-def _stacked(rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str) -> Spec:
-    """A bar a run and `by`, in parts of the values of a field, in the order of their colours."""
+def _stacked(
+    rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
+) -> Spec:
+    """A bar a run and `by`, in parts of the values of a field, in the order of their colours.
+
+    Their lengths are shares, or another `amount` of the rows.
+    """
     several = len({row["run"] for row in rows}) > 1
     bars = [
         {
@@ -210,7 +222,9 @@ def _stacked(rows: Rows, by: str, field: str, colours: Mapping[str, str], what: 
         }
         for row in rows
     ]
-    x = {"field": "share", **NUMBER, "stack": "zero", "title": what, "axis": {"format": "%"}}
+    x = {"field": amount, **NUMBER, "stack": "zero", "title": what}
+    if amount == "share":
+        x |= {"axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
     return {
         **BASE,
         "height": 26 * len({bar["bar"] for bar in bars}),
@@ -218,7 +232,7 @@ def _stacked(rows: Rows, by: str, field: str, colours: Mapping[str, str], what: 
         "mark": {"type": "bar", "stroke": "white", "strokeWidth": 0.6},
         "encoding": {
             "y": {**names_axis("bar"), "axis": {"labelLimit": 260}},
-            "x": {**x, "scale": {"domain": [0, 1]}},
+            "x": x,
             "color": colour(field, colours),
             "order": {"field": "order"},
             "tooltip": tooltip(bars),

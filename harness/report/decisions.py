@@ -9,6 +9,7 @@ import numpy as np
 from harness.core.files import digest
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
+from harness.evaluate.device import answer_s
 from harness.evaluate.fusion import messages_of
 from harness.parsing.parse import spans
 from harness.parsing.status import Status
@@ -211,6 +212,8 @@ class Decisions:
                 shown["agent"] = " · ".join(
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
                 )
+            if run.manifest.latency.speeds:
+                shown["took_s"] = answer_s(run.speed(answer), answer)
             spans_read = _read_in(answer, run) if answer.repairs else []
             answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
         decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry

@@ -117,9 +117,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "names": runs.names,
         "runs": [
             {
-                "inference_s": {
-                    "ego": [latency.ego_s], "helper": latency.helpers_s or [latency.helper_s],
-                },
+                "inference_s": {"ego": [latency.ego_s], "helper": latency.helper_times_s()},
                 "merge_s": latency.fusion_s,
                 "points": {
                     c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages")}

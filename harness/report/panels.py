@@ -100,6 +100,14 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "window. Lost: request or reply did not cross.",
             charts.replies(rows),
         )  # fmt: skip
+    if rows := joined(statistics.energies):
+        yield Panel(
+            "energy", "communication", "What a decision takes",
+            "Joules of inference on the declared device and of sending, mean over decisions; the total's "
+            "interval is over episodes. A helper's inference counts where it was asked. Where the radios' "
+            "part cannot be seen, asking costs energy because helpers think, not because they transmit.",
+            charts.energies(rows),
+        )  # fmt: skip
     if rows := joined(statistics.arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",

@@ -18,6 +18,7 @@ from harness.runs.metrics import LATENCY, SUCCESS
 Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
 CERTAINTY = 0.1
+ENERGIES = ("ego's inference", "helpers' inference", "radios")
 
 
 def success(run: Run) -> Table:
@@ -114,6 +115,22 @@ def replies(run: Run) -> Table:
             {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}
             for reply, n in count.items() if n
         ]  # fmt: skip
+    return rows
+
+
+def energies(run: Run) -> Table:
+    """What a decision takes in joules, by who takes it, with the total's interval; where all is known."""
+    rows = []
+    for condition in run.conditions:
+        total, helpers, radio = (run.score(condition, n) for n in ("energy_j", "helpers_j", "radio_mj"))
+        if total and helpers and radio:
+            sent, thought = (radio.value or 0.0) / 1000, helpers.value or 0.0
+            joules = ((total.value or 0.0) - thought - sent, thought, sent)
+            rows += [
+                {"condition": condition, "part": part, "joules": of_part, "total_j": total.value,
+                 "low": total.low, "high": total.high, "n": total.n, "interval": total.interval}
+                for part, of_part in zip(ENERGIES, joules, strict=True)
+            ]  # fmt: skip
     return rows
 
 

@@ -1,6 +1,6 @@
 """Numbers and findings in the words of the report."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -119,11 +119,32 @@ def latency_source(latency: Latency) -> str:
         "card": "stated by the model card, not measured here",
         "paper": "the paper's, not measured here",
         "declared": "declared by who ran it, not measured here",
+        "device": "each answer's own, by its tokens, on a declared device",
     }[latency.source]
-    of_helpers = latency.helpers_s or (latency.helper_s,)
-    by_role = {"ego": (latency.ego_s,), "helper": of_helpers, "ego with messages": (latency.fusion_s,)}
+    if latency.ego_s is None or latency.fusion_s is None:
+        return f"{source} ({latency.basis})"
+    by_role = {
+        "ego": (latency.ego_s,), "helper": latency.helper_times_s(), "ego with messages": (latency.fusion_s,),
+    }  # fmt: skip
     times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
     return f"{times}; {source} ({latency.basis})"
+
+
+def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[str]:
+    """What a decision takes in each condition, as lines; none without a device profile.
+
+    Args:
+        m: the run's manifest.
+        score: a metric's figure in a condition.
+    """
+    for name in [str(condition["name"]) for condition in m.conditions]:
+        total, helpers, radio = (score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj"))
+        if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
+            joules = with_interval(total.value, total.low, total.high)
+            yield (
+                f"{printable(name)}: {joules} J a decision; helpers think for {helpers.value:.1f} J, "
+                f"radios send for {radio.value:.3g} mJ"
+            )
 
 
 def answer_times(times: Mapping[str, Times]) -> str:

@@ -24,12 +24,15 @@ LABEL, WHOLE, FLAG, NUMBER = pa.dictionary(pa.int32(), pa.string()), pa.int64(),
 COLUMNS = {
     "scene": LABEL, "episode": WHOLE, "step": WHOLE, "danger": LABEL, "condition": LABEL, "seed": WHOLE,
     "action": LABEL, "messages": WHOLE, "requests": WHOLE, "request_bits": NUMBER, "reply_bits": NUMBER,
-    "airtime_ms": NUMBER, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
+    "airtime_ms": NUMBER, "busy_ratio": NUMBER, "inference_j": NUMBER, "helpers_j": NUMBER,
+    "radio_mj": NUMBER, "waiting_j": NUMBER, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
     "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
     "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
     "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
     "acted": FLAG,
 }  # fmt: skip
+# A file of decisions that know nothing of these lacks them.
+OPTIONAL = ("busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j")
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # A column an action: the policy, and the outcome of each action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
@@ -40,7 +43,8 @@ OF_MESSAGES = {
 }  # fmt: skip
 DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
     "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
-    "airtime_ms": 6, "arrival_ms": 3, "weight": 6, "trust": 6,
+    "airtime_ms": 6, "busy_ratio": 6, "inference_j": 6, "helpers_j": 6, "radio_mj": 6, "waiting_j": 6,
+    "arrival_ms": 3, "weight": 6, "trust": 6,
 }  # fmt: skip
 
 ROWS = 2048  # that become mappings at a time
@@ -217,18 +221,23 @@ class Decisions:
 
     def write(self, path: Path) -> None:
         """Replace a Parquet file. Equal rows give equal bytes: names are numbered as rows first have them."""
+        unknown = [name for name in OPTIONAL if self.table[name].null_count == len(self)]
+        table = self.table.drop_columns(unknown).combine_chunks()
         columns = [
             column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
-            for column in self.table.combine_chunks().columns
+            for column in table.columns
         ]
         with replacing(path) as part:
-            pq.write_table(pa.table(columns, schema=self.table.schema), part, compression="zstd")
+            pq.write_table(pa.table(columns, schema=table.schema), part, compression="zstd")
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
         """Read a Parquet file. Raises OSError or ValueError if it is none, or has not a run's columns."""
         with path.open("rb") as file:  # not read_table, which takes names of folders for columns
             table = pq.ParquetFile(file).read()
+        for name in OPTIONAL:
+            if name not in table.column_names:
+                table = table.append_column(name, pa.nulls(len(table), NUMBER))
         helpers = sum(name.startswith("helper_") for name in table.column_names)
         wanted = schema(actions, helpers)
         if missing := [name for name in wanted.names if name not in table.column_names]:

@@ -30,7 +30,7 @@ from harness.runs import attribution
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid, World
-from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Manifest, Score, Variant
+from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Manifest, Score, Speed, Variant
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -125,11 +125,19 @@ class Run:
 
     def agent(self, answer: Answer) -> dict[str, Any]:
         """Who gave an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
+        return self.manifest.agent(self._viewer_place(answer))
+
+    def speed(self, answer: Answer) -> Speed:
+        """How fast an answer came on the run's device; the run has a device profile."""
+        return self.manifest.latency.speed(self._viewer_place(answer))
+
+    def _viewer_place(self, answer: Answer) -> int:
+        """Of a viewer in its scene, the ego at 0; where all have one agent it is 0."""
         if answer.role in ("ego", "merge") or not self.manifest.helpers:
-            return self.manifest.agent(0)
+            return 0
         # A scene's viewers answer in the order in which the agents take them, the ego first.
         first = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
-        return self.manifest.agent(first.index(answer.viewer))
+        return first.index(answer.viewer)
 
     @cached_property
     def attribution(self) -> Attribution | None:

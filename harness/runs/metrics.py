@@ -47,6 +47,7 @@ class Metric:
         episodes: an episode's value; None for a metric of decisions.
         total: an episode has the sum over its decisions, not the mean.
         world: where it is known; None for everywhere.
+        optional: a run that knows it nowhere has no row of it.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Metric:
     episodes: Callable[[Episode], Any] | None = None
     total: bool = False
     world: World | None = None
+    optional: bool = False
 
 
 def _ends(name: str, meaning: str, of: Callable[[Episode], bool]) -> Metric:
@@ -114,6 +116,16 @@ METRICS = {
                lambda d: d["request_bits"] + d["reply_bits"], total=True),
         Metric("airtime_ms", "how long an episode's requests and scheduled replies occupy the medium in all",
                _column("airtime_ms"), total=True),
+        Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
+               _column("busy_ratio"), optional=True),
+        Metric("energy_j", "of a decision: inference of the ego, of the helpers asked and of a fusion call, "
+               "and what their radios draw; known with a device profile",
+               lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
+        Metric("helpers_j", "part of it that the helpers' inference takes", _column("helpers_j"),
+               optional=True),
+        Metric("radio_mj", "part of it that the radios draw", _column("radio_mj"), optional=True),
+        Metric("waiting_j", "what the ego's computer draws besides, while it waits for messages",
+               _column("waiting_j"), optional=True),
         Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
                "included", _column("latency_ms")),
         Metric("deadline_miss_rate", "decisions that took longer than the decision window",
@@ -269,7 +281,7 @@ def is_rate(name: str) -> bool:
 
 def in_range(name: str, e: Estimate) -> Estimate:
     """No metric here is below 0 and no share above 1; Student's t may go beyond."""
-    most = 1.0 if name.endswith(("_rate", "_loss", "_mass")) else np.inf
+    most = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass")) else np.inf
     low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, most))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 
@@ -284,11 +296,11 @@ def unit(name: str) -> tuple[float, str, int]:
     """How a metric is shown: factor, unit, decimals."""
     if "_gain_" in name:
         return 100.0, " points", 1
-    if "_rate" in name or name.endswith("_loss"):
+    if "_rate" in name or name.endswith(("_ratio", "_loss")):
         return 100.0, " %", 1
     endings: Mapping[str, tuple[str, int]] = {
-        "_ms": (" ms", 1), "_nats": (" nats", 3), "_s": (" s", 2), "_m": (" m", 1),
-        "bits_per_episode": (" bit", 0), "_per_episode": ("", 2),
+        "_ms": (" ms", 1), "_mj": (" mJ", 3), "_j": (" J", 2), "_nats": (" nats", 3), "_s": (" s", 2),
+        "_m": (" m", 1), "bits_per_episode": (" bit", 0), "_per_episode": ("", 2),
     }  # fmt: skip
     for ending, (suffix, digits) in endings.items():
         if name.endswith(ending):
@@ -298,7 +310,7 @@ def unit(name: str) -> tuple[float, str, int]:
 
 def label(name: str) -> str:
     """A metric's name in words; its unit is shown with the value."""
-    for suffix in ("_ms", "_nats", "_s", "_m"):
+    for suffix in ("_ms", "_mj", "_j", "_nats", "_s", "_m"):
         name = name.removesuffix(suffix)
     return name.replace("_", " ")
 

@@ -1,10 +1,10 @@
 """The records of a run, typed: they own the names of what its files hold. docs/files.md has their meaning."""
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from msgspec import UNSET, Struct, UnsetType, field
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from harness.core.config import Seconds
+from harness.core.config import Count, Seconds
 from harness.core.statistics import Estimate
 
 Role = Literal["ego", "helper", "merge", "blind"]
@@ -133,26 +133,61 @@ class Times(Struct, frozen=True, omit_defaults=True):
     token: "Times | None" = None
 
 
+class Speed(Struct, frozen=True):
+    """How fast a computer answers with a model, alone, and what a token costs; None where it is not known.
+
+    Attributes:
+        model: whose row of the device profile this is.
+        prefill_tokens_per_s: tokens of a prompt that are read in a second.
+        decode_tokens_per_s: tokens that are written in a second.
+        joules_per_prompt_token: what reading one takes.
+        joules_per_output_token: what writing one takes.
+    """
+
+    model: str
+    prefill_tokens_per_s: float | None
+    decode_tokens_per_s: float | None
+    joules_per_prompt_token: float | None = None
+    joules_per_output_token: float | None = None
+
+
 class Latency(Struct, frozen=True, omit_defaults=True):
     """How long inference takes, fixed before a run: it decides who is heard in time.
 
     Attributes:
-        source: `card`, `paper`, `declared` (by the user) or `measured`.
+        source: `card`, `paper`, `declared` (by the user), `measured`, or `device`, where each answer takes
+            what its own tokens take on a declared computer.
         basis: where the numbers come from.
-        ego_s: seconds of one inference of the ego.
+        ego_s: seconds of one inference of the ego; None where the source is `device`, as are the next two.
         helper_s: of a helper; with several helper models the first one's.
         fusion_s: of the ego's fusion call.
-        helpers_s: of each of several helper models; empty where there is one.
         sample: the answers behind a measured time, by role.
+        helpers_s: of each of several helper models; empty where there is one.
+        speeds: of each agent, the ego's first, where the source is `device`.
     """
 
-    source: Literal["card", "paper", "declared", "measured"]
+    source: Literal["card", "paper", "declared", "measured", "device"]
     basis: str
-    ego_s: Seconds
-    helper_s: Seconds
-    fusion_s: Seconds
+    ego_s: Seconds | None = None
+    helper_s: Seconds | None = None
+    fusion_s: Seconds | None = None
     sample: dict[str, Times] = {}
     helpers_s: tuple[Seconds, ...] = ()
+    speeds: tuple[Speed, ...] = ()
+
+    def __post_init__(self) -> None:
+        known = None not in (self.ego_s, self.helper_s, self.fusion_s)
+        if known == (self.source == "device") or bool(self.speeds) != (self.source == "device"):
+            raise ValueError("latency has speeds where its source is device, and else seconds")
+
+    def helper_times_s(self) -> tuple[Seconds, ...]:
+        """Seconds of each helper model, who take turns; none where the source is `device`."""
+        return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
+
+    def speed(self, place: int) -> Speed:
+        """Of a scene's viewer at this place, the ego at 0; helpers' agents take turns."""
+        ego, *helpers = self.speeds
+        return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
@@ -384,6 +419,73 @@ class ChannelRecord(Struct, frozen=True, kw_only=True):
     limits: dict[str, tuple[float, float]] = {}
 
 
+Status = Literal["measured", "cited", "modelled", "assumed"]
+
+
+class Constant(Struct, frozen=True):
+    """A number of a device profile, above 0: what it is, and where it comes from."""
+
+    value: Annotated[float, Meta(gt=0, description="a number above 0")]
+    status: Status
+    source: Annotated[str, Meta(min_length=1, description="where the number comes from")]
+
+
+class DeviceRow(Struct, frozen=True, kw_only=True):
+    """What a device does with one model; None where nobody says.
+
+    Attributes:
+        model: its name: that of a card, where there is one.
+        billions: of weights.
+        precision: number format of the weights.
+        batch_size: requests that went through it together when it was timed.
+        prefill_tokens_per_s: tokens of a prompt that are read in a second.
+        decode_tokens_per_s: tokens that are written in a second, of one request.
+        joules_per_prompt_token: what reading one takes, the device's idling included.
+        joules_per_output_token: what writing one takes, the device's idling included.
+    """
+
+    model: str
+    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]
+    precision: str
+    batch_size: Count
+    prefill_tokens_per_s: Constant | None = None
+    decode_tokens_per_s: Constant | None = None
+    joules_per_prompt_token: Constant | None = None
+    joules_per_output_token: Constant | None = None
+
+
+class Device(Struct, frozen=True, kw_only=True):
+    """A file of `devices/`: a computer that vehicles may have.
+
+    Attributes:
+        name: of the file.
+        description: one sentence for lists.
+        power_mode: in which it was timed.
+        rows: a model each.
+        scaling: how a model without a row is timed: `weights`, rates inversely proportional to the number of
+            weights, from the nearest row. None refuses it.
+        load_watts: what it draws while it infers; joules a token that a row does not have follow from it.
+        idle_watts: what it draws while it waits.
+        transmit_dbm: radiated power of its radio, where the channel states none.
+        amplifier_efficiency: share of what the radio's amplifier draws that is radiated.
+    """
+
+    name: str
+    description: str
+    power_mode: str
+    rows: tuple[DeviceRow, ...]
+    scaling: Literal["weights"] | None = None
+    load_watts: Constant | None = None
+    idle_watts: Constant | None = None
+    transmit_dbm: Constant | None = None
+    amplifier_efficiency: Constant | None = None
+
+    def __post_init__(self) -> None:
+        names = [row.model for row in self.rows]
+        if not names or len(set(names)) < len(names):
+            raise ValueError("rows: give one or more, of different models")
+
+
 class Manifest(Struct, frozen=True, kw_only=True):
     """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
 
@@ -408,6 +510,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
     temperature: float = 0.0
     sampling_seed: int = 0
     latency_source: str | None
+    device_profile: Device | None = None
+    device_model: str | None = None
     latency: Latency
     answer_times: dict[str, Times] = field(default_factory=dict)
     identity: dict[str, Any]

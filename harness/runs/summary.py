@@ -19,6 +19,7 @@ from harness.runs.metrics import (
     ALL,
     GAIN,
     LATENCY,
+    METRICS,
     PERCENTILES,
     SUCCESS,
     Grid,
@@ -43,6 +44,7 @@ def scores(
 ) -> list[Score]:
     """Every metric of a run; `episodes` by place."""
     values = by_episode(metrics_of(world), grid, decisions, episodes)
+    values = {name: v for name, v in values.items() if not (METRICS[name].optional and np.isnan(v).all())}
     latency_ms, places = decisions["latency_ms"], grid.places(decisions) // len(grid.episodes)
     return [
         *of_conditions(grid.conditions, values),

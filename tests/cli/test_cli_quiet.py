@@ -62,6 +62,6 @@ def completed(line: str) -> list[str]:
 
 
 def test_a_shell_completes_commands_and_options() -> None:
-    assert sorted(completed("harness d")) == ["dataset", "distill", "doctor", "drive"]
+    assert sorted(completed("harness d")) == ["dataset", "device", "distill", "doctor", "drive"]
     assert completed("harness eval --qu") == ["--quiet"]
     assert completed("harness campaign cl") == ["closed-loop"]

@@ -26,6 +26,7 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 
 Said = tuple[int, str, str]
 SOME = {"time_to_clear_s", "regret_rate", "delay_s"}  # which not every episode has
+OPTIONAL = {name for name, metric in METRICS.items() if metric.optional}
 LIVE = {name for name, metric in METRICS.items() if metric.world == "closed-loop"}
 
 
@@ -45,7 +46,8 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
     assert c.answers_in_both == {"ego": scenes, "helper": 3 * scenes}
     for of in c.conditions:
         silent = {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
-        assert {d.metric for d in of.differences} == set(NAMES) - LIVE - {"merge_failed_rate"} - silent
+        always = set(NAMES) - LIVE - OPTIONAL - {"merge_failed_rate"}
+        assert {d.metric for d in of.differences} == always - silent
         for d in of.differences:
             assert d.change.value == 0
             if d.metric.endswith(("_rate", "_reply_loss")):
@@ -293,7 +295,7 @@ def test_live_runs_are_compared_with_live_runs(
     told = differences(c, "6g")
     unheard = {"effective_loss", "observed_reply_loss", "merge_failed_rate"}
     frozen = {name for name, metric in METRICS.items() if metric.world == "frozen"}
-    assert set(NAMES) - set(told) == frozen | unheard
+    assert set(NAMES) - set(told) == frozen | unheard | OPTIONAL
     for name, d in told.items():
         if not d.change.n_excluded:  # a summary leaves nothing out for another run's sake
             assert d.b == pytest.approx(float(own[name]), abs=1e-3)

@@ -134,9 +134,12 @@ def _outline(name: str) -> Outline:
 
 
 def _messages(played: Played, still: Still) -> Iterator[Artist]:
-    """Each reply on its way from its helper to the ego; one that was lost goes half of it."""
+    """Each reply on its way from its helper to the ego; one that was lost goes half of it.
+
+    Where each answer has a time of its own, a reply is drawn from the decision's start.
+    """
     latency = played.manifest.latency
-    sent_s = max(latency.ego_s, latency.helper_s, *latency.helpers_s)
+    sent_s = max(latency.ego_s or 0.0, *latency.helper_times_s(), 0.0)
     ego = still.state.ego
     there = {v.id for v in still.state.vehicles}
     for message in still.decision.messages if still.open else ():

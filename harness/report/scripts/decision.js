@@ -64,13 +64,13 @@ function policyRows(told, chosen, actions, run) {
   return rows;
 }
 
-// Inference as the run took it: one time for all, one a role, or one each helper model, which take turns.
+// Inference as the run took it: each answer's own time, one a role, or one each helper model, which take turns.
 function timelineRows(told, chosen, run) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
   let turn = 0;
   for (const a of first(told.answers, point)) {
     const times = run.inference_s[a.role === "ego" ? "ego" : "helper"];
-    const ready = 1000 * times[a.role === "ego" ? 0 : turn++ % times.length];
+    const ready = 1000 * (a.took_s ?? times[a.role === "ego" ? 0 : turn++ % times.length]);
     const m = chosen.messages.find((m) => m.from === sender(a)), name = who(a);
     if (a.role !== "ego" && !m) continue;
     if (ready) rows.push({ who: name, what: "inference", from: 0, to: ready });
@@ -80,8 +80,10 @@ function timelineRows(told, chosen, run) {
     rows.push({ who: name, what, from: Math.min(ready, to), to });
   }
   // ego-prompt infers once more when the exchange is over; a rule takes no time.
-  const again = point.consensus === "ego-prompt" && chosen.messages.some((m) => m.on_time);
-  const fusion = again ? 1000 * run.merge_s : 0;
+  const heard = chosen.messages.filter((m) => m.on_time).map((m) => m.from + (point.messages === "blind" ? "~blind" : ""));
+  const again = point.consensus === "ego-prompt" && heard.length;
+  const call = told.answers.find((a) => a.role === "merge" && a.viewer.split("+").slice(1).join() === heard.join());
+  const fusion = again ? 1000 * (call?.took_s ?? run.merge_s) : 0;
   if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: latency_ms - fusion, to: latency_ms });
   if (latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: latency_ms });
   return rows;

@@ -1,0 +1,209 @@
+"""`harness device`: the computers that a vehicle can have, what each rests on, and what fits the window."""
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import echo_json, table
+from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.core.statistics import Estimate
+    from harness.runs.records import Constant, Device, DeviceRow
+
+app = typer.Typer(
+    help="List computers, show what fits the window on one, or check one.", no_args_is_help=True
+)
+
+MOST_TOKENS = 1_000_000
+MOST_MS = 60_000
+Name = typer.Argument(help="Device profile.", metavar="NAME")
+Model = typer.Option(None, "--device-model", help="One of its rows, or a size such as 3b. Default: all rows.")
+
+
+@app.command("list")
+def list_devices(as_json: options.Json = False) -> None:
+    """List the device profiles. Each is a value of --device-profile."""
+    from harness.backends import devices
+
+    every = [devices.load(name) for name in devices.names()]
+    if as_json:
+        echo_json([msgspec.to_builtins(device) for device in every])
+        return
+    for device in every:
+        typer.echo(f"{printable(device.name)} · {', '.join(printable(row.model) for row in device.rows)}")
+        typer.echo(f"  {printable(device.description, 78)}")
+
+
+@app.command()
+def show(
+    name: str = Name,
+    model: str | None = Model,
+    run: Path | None = typer.Option(None, help="Folder of a run, whose ego's tokens are taken."),
+    prompt_tokens: int = typer.Option(300, help="Tokens of a prompt, without --run."),
+    answer_tokens: int = typer.Option(40, help="Tokens of an answer that is written, without --run."),
+    window_ms: float = typer.Option(200.0, help="Decision window, ms."),
+    as_json: options.Json = False,
+) -> None:
+    """Show which answers fit the decision window on a device, and what they take.
+
+    From seeing to having the ego's own answer, without a radio; the ego is alone on its computer.
+    """
+    from harness.backends import devices
+    from harness.runs.folder import read
+    from harness.studies.device_fit import declared, fits, of_run
+
+    options.in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
+    options.in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
+    if not 0 < window_ms <= MOST_MS:
+        raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
+    device = devices.load(name)
+    rows = _rows(device, model)
+    told = of_run(read(run)) if run else declared(prompt_tokens, answer_tokens)
+    found = fits(device, rows, told, window_ms / 1000)
+    if as_json:
+        echo_json({
+            "device": msgspec.to_builtins(device), "window_ms": window_ms, "run": run and str(run),
+            "fits": [
+                {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
+                 "output_tokens": fit.output_tokens, "ms": _number(1000 * fit.seconds),
+                 "in_time": _mapping(fit.in_time), "joules": _mapping(fit.joules)}
+                for fit in found
+            ],
+        })  # fmt: skip
+        return
+    typer.echo(f"{printable(device.name)} · {printable(device.description)}")
+    typer.echo()
+    fitting = "in time %" if run else f"in {window_ms:g} ms"
+    table(
+        ["model", "answer", "in + out", "ms", fitting, "J"],
+        [
+            (
+                printable(fit.row.model),
+                fit.answer,
+                f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
+                _shown(1000 * fit.seconds, 0 if fit.seconds >= 0.1 else 1),
+                _share(fit.in_time) if run else _yes(fit.in_time.value),
+                _interval(fit.joules) if run else _shown(fit.joules.value, 2),
+            )
+            for fit in found
+        ],
+    )
+    typer.echo()
+    if run:
+        _say(
+            f"{printable(run)}: n = {len(told.prompt)} answers of {printable(told.who)} for the ego; "
+            "tokens and ms are medians, in time and J means with 95 % intervals over episodes; in time: "
+            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are those of its "
+            "own tokenizer"
+        )
+    _origins(device, rows)
+
+
+@app.command()
+def check(
+    name: str = Name,
+    run: Path = typer.Argument(help="Folder of a run with --batch-size 1 --no-cache.", metavar="RUN"),
+    model: str | None = typer.Option(None, "--device-model", help="Row to hold. Default: the run's model."),
+    as_json: options.Json = False,
+) -> None:
+    """Hold a device profile against what the answers of a run took.
+
+    The run's machine is the device's, or the figures say how far the two are apart.
+    """
+    from harness.backends import devices
+    from harness.core.figures import as_mapping, shown
+    from harness.runs.folder import read
+    from harness.studies.device_fit import held
+
+    device, done = devices.load(name), read(run)
+    row = devices.row_of(device, model or str(done.manifest.model["name"]).partition(":")[0])
+    found = held(device, row, done)
+    if as_json:
+        echo_json([
+            {"role": each.role, "what": each.what, "measured": as_mapping(each.measured),
+             "stated": _number(each.stated)}
+            for each in found
+        ])  # fmt: skip
+        return
+    scales = {"seconds": ("answer, ms", 1000.0), "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
+              "decode_tokens_per_s": ("decoding, tokens/s", 1.0)}  # fmt: skip
+    table(
+        ["role", "what", "measured", f"{printable(device.name)} says", "n"],
+        [
+            (
+                each.role,
+                scales[each.what][0],
+                shown(each.measured, scales[each.what][1]),
+                _shown(each.stated * scales[each.what][1], 1),
+                str(each.measured.n),
+            )
+            for each in found
+        ],
+    )
+    _say(f"medians of answers asked alone, with 95 % intervals over episodes; {printable(row.model)}'s row")
+    _origins(device, [row])
+
+
+def _rows(device: "Device", model: str | None) -> "list[DeviceRow]":
+    from harness.backends.devices import row_of
+
+    return [row_of(device, model)] if model else list(device.rows)
+
+
+def _origins(device: "Device", rows: "list[DeviceRow]") -> None:
+    """What the numbers rest on, each source once."""
+    from harness.backends.devices import JOULES, RATES, constants
+
+    for names, head in ((RATES, "rates"), (tuple(JOULES), "J")):
+        said = {
+            f"{c.status} ({_source(device, c)})": None
+            for row in rows for name, c in constants(device, row) if name in names and c
+        }  # fmt: skip
+        _say(f"{head}: {'; '.join(said) or 'unknown, since nobody states them'}")
+    _say(f"power mode: {device.power_mode}")
+
+
+def _source(device: "Device", constant: "Constant") -> str:
+    watts = device.load_watts
+    if watts and constant.source.endswith(watts.source):  # the rate is in the table
+        return f"{watts.value:g} W over the rate: {watts.source}"
+    return constant.source
+
+
+def _say(text: str) -> None:
+    typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  "))
+
+
+def _number(value: float) -> float | None:
+    return None if value != value else value
+
+
+def _mapping(estimate: "Estimate") -> dict[str, float | int | None]:
+    from harness.core.figures import as_mapping
+
+    return as_mapping(estimate)
+
+
+def _shown(value: float, digits: int) -> str:
+    return "unknown" if value != value else f"{value:.{digits}f}"
+
+
+def _yes(share: float) -> str:
+    return "unknown" if share != share else "yes" if share else "no"
+
+
+def _share(estimate: "Estimate") -> str:
+    from harness.core.figures import shown
+
+    return "unknown" if estimate.value != estimate.value else shown(estimate)
+
+
+def _interval(estimate: "Estimate") -> str:
+    from harness.core.figures import shown
+
+    return "unknown" if estimate.value != estimate.value else shown(estimate, 1.0, 2)

@@ -1,0 +1,147 @@
+"""What fits the decision window on a declared computer, and how near its rates are to a run's own times."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.backends import devices
+from harness.core.arrays import Floats, Ints
+from harness.core.errors import UserError, printable
+from harness.core.statistics import Estimate, episode_interval, rate_interval
+from harness.evaluate.device import tokens
+from harness.runs import percentiles
+from harness.runs.folder import Run
+from harness.runs.records import Answer, Device, DeviceRow
+
+READOUT, WRITTEN = "readout", "written"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One answer of a model on a device, asked alone; NaN where a number of it is not known.
+
+    Attributes:
+        row: the model's.
+        answer: `readout`, which is one token, or how it is written.
+        prompt_tokens: read; of a run, the median.
+        output_tokens: written; of a run, the median.
+        seconds: that it takes; of a run, the median.
+        in_time: share of answers that are there within the window; of declared tokens 0 or 1, of one answer.
+        joules: that it takes; of a run, the mean.
+    """
+
+    row: DeviceRow
+    answer: str
+    prompt_tokens: float
+    output_tokens: float
+    seconds: float
+    in_time: Estimate
+    joules: Estimate
+
+
+def fits(device: Device, rows: Sequence[DeviceRow], told: "Told", window_s: float) -> list[Fit]:
+    """Each row with each kind of answer, within so many seconds from seeing to having the ego's answer."""
+    return [_fit(device, row, kind, told, window_s) for row in rows for kind in told.output]
+
+
+@dataclass(frozen=True)
+class Told:
+    """Answers of which a fit is asked.
+
+    Attributes:
+        prompt: tokens read, (n,).
+        output: tokens written by kind of answer, each (n,).
+        episodes: the episode of each, (n,); None for one declared answer.
+        who: the model that wrote them.
+    """
+
+    prompt: Floats
+    output: dict[str, Floats]
+    episodes: Ints | None = None
+    who: str = ""
+
+
+def declared(prompt_tokens: int, answer_tokens: int) -> Told:
+    """One answer of so many tokens, read out or written."""
+    one = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
+    return Told(np.array([float(prompt_tokens)]), one)
+
+
+def of_run(run: Run) -> Told:
+    """The ego's answers of a run, as they were given, and as if one letter of each prompt were read out.
+
+    Raises:
+        UserError: nobody counted their tokens.
+    """
+    egos = [answer for answer in run.answers if answer.role == "ego" and answer.error is None]
+    counts = np.array([tokens(answer) for answer in egos], dtype=float).reshape(-1, 2)
+    if not len(counts):
+        raise UserError(f"{printable(run.path)} has no answer of its ego; give another run")
+    mode, ones = run.manifest.answer, np.ones(len(counts))
+    _, place = np.unique([answer.scene.partition("-")[0] for answer in egos], return_inverse=True)
+    return Told(counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"])
+
+
+def _fit(device: Device, row: DeviceRow, kind: str, told: Told, window_s: float) -> Fit:
+    speed, output = devices.speed(device, row), told.output[kind]
+    pairs = list(zip(told.prompt.tolist(), output.tolist(), strict=True))
+    seconds, joules = (
+        np.array([of(speed, *pair) for pair in pairs]) for of in (devices.seconds, devices.joules)
+    )
+    hits = np.where(np.isnan(seconds), np.nan, (seconds <= window_s).astype(float))
+    if told.episodes is None:
+        once = [Estimate(float(each[0]), np.nan, np.nan, 1, 0) for each in (hits, joules)]
+    else:
+        once = [rate_interval(hits, told.episodes), episode_interval(joules, told.episodes)]
+    read, written, took = (float(np.median(each)) for each in (told.prompt, output, seconds))
+    return Fit(row, kind, read, written, took, *once)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A figure of a run's answers that were asked alone, beside what a device profile says of it.
+
+    Attributes:
+        what: `seconds` of an answer, or a rate by its name in a profile.
+        role: whose answers.
+        measured: median with its 95 % interval over episodes; n is how many answers.
+        stated: what the profile says: of seconds the median over the same answers.
+    """
+
+    what: str
+    role: str
+    measured: Estimate
+    stated: float
+
+
+def held(device: Device, row: DeviceRow, run: Run) -> list[Held]:
+    """A profile beside a run's own times. Raises UserError if no answer of the run was asked alone."""
+    alone = [a for a in run.answers if a.seconds is not None and a.error is None and not a.retries]
+    alone = [a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens]
+    found = [each for role in dict.fromkeys(a.role for a in alone)
+             for each in _held(device, row, [a for a in alone if a.role == role])]  # fmt: skip
+    if not found:
+        raise UserError(
+            f"{printable(run.path)} has no answer that was asked alone and timed; run it with --batch-size 1 "
+            "--no-cache"
+        )
+    return found
+
+
+def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Held]:
+    speed, role = devices.speed(device, row), alone[0].role
+    stated = [devices.seconds(speed, *tokens(answer)) for answer in alone]
+    yield Held("seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated)))
+    read = [(a.prompt_tokens / a.first_token_s, a) for a in alone if a.first_token_s and a.prompt_tokens]
+    written = [(1 / a.token_s, a) for a in alone if a.token_s]
+    for name, pairs in zip(devices.RATES, (read, written), strict=True):
+        if pairs:
+            value = getattr(speed, name)
+            yield Held(name, role, _median(pairs), np.nan if value is None else value)
+
+
+def _median(pairs: Sequence[tuple[float | None, Answer]]) -> Estimate:
+    values = np.array([value for value, _ in pairs], dtype=float)
+    low, high = percentiles.intervals(values, [a.scene.partition("-")[0] for _, a in pairs])[50]
+    return Estimate(float(np.median(values)), low, high, len(values), 0)

@@ -1,0 +1,151 @@
+"""`harness device`: what fits the window by declared or a run's tokens; a profile beside a run's times."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluating import run, spec_of
+from msgspec.structs import replace
+
+from harness.backends import devices
+from harness.coordination.operating_point import POINTS
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.runs import folder
+from harness.studies.device_fit import declared, fits, held, of_run
+
+Said = tuple[int, str, str]
+
+
+@pytest.fixture(scope="module")
+def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the model that ships, each answer asked alone."""
+    out = tmp_path_factory.mktemp("runs") / "alone"
+    run(spec_of(small, "swarm-tiny", points=(POINTS["single-local"],), seeds=(0,), batch_size=1), out)
+    return out
+
+
+def test_written_json_does_not_fit_200_ms_on_an_orin_and_a_read_out_does(
+    harness: Callable[..., Said],
+) -> None:
+    """300 / 2687.9 + 40 / 50.7 s; joules at 60 W, which is an upper bound."""
+    code, out, _ = harness("device", "show", "agx-orin", "--device-model", "qwen3-4b", "--json")
+    readout, written = json.loads(out)["fits"]
+    assert code == 0
+    seconds = 300 / 2687.9 + np.array([1, 40]) / 50.7
+    assert [readout["ms"], written["ms"]] == pytest.approx(1000 * seconds)
+    assert [readout["joules"]["value"], written["joules"]["value"]] == pytest.approx(60 * seconds)
+    assert [readout["in_time"]["value"], written["in_time"]["value"]] == [1, 0]
+    options = ("--device-model", "qwen3-4b", "--answer-tokens", "4")
+    code, out, _ = harness("device", "show", "agx-orin", *options)
+    assert "qwen3-4b written 300 + 4 191 yes 11.43" in " ".join(out.split())
+    assert "J: modelled (60 W over the rate: the module's cap by its data sheet: an upper" in out
+
+
+def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
+    code, out, _ = harness("device", "show", "h200")
+    assert code == 0
+    assert "llama-3.1-8b  readout   300 + 1  unknown    unknown  unknown" in out
+    assert "J: unknown, since nobody states them" in out
+    _, out, _ = harness("device", "show", "h200", "--json")
+    assert json.loads(out)["fits"][0]["ms"] is None
+
+
+def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
+    told, device = folder.read(alone), devices.load("agx-orin")
+    row = devices.row_of(device, "qwen3-0.6b")
+    as_read_out, as_written = fits(device, [row], of_run(told), 0.2)
+    egos = [a for a in told.answers if a.role == "ego"]
+    took = [a.prompt_tokens / 17277.3 + a.completion_tokens / 162.5 for a in egos]
+    assert as_written.answer == "json"
+    assert as_written.seconds == pytest.approx(np.median(took))
+    assert as_written.in_time.value == np.mean(np.array(took) <= 0.2)
+    assert (as_read_out.output_tokens, as_read_out.in_time.value) == (1, 1)
+    code, out, _ = harness("device", "show", "agx-orin", "--run", alone)
+    assert code == 0
+    assert f"n = {len(egos)} answers of swarm-tiny for the ego" in " ".join(out.split())
+
+
+def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Said]) -> None:
+    told = folder.read(alone)
+    egos = [a for a in told.answers if a.role == "ego"]
+    device = devices.load("laptop-cpu")
+    found = {(each.role, each.what): each for each in held(device, device.rows[0], told)}
+    answer = found["ego", "seconds"]
+    assert answer.measured.value == pytest.approx(np.median([a.seconds for a in egos]))
+    assert answer.measured.n == len(egos)
+    assert answer.measured.low <= answer.measured.value <= answer.measured.high
+    assert answer.stated == pytest.approx(
+        np.median([a.prompt_tokens / 45000 + a.completion_tokens / 3830 for a in egos])
+    )
+    prefill = found["helper", "prefill_tokens_per_s"]
+    asked = [a for a in told.answers if a.role == "helper"]
+    assert prefill.measured.value == pytest.approx(
+        np.median([a.prompt_tokens / a.first_token_s for a in asked])
+    )
+    assert prefill.stated == 45000
+    code, out, _ = harness("device", "check", "laptop-cpu", alone)
+    assert code == 0
+    assert "laptop-cpu says" in out
+    code, out, _ = harness("device", "check", "agx-orin", alone, "--device-model", "qwen3-4b", "--json")
+    assert [each["stated"] for each in json.loads(out) if each["what"] == "decode_tokens_per_s"] == [50.7] * 2
+
+
+def test_every_profile_is_listed(harness: Callable[..., Said]) -> None:
+    code, out, _ = harness("device", "list")
+    assert code == 0
+    assert [line.split(" ·")[0] for line in out.splitlines()[::2]] == devices.names()
+    _, out, _ = harness("device", "list", "--json")
+    assert [each["name"] for each in json.loads(out)] == devices.names()
+
+
+def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path) -> None:
+    run(spec_of(small, "proxy", points=(POINTS["single-local"],)), tmp_path / "proxy")
+    told = folder.read(tmp_path / "proxy")
+    device = devices.load("laptop-cpu")
+    with pytest.raises(UserError, match="has no token counts"):
+        of_run(told)
+    with pytest.raises(UserError, match="no answer that was asked alone and timed; run it with --batch-size"):
+        held(device, device.rows[0], told)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("show", "desk"), "unknown device profile 'desk'; known: agx-orin, "),
+        (("show", "thor", "--window-ms", "0"), "--window-ms 0 is out of range; give more than 0, to 60000"),
+        (("show", "thor", "--window-ms", "nan"), "--window-ms nan is out of range; give more than 0"),
+        (("show", "thor", "--prompt-tokens", "0"), "--prompt-tokens 0 is out of range; give 1 to 1000000"),
+        (("show", "thor", "--device-model", "3b"), "unknown model of device profile thor '3b'"),
+        (
+            ("show", "agx-orin", "--device-model", "0b"),
+            "or a size such as 3b, which the nearest one is scaled",
+        ),
+        (("show", "thor", "--run", "nowhere"), "nowhere"),
+        (("check", "thor", "nowhere"), "nowhere"),
+    ],
+)
+def test_mistakes_are_one_line(options: tuple[str, ...], says: str, harness: Callable[..., Said]) -> None:
+    code, out, err = harness("device", *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert says in err
+
+
+def test_the_law_of_weights_is_off_by_less_than_a_factor_of_1_6() -> None:
+    """Between neighbouring rows of the profiles that declare it."""
+    for device in map(devices.load, devices.names()):
+        for one, other in zip(device.rows, device.rows[1:], strict=False):
+            if not device.scaling or "vl" in one.model + other.model:
+                continue
+            for left, right in ((one, other), (other, one)):
+                scaled = devices.row_of(replace(device, rows=(left,)), f"{right.billions:g}b")
+                for rate in devices.RATES:
+                    off = getattr(scaled, rate).value / getattr(right, rate).value
+                    assert 1 / 1.6 < off < 1.6
+
+
+def test_declared_tokens_are_read_out_or_written() -> None:
+    told = declared(300, 40)
+    assert {kind: n.tolist() for kind, n in told.output.items()} == {"readout": [1.0], "written": [40.0]}

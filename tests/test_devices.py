@@ -1,0 +1,355 @@
+"""Device profiles: what a token takes and costs, played by hand; who is in time follows from it alone."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from evaluating import Scripted, course, run, same_decisions, says, spec_of, sure
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.backends import devices
+from harness.backends.base import Completion, Request
+from harness.coordination.coordinate import coordinate
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import CLOUD, OperatingPoint, named_point
+from harness.core.errors import UserError
+from harness.core.files import digest
+from harness.dataset.load import Dataset
+from harness.evaluate import run as evaluation
+from harness.evaluate.device import answer_j, answer_s, transmit_watts
+from harness.radio.channel import Draws
+from harness.runs import folder
+from harness.runs.records import Constant, Device, DeviceRow, Speed
+
+
+def known(value: float) -> Constant:
+    return Constant(value, "measured", "my desk")
+
+
+DESK = Device(
+    name="desk", description="A desk.", power_mode="all", load_watts=known(50), idle_watts=known(5),
+    transmit_dbm=known(30), amplifier_efficiency=known(0.5),
+    rows=(
+        DeviceRow(
+            model="swarm-tiny", billions=0.0005, precision="F16", batch_size=1,
+            prefill_tokens_per_s=known(1000), decode_tokens_per_s=known(100),
+            joules_per_prompt_token=known(0.01), joules_per_output_token=known(1),
+        ),
+        DeviceRow(
+            model="big", billions=4, precision="F16", batch_size=1,
+            prefill_tokens_per_s=known(500), decode_tokens_per_s=known(10),
+        ),
+        DeviceRow(
+            model="half", billions=8, precision="F16", batch_size=1, decode_tokens_per_s=known(10)
+        ),
+    ),
+)  # fmt: skip
+
+
+# -- one decision by hand -------------------------------------------------------------------------------
+
+ALONE = OperatingPoint("single-local", None)
+CLEAR = OperatingPoint("clear", "v2x", loss=0.0, window_s=0.6)  # serial, 25 ms a slot, 10 Mbit/s
+AGAIN = replace(CLEAR, name="again", consensus="ego-prompt")
+
+
+class Counted(Scripted):
+    """An ego reads 100 tokens and writes 10, a helper 200 and 5, and a fusion call 300 and 10."""
+
+    def _say(self, request: Request) -> Completion:
+        said = super()._say(request)
+        counts = (300, 10) if "+" in request.id else (100, 10) if request.role == "ego" else (200, 5)
+        return said if said.error else replace(said, prompt_tokens=counts[0], completion_tokens=counts[1])
+
+
+@pytest.fixture
+def counted(small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., folder.Run]:
+    """A run of one decision point in which the ego is unsure, with the tokens of `Counted`."""
+    one = course(small, 1, {"00001-0": {}}, drives={"00001-0": "SLOWER"})
+    lines = {"00001-0/v1": says([0.3, 0.4, 0.3])}
+    lines |= {f"00001-0/v{n}": sure("SLOWER", "helper") for n in (2, 3, 4)}
+
+    def made(*points: OperatingPoint, more: dict[str, Any] | None = None, **options: Any) -> folder.Run:
+        monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Counted({**lines, **(more or {})}))
+        options = {"device_profile": DESK, "points": points, "seeds": (0,), **options}
+        out = tmp_path / digest([point.name for point in points])[:8]
+        run(spec_of(one, "swarm-tiny", **options), out)
+        return folder.read(out)
+
+    return made
+
+
+def test_seconds_and_joules_of_one_decision_by_hand(counted: Callable[..., folder.Run]) -> None:
+    told = counted(ALONE, CLEAR, AGAIN, CLOUD)
+    d = told.decisions
+    names = ("latency_ms", "messages", "reply_bits", "inference_j", "helpers_j", "radio_mj", "waiting_j")
+    of = {name: dict(zip(d.labels("condition"), d[name].tolist(), strict=True)) for name in names}
+    # The ego: 100 / 1000 + 10 / 100 s, and 100 x 0.01 + 10 x 1 J. A helper: 0.2 + 0.05 s, 2 + 5 J.
+    assert of["latency_ms"]["single-local"] == pytest.approx(200)
+    assert of["inference_j"]["single-local"] == pytest.approx(11)
+    assert of["messages"]["clear"] == 3
+    # The helpers have their answers 50 ms after the ego asks; then three slots, one after the other.
+    bits = of["reply_bits"]["clear"]
+    exchange_ms = 250 + 3 * 25 + bits / 10e6 * 1000
+    assert of["latency_ms"]["clear"] == pytest.approx(exchange_ms, abs=1e-3)
+    assert of["inference_j"]["clear"] == pytest.approx(11 + 3 * 7)
+    assert of["helpers_j"]["clear"] == pytest.approx(3 * 7)
+    # 30 dBm are 1 W, of an amplifier that radiates half of what it draws 2 W.
+    assert of["radio_mj"]["clear"] == pytest.approx(2 * (400 + bits) / 10e6 * 1000, abs=1e-6)
+    assert of["waiting_j"]["clear"] == pytest.approx(5 * (exchange_ms - 200) / 1000, abs=1e-5)
+    # A fusion call: 0.3 + 0.1 s and 3 + 10 J on top, during which the ego does not wait.
+    assert of["latency_ms"]["again"] == pytest.approx(exchange_ms + 400, abs=1e-3)
+    assert of["inference_j"]["again"] == pytest.approx(11 + 3 * 7 + 13)
+    assert of["waiting_j"]["again"] == pytest.approx(of["waiting_j"]["clear"], abs=1e-5)
+    # What a cloud's computer takes nobody says; the car's waits for it.
+    assert np.isnan(of["inference_j"]["cloud"])
+    assert of["waiting_j"]["cloud"] == pytest.approx(5 * 0.51)
+
+
+def test_a_runs_summary_has_the_energy_of_a_decision(counted: Callable[..., folder.Run]) -> None:
+    """Asking costs energy because helpers think, not because they transmit."""
+    told = counted(ALONE, CLEAR)
+    energy = {c: told.score(c, "energy_j") for c in told.conditions}
+    radio = told.score("clear", "radio_mj")
+    assert energy["single-local"].value == pytest.approx(11)
+    assert energy["clear"].value == pytest.approx(32 + radio.value / 1000)
+    assert radio.value / 1000 < 0.001 * told.score("clear", "helpers_j").value
+    manifest = told.manifest
+    assert manifest.latency.source == "device"
+    assert manifest.device_profile == DESK
+    assert manifest.latency.speeds == (Speed("swarm-tiny", 1000, 100, 0.01, 1),)
+
+
+def test_without_a_device_profile_nothing_is_said_of_energy(counted: Callable[..., folder.Run]) -> None:
+    told = counted(ALONE, CLEAR, device_profile=None)
+    assert told.score("clear", "energy_j") is None
+    assert not {"inference_j", "radio_mj", "busy_ratio"} & set(told.path.joinpath("summary.csv").read_text())
+    assert np.isnan(told.decisions["inference_j"]).all()
+
+
+def test_another_models_speed_is_said_plainly(counted: Callable[..., folder.Run]) -> None:
+    """100 / 500 + 10 / 10 s; joules from 50 W over the rates: 100 x 0.1 + 10 x 5."""
+    told = counted(ALONE, device_model="big")
+    assert told.manifest.latency.basis.startswith("swarm-tiny's answers at the speed of big on desk (F16")
+    assert told.decisions["latency_ms"].tolist() == [1200]
+    assert told.decisions["inference_j"].tolist() == [60]
+
+
+def test_an_answer_that_is_an_engines_error_has_no_time(counted: Callable[..., folder.Run]) -> None:
+    broken = Completion("00001-0/v1", "", None, None, "error", None, 1, "it broke")
+    told = counted(ALONE, more={"00001-0/v1": broken})
+    assert np.isnan(told.decisions["latency_ms"]).all()
+    assert np.isnan(told.decisions["inference_j"]).all()
+
+
+def test_tokens_that_nobody_counted_are_refused(small: Dataset, tmp_path: Path,
+                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))
+    with pytest.raises(UserError, match=r"/v1 has no token counts, so no device profile can time it; use"):
+        run(spec_of(small, "swarm-tiny", device_profile=DESK, points=(ALONE,)), tmp_path / "run")
+
+
+def test_a_repair_turn_counts_with_its_tokens(counted: Callable[..., folder.Run]) -> None:
+    """An answer of two turns has the tokens of both."""
+    told = counted(ALONE)
+    speed, [answer, *_] = told.manifest.latency.speeds[0], told.answers
+    twice = msgspec.structs.replace(answer, prompt_tokens=250, completion_tokens=20)
+    assert answer_s(speed, twice) == pytest.approx(0.25 + 0.2)
+    assert answer_j(speed, twice) == pytest.approx(2.5 + 20)
+
+
+def test_a_radio_sends_with_the_channels_power_where_it_has_one() -> None:
+    assert transmit_watts(DESK, named_point("6g")) == pytest.approx(2.0)
+    assert transmit_watts(DESK, named_point("mode4:power_dbm=20")) == pytest.approx(0.1 / 0.5)
+    silent = msgspec.structs.replace(DESK, amplifier_efficiency=None)
+    assert np.isnan(transmit_watts(silent, named_point("6g")))
+
+
+# -- what must always hold ------------------------------------------------------------------------------
+
+RATES = st.floats(1, 1e5)
+COUNTS = st.integers(0, 4000)
+
+
+@given(RATES, RATES, RATES, RATES, COUNTS, COUNTS, st.integers(0, 500), st.integers(0, 500))
+def test_more_tokens_are_never_cheaper_or_sooner(
+    prefill: float, decode: float, prompt_j: float, output_j: float, read: int, written: int, more: int,
+    longer: int,
+) -> None:  # fmt: skip
+    speed = Speed("m", prefill, decode, prompt_j, output_j)
+    for of in (devices.seconds, devices.joules):
+        assert of(speed, read + more, written + longer) >= of(speed, read, written) >= 0
+
+
+@given(
+    st.sampled_from(["v2x", "6g"]),
+    st.lists(st.floats(0.01, 0.5), min_size=4, max_size=4),
+    st.lists(st.floats(0.1, 1.0), min_size=4, max_size=4),
+    st.booleans(),
+)
+def test_a_faster_device_never_decides_later(
+    profile: str, seconds: list[float], shares: list[float], on_demand: bool
+) -> None:
+    """Whoever of the vehicles is faster, and whoever comes first on the medium then."""
+    point = OperatingPoint("p", profile, loss=0.0, on_demand=on_demand)
+    unsure = np.full(3, 1 / 3)
+
+    def latency_s(inference_s: Any) -> float:
+        intents = Intents(
+            unsure, np.tile(unsure, (3, 1)), np.ones(3, dtype=bool), np.full(4, 10.0), np.full(3, 20.0),
+            np.array([1000.0, 2000.0, 1500.0]), inference_s,
+        )  # fmt: skip
+        return float(coordinate(point, intents, Draws(np.full((3, 2), 0.5), np.full(3, 0.5))).latency_s)
+
+    slow = np.array(seconds)
+    assert latency_s(slow * np.array(shares)) <= latency_s(slow) + 1e-12
+
+
+def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
+    """Who is in time follows from tokens, not from how fast this machine is at the moment."""
+    spec = spec_of(
+        small, "swarm-tiny", limit=2, device_profile=devices.load("agx-orin"), device_model="qwen3-4b"
+    )
+    for batch_size in (1, 8):
+        run(replace(spec, batch_size=batch_size), tmp_path / str(batch_size))
+    one, other = (tmp_path / str(batch_size) for batch_size in (1, 8))
+    assert same_decisions(one, other)
+    assert (one / "summary.csv").read_bytes() == (other / "summary.csv").read_bytes()
+    assert not np.isnan(folder.read(one).decisions["inference_j"]).any()
+
+
+def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
+    device, alone = devices.load("agx-orin"), (ALONE,)
+    spec = spec_of(
+        small, "swarm-tiny", answer="readout", limit=1, device_profile=device, device_model="qwen3-4b",
+        points=alone,
+    )  # fmt: skip
+    run(spec, tmp_path / "run")
+    told = folder.read(tmp_path / "run")
+    assert {answer.completion_tokens for answer in told.answers} == {1}
+    assert not told.decisions["deadline_missed"].any()
+
+
+@pytest.mark.slow
+def test_workers_change_no_row(harness: Callable[..., Any]) -> None:
+    drive = ("drive", "--model", "swarm-tiny", "--episodes", "9", "--seeds", "0,1", "--condition", "6g")
+    on = ("--device-profile", "agx-orin", "--device-model", "qwen3-0.6b", "--quiet")
+    for workers in "12":
+        assert harness(*drive, *on, "--workers", workers, "--out", workers)[0] == 0
+    for name in ("decisions.parquet", "episodes.csv", "summary.csv"):
+        assert Path("1", name).read_bytes() == Path("2", name).read_bytes()
+
+
+# -- files ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", devices.names())
+def test_every_profile_that_ships_says_what_each_number_is(name: str) -> None:
+    device = devices.load(name)
+    for row in device.rows:
+        each = dict(devices.constants(device, row))
+        assert each["decode_tokens_per_s"] is not None
+        assert all(c is None or c.source not in ("edge-llm", "silybench") for c in each.values())
+        # Writing a token moves all weights, reading many at once does so once for all of them.
+        if each["prefill_tokens_per_s"]:
+            assert each["prefill_tokens_per_s"].value > each["decode_tokens_per_s"].value
+    for smaller, larger in zip(device.rows, device.rows[1:], strict=False):
+        if smaller.billions < larger.billions and smaller.prefill_tokens_per_s:
+            assert smaller.decode_tokens_per_s.value >= larger.decode_tokens_per_s.value
+
+
+def test_what_nobody_states_is_not_known() -> None:
+    thor = devices.load("thor")
+    speed = devices.speed(thor, devices.row_of(thor, "qwen3-4b"))
+    assert devices.seconds(speed, 300, 1) == pytest.approx(300 / 33029.8 + 1 / 73.4)
+    assert np.isnan(devices.joules(speed, 300, 1))
+    h200 = devices.load("h200")
+    assert np.isnan(devices.seconds(devices.speed(h200, h200.rows[0]), 300, 1))
+
+
+def test_a_size_is_scaled_from_the_nearest_row_where_the_profile_says_how() -> None:
+    agx = devices.load("agx-orin")
+    row, near = devices.row_of(agx, "5b"), devices.row_of(agx, "qwen3-vl-4b")
+    assert row.model == "5b from qwen3-vl-4b"
+    assert row.decode_tokens_per_s.value == pytest.approx(near.decode_tokens_per_s.value * 4.4 / 5)
+    assert row.decode_tokens_per_s.status == "modelled"
+    with pytest.raises(UserError, match="unknown model of device profile desk '5b'; known: big, half, swarm"):
+        devices.row_of(DESK, "5b")
+
+
+MINE = """
+description = "Mine."
+power_mode = "15 W"
+[sources]
+me = "my desk, today"
+[[rows]]
+model = "swarm-tiny"
+billions = 0.0005
+precision = "F16"
+batch_size = 1
+prefill_tokens_per_s = { value = 4000, status = "measured", source = "me" }
+decode_tokens_per_s = { value = 400, status = "measured", source = "me" }
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "devices").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "devices"
+
+
+def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
+    (project / "mine.toml").write_text(MINE)
+    device = devices.load("mine")
+    assert {"mine", "agx-orin"} <= set(devices.names())
+    assert device.rows[0].decode_tokens_per_s == Constant(400, "measured", "my desk, today")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("value = 4000", "value = 0"), "value = 0; allowed: a number above 0"),
+        (('status = "measured"', 'status = "felt"'), "unknown status in"),
+        (("billions", "bilions"), "did you mean 'billions'?"),
+        (('source = "me" }\ndecode', 'source = "" }\ndecode'), "allowed: where the number comes from"),
+        (('me = "my desk, today"', "me = 3"), "[sources]: give each source a name and a text"),
+        (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: str"),
+        (("batch_size = 1", "batch_size = 0"), "batch_size = 0; allowed: 1 or more"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, project: Path) -> None:
+    (project / "mine.toml").write_text(MINE.replace(*change, 1))
+    with pytest.raises(UserError) as error:
+        devices.load("mine")
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--device-profile", "agx-ori"), "unknown device profile 'agx-ori'; did you mean 'agx-orin'?"),
+        (("--device-profile", "agx-orin"), "unknown model of device profile agx-orin 'swarm-tiny'; known: q"),
+        (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), "unknown model of device profile"),
+        (("--device-model", "qwen3-4b"), "--device-model qwen3-4b is a device's row; give --device-pro"),
+        (("--device-profile", "h200", "--device-model", "llama-3.1-8b"), "states no prefill_tokens_per_s of"),
+        (("--device-profile", "agx-orin", "--device-model", "qwen3-4b", "--latency", "paper"),
+         "--device-profile agx-orin says how long answers take, as --latency paper does; give one of"),
+        (("--device-profile", "agx-orin", "--device-model", "qwen3-4b", "--model", "proxy"),
+         "--device-profile agx-orin: proxy is no language model and counts no tokens; leave it out"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_timed_is_one_line(
+    options: tuple[str, ...], says: str, harness: Callable[..., Any]
+) -> None:
+    code, out, err = harness("eval", "--limit", "1", "--model", "swarm-tiny", *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert says in err
+    assert "\x1b" not in err
