@@ -130,7 +130,7 @@ def transmit_watts(device: Device, point: "OperatingPoint") -> float:
     """What a radio draws while it sends, by the channel's power or else the profile's; NaN if unknown."""
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
-    dbm = float(getattr(point.channel(), "power_dbm", device.transmit_dbm.value))
+    dbm = float(getattr(point.channel, "power_dbm", device.transmit_dbm.value))
     return 10 ** ((dbm - 30) / 10) / device.amplifier_efficiency.value
 
 

@@ -254,7 +254,7 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
 @lru_cache(maxsize=64)
 def busy_ratio(point: OperatingPoint) -> float:
     """Channel busy ratio under the background load; NaN where the channel does not know."""
-    channel = point.channel()
+    channel = point.channel
     return channel.busy_ratio() if isinstance(channel, Physical) else float("nan")
 
 
