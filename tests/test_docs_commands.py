@@ -34,6 +34,7 @@ CUT = {
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
     "harness twins": "--sample 1 --workers 1",  # of 12 episodes
     "harness attribute": "--sample 2",  # of 40 decision points
+    "harness trust": "--attacks liar+spoof --rules trust --share 1/3 --seeds 0:1",  # of 15, 10, 2 and 5
     "harness campaign paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
     "harness campaign closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000

@@ -79,17 +79,22 @@ class Cell:
         return f"{self.rule}|{self.attack}|{self.share:.6g}"
 
     def detection(self) -> Mapping[str, Estimate] | None:
-        """Precision, recall and F1 of messages, with a bootstrap over episodes; None if it judges nobody."""
+        """Precision, recall, F1 and false alarms of messages, with a bootstrap over episodes.
+
+        False alarms are the share of honest messages that were taken for an attacker's. None if the rule judges
+        nobody.
+        """
         if self.flagged is None:
             return None
-        hit, missed, wrong, _ = self.flagged
+        hit, missed, wrong, right = self.flagged
         times = resampled(noise.generator("trust", "detection"), len(hit), RESAMPLES)
-        hits, misses, wrongs = times @ hit, times @ missed, times @ wrong
+        hits, misses, wrongs, rights = times @ hit, times @ missed, times @ wrong, times @ right
         with np.errstate(invalid="ignore", divide="ignore"):
             found = {
                 "precision": hits / (hits + wrongs),
                 "recall": hits / (hits + misses),
                 "f1": 2 * hits / (2 * hits + wrongs + misses),
+                "false_alarms": wrongs / (wrongs + rights),
             }
         return {name: _bootstrapped(of, len(hit)) for name, of in found.items()}
 

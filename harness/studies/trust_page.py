@@ -135,11 +135,11 @@ def as_json(bench: Bench) -> dict[str, Any]:
 
 
 def detections(bench: Bench) -> dict[str, list[tuple[str, float, Mapping[str, Estimate], Cell]]]:
-    """How rules that judge helpers find attackers, by rule."""
+    """How rules that judge helpers find attackers, and whom they take for one in peace, by rule."""
     found: dict[str, list[tuple[str, float, Mapping[str, Estimate], Cell]]] = {}
     for (rule, attack, share), cell in bench.cells.items():
-        if attack and (figures := cell.detection()):
-            found.setdefault(rule, []).append((attack, share, figures, cell))
+        if figures := cell.detection():
+            found.setdefault(rule, []).append((attack or "nobody attacks", share, figures, cell))
     return found
 
 
