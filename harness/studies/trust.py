@@ -81,8 +81,8 @@ class Cell:
     def detection(self) -> Mapping[str, Estimate] | None:
         """Precision, recall, F1 and false alarms of messages, with a bootstrap over episodes.
 
-        False alarms are the share of honest messages that were taken for an attacker's. None if the rule judges
-        nobody.
+        False alarms are the share of honest messages that were taken for an attacker's. None if the rule
+        judges nobody.
         """
         if self.flagged is None:
             return None
