@@ -13,8 +13,10 @@ import numpy as np
 from harness.backends import devices
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
+from harness.evaluate.fusion import key_of
+from harness.radio.wrapped import Wrapped
 from harness.runs.decisions import Decisions
-from harness.runs.records import BLIND, Answer, Constant, Device, DeviceRow, Latency, Speed
+from harness.runs.records import Answer, Constant, Device, DeviceRow, Latency, Speed
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -130,7 +132,10 @@ def transmit_watts(device: Device, point: "OperatingPoint") -> float:
     """What a radio draws while it sends, by the channel's power or else the profile's; NaN if unknown."""
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
-    dbm = float(getattr(point.channel, "power_dbm", device.transmit_dbm.value))
+    radio = point.channel
+    while isinstance(radio, Wrapped):
+        radio = radio.channel
+    dbm = float(getattr(radio, "power_dbm", device.transmit_dbm.value))
     return 10 ** ((dbm - 30) / 10) / device.amplifier_efficiency.value
 
 
@@ -142,9 +147,9 @@ def _inferred(
     egos = {answer.scene: answer for answer in by_id.values() if answer.role == "ego"}
     calls = {(a.scene, a.heard): a for a in by_id.values() if a.role == "merge"}
     n, condition = len(decisions), decisions.codes("condition", [point.name for point in points])
-    fusing = {place: point.asks_blind for place, point in enumerate(points) if point.asks_again}
+    fusing = {place: point.rewrites for place, point in enumerate(points) if point.asks_again}
     senders = [decisions.labels(f"helper_{place}") for place in range(1, decisions.helpers + 1)]
-    on_time = decisions.of_messages("on_time") == 1.0
+    on_time, attacks = (decisions.of_messages(name) == 1.0 for name in ("on_time", "attacker"))
     ego_j, ego_s, helpers_j, call_j = np.zeros((4, n))
     for scene, rows in decisions.scenes.items():
         ego_j[rows.start : rows.stop] = answer_j(latency.speeds[0], egos[scene])
@@ -153,10 +158,13 @@ def _inferred(
         for row in rows:
             asked = [(place, who) for place, column in enumerate(senders) if (who := column[row])]
             for place, who in asked:
-                if who not in of_helpers:
-                    of_helpers[who] = answer_j(latency.speed(1 + place), by_id[f"{scene}/{who}"])
+                if who not in of_helpers:  # a further voice of an attacker thinks nothing of its own
+                    answer = by_id.get(f"{scene}/{who}")
+                    of_helpers[who] = answer_j(latency.speed(1 + place), answer) if answer else 0.0
                 helpers_j[row] += of_helpers[who]
-            if (blind := fusing.get(int(condition[row]))) is not None:
-                heard = tuple(who + BLIND * blind for place, who in asked if on_time[row, place])
+            if rewrites := fusing.get(int(condition[row])):
+                heard = tuple(
+                    key_of(who, rewrites, attacks[row, at]) for at, who in asked if on_time[row, at]
+                )
                 call_j[row] = answer_j(latency.speeds[0], calls[scene, heard]) if heard else 0.0
     return ego_j, ego_s, helpers_j, call_j

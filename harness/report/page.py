@@ -118,7 +118,6 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         "runs": [
             {
                 "inference_s": {"ego": [latency.ego_s], "helper": latency.helper_times_s()},
-                "merge_s": latency.fusion_s,
                 "points": {
                     c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages")}
                     for c in run.manifest.conditions

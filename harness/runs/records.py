@@ -229,6 +229,7 @@ class Decision(Struct, frozen=True, kw_only=True):
         own_failed: the ego's own answer could not be parsed.
         own_weight: weight of its intent in the policy; None where a fusion call answered.
         latency_ms: from seeing to acting.
+        fusion_ms: part of it that fusion takes.
         deadline_missed: it took longer than the window.
         messages: replies scheduled.
         value: whether success was still possible; known of frozen scenes, as are the next four.
@@ -253,6 +254,7 @@ class Decision(Struct, frozen=True, kw_only=True):
     own_failed: bool
     own_weight: float | None
     latency_ms: float | None
+    fusion_ms: float | None
     deadline_missed: bool | None
     messages: tuple[Message, ...]
     value: bool | None

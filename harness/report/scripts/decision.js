@@ -80,10 +80,7 @@ function timelineRows(told, chosen, run) {
     rows.push({ who: name, what, from: Math.min(ready, to), to });
   }
   // ego-prompt infers once more when the exchange is over; a rule takes no time.
-  const heard = chosen.messages.filter((m) => m.on_time).map((m) => m.from + (point.messages === "blind" ? "~blind" : ""));
-  const again = point.consensus === "ego-prompt" && heard.length;
-  const call = told.answers.find((a) => a.role === "merge" && a.viewer.split("+").slice(1).join() === heard.join());
-  const fusion = again ? 1000 * (call?.took_s ?? run.merge_s) : 0;
+  const fusion = chosen.fusion_ms;
   if (fusion) rows.push({ who: rows[0]?.who ?? "ego", what: "fusion", from: latency_ms - fusion, to: latency_ms });
   if (latency_ms != null) rows.push({ who: "decision", what: "decision", from: 0, to: latency_ms });
   return rows;
