@@ -166,6 +166,8 @@ def test_a_repair_turn_counts_with_its_tokens(counted: Callable[..., folder.Run]
 def test_a_radio_sends_with_the_channels_power_where_it_has_one() -> None:
     assert transmit_watts(DESK, named_point("6g")) == pytest.approx(2.0)
     assert transmit_watts(DESK, named_point("mode4:power_dbm=20")) == pytest.approx(0.1 / 0.5)
+    over_a_relay = named_point("mode4:power_dbm=20,edge=relay,loss=0.5")
+    assert transmit_watts(DESK, over_a_relay) == pytest.approx(0.1 / 0.5)
     silent = msgspec.structs.replace(DESK, amplifier_efficiency=None)
     assert np.isnan(transmit_watts(silent, named_point("6g")))
 

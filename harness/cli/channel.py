@@ -281,12 +281,9 @@ def _picture(out: Path | None) -> None:
 def _of(text: str) -> "tuple[str, Channel]":
     """The profile that a condition's text names, and its channel with the text's settings."""
     from harness.coordination.operating_point import named_point
-    from harness.radio.wrapped import Wrapped
+    from harness.radio.wrapped import innermost
 
     point = named_point(text)
     if point.profile is None:
         raise UserError(f"{printable(text)} has no channel; `harness channel list` shows those there are")
-    channel = point.channel
-    while isinstance(channel, Wrapped):
-        channel = channel.channel
-    return point.profile, channel
+    return point.profile, innermost(point.channel)

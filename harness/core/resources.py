@@ -17,7 +17,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def root() -> Path:
-    """Folder that holds what ships: `prompts/`, `models/`, `channels/`, `devices/`, `networks/`, `datasets/`."""
+    """Folder that holds what ships, such as `prompts/` and `datasets/`."""
     checkout = _PACKAGE.parent
     return checkout if (checkout / "pyproject.toml").is_file() else _PACKAGE / "_data"
 
