@@ -100,15 +100,17 @@ def check(
 ) -> None:
     """Hold a radio against what it delivers, and against others' curves.
 
-    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Curves are taken at their
-    own settings.
+    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Waits are from one of a
+    vehicle's background packets to the next received, on a tenth as many trips. Curves are taken at their own
+    settings.
     """
     import numpy as np
 
     from harness.core.figures import as_mapping, shown
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
-    from harness.studies.reception import DISTANCES_M, by_sight, compared, curves_of, drawn
+    from harness.radio.transceiver import Transceiver
+    from harness.studies.reception import DISTANCES_M, PACKETS, by_sight, compared, curves_of, drawn, gaps
 
     if not 100 <= n <= MOST_TRIPS:
         raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
@@ -120,6 +122,10 @@ def check(
     messages = drawn(channel, DISTANCES_M, n)
     of_others = [compared(channel, curve, where) for path in against or () for curve in curves_of(path)]
     model = by_sight(channel, DISTANCES_M)["clear"].tolist()
+    waits = (
+        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and channel.rate_hz else []
+    )
+    busy = channel.busy_ratio()
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
@@ -129,7 +135,12 @@ def check(
         save(reception(name, by_sight(channel, every), every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         echo_json({
-            "name": name, "n": n, "outside": beyond,
+            "name": name, "n": n, "outside": beyond, "busy_ratio": None if np.isnan(busy) else busy,
+            "waits": [
+                {"distance_m": w.distance_m, "mean_s": as_mapping(w.mean_s), "p95_s": as_mapping(w.p95_s),
+                 "independent_s": w.independent_s if np.isfinite(w.independent_s) else None}
+                for w in waits
+            ],
             "messages": [
                 {"distance_m": m.distance_m, "model": share, "crossing": as_mapping(m.crossing),
                  "round_trip": as_mapping(m.round_trip), "delay_s": m.delay_s}
@@ -157,6 +168,21 @@ def check(
         ],
     )
     typer.echo(f"n = {n} trips a distance, each with shadowing of its own; 95 % intervals")
+    if waits:
+        typer.echo()
+        table(
+            ["next packet after, s", "mean", "95th percentile", "if independent"],
+            [
+                (
+                    f"{w.distance_m:g} m",
+                    shown(w.mean_s, 1.0, 3),
+                    shown(w.p95_s, 1.0, 2),
+                    f"{w.independent_s:.3f}",
+                )
+                for w in waits
+            ],
+        )
+        typer.echo(f"n = {n // 10} trips a distance, {PACKETS} packets each; busy ratio {busy:.3f}")
     for line in beyond:
         typer.echo(line)
     if of_others:
@@ -255,12 +281,9 @@ def _picture(out: Path | None) -> None:
 def _of(text: str) -> "tuple[str, Channel]":
     """The profile that a condition's text names, and its channel with the text's settings."""
     from harness.coordination.operating_point import named_point
-    from harness.radio.wrapped import Wrapped
+    from harness.radio.wrapped import innermost
 
     point = named_point(text)
     if point.profile is None:
         raise UserError(f"{printable(text)} has no channel; `harness channel list` shows those there are")
-    channel = point.channel
-    while isinstance(channel, Wrapped):
-        channel = channel.channel
-    return point.profile, channel
+    return point.profile, innermost(point.channel)

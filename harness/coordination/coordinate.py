@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from harness.coordination.consensus import Messages, capped, inverse_distance_weights
-from harness.coordination.exchange import Exchange, exchange, inferred_s
+from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.robust import outvoted
@@ -112,13 +112,14 @@ def fuse(
         fused, weights, state, trusted = rule.fuse(messages, state)
         trust = trust if trusted is None else np.where(heard.on_time, trusted, np.nan)
     fused = np.where((anybody & ~failed)[..., None], fused, heard.own)
+    unknown = np.isnan(intents.inference_s[..., 0]) & (point.round_trip_s is None)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,
         fused=fused,
         action=np.argmax(fused, axis=-1),
         fusion_failed=failed,
-        latency_s=np.where(np.isnan(inferred_s(point, intents)[..., 0]), np.nan, latency_s),
+        latency_s=np.where(unknown, np.nan, latency_s),
         deadline_missed=latency_s > point.window_s,
         state=state,
         trust=trust,

@@ -30,6 +30,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import FUSION, OperatingPoint
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
 from harness.core.statistics import known_mean
 from harness.radio.channel import Channel, Draws, Links, Physical
 from harness.radio.roadside import Consulted, by_unit
@@ -112,7 +113,7 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
     asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
     unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
 
-    inference_s = inferred_s(point, intents)
+    inference_s = inferred_s(point, intents, draws)
     inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 
@@ -171,11 +172,16 @@ def _directly(channel: Channel, links: Links, draws: Draws, ready: Callable[[Flo
     )
 
 
-def inferred_s(point: OperatingPoint, intents: Intents) -> Floats:
+def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
-    if point.round_trip_s is None:
-        return intents.inference_s
-    return np.insert(intents.inference_s[..., 1:], 0, point.round_trip_s, axis=-1)
+    ego_s: Floats | float = intents.inference_s[..., 0]
+    if point.round_trip_s is not None:
+        ego_s = point.round_trip_s
+    elif point.network:
+        if draws.trips is None:
+            raise UserError("round_trip needs layouts, which the paper's study has not; take round_trip_s")
+        ego_s = ego_s + point.network.round_trip_s(draws.of(".cloud").wait)
+    return np.insert(intents.inference_s[..., 1:], 0, ego_s, axis=-1)
 
 
 def fallback_intent(fallback: str, n_actions: int) -> Floats:

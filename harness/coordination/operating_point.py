@@ -10,6 +10,7 @@ from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical, Unit
+from harness.radio.networks import Network, network
 from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
 from harness.radio.roadside import Relay
 from harness.radio.wrapped import AtLoss
@@ -77,6 +78,8 @@ class OperatingPoint:
         messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
             (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
             gain of what helpers see.
+        round_trip: network over which the ego asks its model in a cloud, a name of `harness.radio.networks`:
+            each decision draws a round trip, which comes on top of the model's inference.
         round_trip_s: seconds from the ego's question to the answer of a model in a cloud, in place of its own
             inference.
         radio: further settings of the profile's channel, in place of its own:
@@ -112,6 +115,7 @@ class OperatingPoint:
     on_demand: bool = False
     messages: str = "own"
     round_trip_s: float | None = None
+    round_trip: str = ""
     radio: str = ""
     attack: str = ""
     defence: str = ""
@@ -142,6 +146,12 @@ class OperatingPoint:
             self._number("latency_s", "seconds, 0 or more", zero=True)
         if self.round_trip_s is not None:
             self._number("round_trip_s", "seconds, 0 or more", zero=True)
+        if self.round_trip:
+            _ = self.network
+            if self.round_trip_s is not None:
+                raise self._wrong("round_trip", "left out where round_trip_s says all; keep one of the two")
+            if self.asks_again:
+                raise self._wrong("round_trip", f"left out where consensus is {EGO_PROMPT}, which asks twice")
         if type(self.max_helpers) is not int or self.max_helpers < 0:
             raise self._wrong("max_helpers", "a whole number, 0 or more")
         if self.edge not in EDGES:
@@ -236,6 +246,11 @@ class OperatingPoint:
         """The roadside unit, where there is one with a place."""
         return self._unit if self.edge != "none" and isinstance(self.channel, Physical) else None
 
+    @cached_property
+    def network(self) -> Network | None:
+        """The network to a cloud, as its file was when the point was made. Raises UserError."""
+        return network(self.round_trip) if self.round_trip else None
+
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
         """The same with these settings of its channel. Raises UserError for one that it has not."""
         texts = {**pairs(self.radio), **settings}
@@ -324,6 +339,8 @@ def named_point(text: str) -> OperatingPoint:
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes nothing; "
                 "leave it out"
             )
+    if "round_trip" in settings and "round_trip_s" not in settings:
+        settings["round_trip_s"] = None  # of `cloud`, the paper's
     point = point.of_radio(radio) if radio else point
     return replace(point, name=text, **settings) if settings or radio else point
 

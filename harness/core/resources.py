@@ -1,8 +1,8 @@
-"""Where prompts, models, channels, devices and datasets lie: in one's project, and those that ship beside.
+"""Where prompts, models, channels, devices, networks and datasets lie: in a project, and what ships beside.
 
 What ships lies at the checkout's top level, or inside the wheel. A folder with a file `swarmdrive.toml` is a
-project; its own `prompts/`, `models/`, `channels/`, `devices/` and `datasets/` count where it is the current
-directory.
+project; its own `prompts/`, `models/`, `channels/`, `devices/`, `networks/` and `datasets/` count where it is
+the current directory.
 """
 
 import os
@@ -17,13 +17,13 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def root() -> Path:
-    """Folder that holds the `prompts/`, `models/`, `channels/`, `devices/` and `datasets/` that ship."""
+    """Folder that holds what ships, such as `prompts/` and `datasets/`."""
     checkout = _PACKAGE.parent
     return checkout if (checkout / "pyproject.toml").is_file() else _PACKAGE / "_data"
 
 
 def folder(kind: str) -> Path:
-    """Folder of one kind of resource that ships: `prompts`, `models`, `channels`, `devices` or `datasets`."""
+    """Folder of one kind of resource that ships, such as `prompts` or `channels`."""
     return root() / kind
 
 

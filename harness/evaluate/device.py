@@ -14,7 +14,7 @@ from harness.backends import devices
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.evaluate.fusion import key_of
-from harness.radio.wrapped import Wrapped
+from harness.radio.wrapped import innermost
 from harness.runs.decisions import Decisions
 from harness.runs.records import Answer, Constant, Device, DeviceRow, Latency, Speed
 
@@ -115,7 +115,7 @@ def energy(
     condition = decisions.codes("condition", [point.name for point in points])
     for place, point in enumerate(points):
         watts[condition == place] = transmit_watts(device, point)
-        if point.round_trip_s is not None:  # the ego's model is in a cloud
+        if point.round_trip_s is not None or point.round_trip:  # the ego's model is in a cloud
             ego_j[condition == place], ego_s[condition == place] = np.nan, 0.0
     if device.idle_watts:
         idle_watts = device.idle_watts.value
@@ -132,10 +132,7 @@ def transmit_watts(device: Device, point: "OperatingPoint") -> float:
     """What a radio draws while it sends, by the channel's power or else the profile's; NaN if unknown."""
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
-    radio = point.channel
-    while isinstance(radio, Wrapped):
-        radio = radio.channel
-    dbm = float(getattr(radio, "power_dbm", device.transmit_dbm.value))
+    dbm = float(getattr(innermost(point.channel), "power_dbm", device.transmit_dbm.value))
     return 10 ** ((dbm - 30) / 10) / device.amplifier_efficiency.value
 
 

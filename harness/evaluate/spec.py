@@ -285,6 +285,7 @@ class Spec:
             "actions": list(self.actions),
             "conditions": [asdict(point) for point in self.points],
             "channels": {name: CHANNELS.record(name) for point in self.points if (name := point.profile)},
+            "networks": {point.round_trip: asdict(point.network) for point in self.points if point.network},
             "seeds": list(self.seeds),
             "batch_size": self.batch_size,
             "dtype": self.dtype,

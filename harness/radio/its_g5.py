@@ -120,6 +120,11 @@ class ItsG5(Transceiver):
         return PREAMBLE_S + SYMBOL_S * symbols
 
     @property
+    def packet_bits(self) -> int:
+        """Without headers."""
+        return 8 * self.packet_bytes
+
+    @property
     def packet_s(self) -> float:
         """How long a packet of the background is on air."""
         return float(self.airtime_s(self.packet_bytes + self.header_bytes))

@@ -82,6 +82,11 @@ class Sidelink(Transceiver):
         """What one block carries; a larger message takes several, and each must cross."""
 
     @property
+    def packet_bits(self) -> int:
+        """One block."""
+        return self.block_bits
+
+    @property
     @abstractmethod
     def noise_dbm(self) -> float:
         """Noise in the bandwidth of a block."""

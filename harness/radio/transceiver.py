@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 
@@ -42,6 +42,19 @@ class Transceiver(Propagation):
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
         """How long a message of so many bits is on air."""
+
+    @abstractmethod
+    def busy_ratio(self) -> float:
+        """Channel busy ratio under the background load."""
+
+    @abstractmethod
+    def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
+        """Share of the background's packets received at these distances, `(n,)`: `channel.Physical`."""
+
+    @property
+    @abstractmethod
+    def packet_bits(self) -> int:
+        """Size of the background's packets."""
 
     @abstractmethod
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Any:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.radio.channel import Broadcast, Delivery, Draws, Links, Physical, Site
+from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical, Site
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Wrapped:
     def busy_ratio(self) -> float:
         """The channel's."""
         return self.channel.busy_ratio()
+
+
+def innermost(channel: Channel) -> Channel:
+    """The channel itself, without what is round it."""
+    return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
 
 
 @dataclass(frozen=True)

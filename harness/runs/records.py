@@ -503,6 +503,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     actions: tuple[str, ...]
     conditions: tuple[dict[str, Any], ...]
     channels: dict[str, ChannelRecord] = {}
+    networks: dict[str, dict[str, Any]] = {}
     seeds: tuple[int, ...]
     thinking: bool
     answer: str

@@ -1,6 +1,7 @@
 """Reception against distance: a channel's own curve, the messages it delivers, and others' curves."""
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +12,20 @@ import numpy as np
 from msgspec import Meta
 
 from harness.coordination.operating_point import pairs
-from harness.core.arrays import Floats
+from harness.core import noise
+from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.statistics import Estimate, rate_interval
+from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
 from harness.radio.profiles import changed
+from harness.radio.transceiver import Transceiver
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
 PAYLOAD_BITS = 800.0
+PACKETS, MPS = 200, 14.0  # of a trip, and its speed
+RESAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,60 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
         crossing, round_trip = (rate_interval(each[:, 0].astype(float)) for each in (crossed, up))
         result.append(Drawn(distance_m, crossing, round_trip, float(delay_s.mean())))
     return result
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How long a receiver waits from one of a vehicle's packets to the next that it gets, at one distance.
+
+    Attributes:
+        distance_m: between the two.
+        mean_s: over trips.
+        p95_s: 95th percentile, with an interval over trips.
+        independent_s: the mean if each packet were lost by itself: 1 / (rate x reception).
+    """
+
+    distance_m: float
+    mean_s: Estimate
+    p95_s: Estimate
+    independent_s: float
+
+
+def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
+    """Of `n` trips of two vehicles at each distance, in sight, 14 m/s along one road, for `PACKETS` packets.
+
+    Their shadowing changes as they go; a packet is drawn by its own loss, as runs draw messages. What a
+    trip's end cuts off is left out, so waits that would be longer than a tenth of a trip are unknown.
+    """
+    moved_m = MPS / channel.rate_hz * np.arange(PACKETS)
+    numbers = np.broadcast_to(np.arange(n)[:, None], (n, PACKETS))
+    trips = Trips(numbers, np.full((n, PACKETS), seed), np.zeros((n, PACKETS), dtype=int), 1)
+    uniforms = noise.uniforms((n, PACKETS), "packets of a trip", seed)
+    reception = by_sight(channel, distances_m)["clear"]
+    result = []
+    for distance_m, share in zip(distances_m, reception.tolist(), strict=True):
+        ends_m = moved_m[:, None] + [0.0, distance_m]
+        xy_m = np.broadcast_to(np.stack([ends_m, np.zeros_like(ends_m)], axis=-1), (n, PACKETS, 2, 2))
+        none = np.zeros((n, PACKETS, 1))
+        site = Site(xy_m, np.full(none.shape, CLEAR), none, np.full((*none.shape, 2), np.nan))
+        loss = channel.loss(site, trips.shadow(xy_m, channel.decorrelation_m), channel.packet_bits)[..., 0]
+        trip, packet = np.nonzero((uniforms >= loss) & (PACKETS * share > 10))
+        same = np.diff(trip) == 0
+        waits_s, of = np.diff(packet)[same] / channel.rate_hz, trip[1:][same]
+        independent_s = 1 / (channel.rate_hz * share) if share else math.inf
+        result.append(Gap(distance_m, episode_interval(waits_s, of), _p95(waits_s, of), independent_s))
+    return result
+
+
+def _p95(values: Floats, trips: Ints) -> Estimate:
+    """The 95th percentile, with the bootstrap's interval over trips; NaN of none."""
+    there, of = np.unique(trips, return_inverse=True)
+    if not len(there):
+        return Estimate(math.nan, math.nan, math.nan, 0, 0)
+    times = resampled(noise.generator("waits"), len(there), RESAMPLES)
+    value, *found = (np.quantile(np.repeat(values, row[of]), 0.95) for row in times)
+    low, high = np.quantile(found, [0.025, 0.975]).tolist()
+    return Estimate(float(value), low, high, len(there), 0)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +30,7 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses
 from harness.prompts import versions
+from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import dataset_of, read
 from harness.runs.records import Answer
@@ -84,6 +85,12 @@ class Stored:
                 raise UserError(
                     f"{printable(folder)}: channel profile {printable(profile)} has changed since; restore "
                     "it or run again"
+                )
+        for name, of_run in manifest.networks.items():
+            if asdict(network(name)) != of_run:
+                raise UserError(
+                    f"{printable(folder)}: network {printable(name)} has changed since; restore it or run "
+                    "again"
                 )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)

@@ -1,0 +1,63 @@
+"""Round trips from a car to a cloud, by what somebody measured: files `networks/*.toml`."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.config import convert, toml
+from harness.core.errors import UserError, printable, unknown
+from harness.core.resources import entries, find
+
+
+@dataclass(frozen=True)
+class Network:
+    """A distribution of round trips, without what the answer takes at the other end.
+
+    Attributes:
+        description: one sentence for lists.
+        source: who measured them, where and how many.
+        status: `cited` from a publication or its data, `measured` by oneself, or `assumed`.
+        quantiles_ms: round trips by the percentage of all that are no longer, from 0 to 100.
+    """
+
+    description: str
+    source: str
+    status: Literal["cited", "measured", "assumed"]
+    quantiles_ms: dict[str, float]
+
+    def round_trip_s(self, uniforms: Floats) -> Floats:
+        """The quantiles at these draws, on straight lines between those that are given."""
+        shares = [float(percent) / 100 for percent in self.quantiles_ms]
+        return np.interp(uniforms, shares, [ms / 1000 for ms in self.quantiles_ms.values()])
+
+
+def names() -> list[str]:
+    """Of the networks that there are, a project's among them."""
+    return [path.stem for path in entries("networks", "*.toml")]
+
+
+def network(name: str) -> Network:
+    """A network by its name. Raises UserError for an unknown one and for a file that does not work."""
+    if name not in names():
+        raise unknown("round_trip", name, names())
+    path = find("networks", f"{name}.toml")
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _read(path: Path, mtime_ns: int) -> Network:
+    where = f"network file {printable(path)}"
+    found = convert(toml(path, where), Network, where)
+    try:
+        percents = [float(percent) for percent in found.quantiles_ms]
+    except ValueError:
+        percents = []
+    times_ms = list(found.quantiles_ms.values())
+    ends = percents[:1] == [0.0] and percents[-1:] == [100.0] and min(times_ms) >= 0
+    if not (ends and np.all(np.diff(percents) > 0) and np.all(np.diff(times_ms) >= 0)):
+        raise UserError(f"{where}: quantiles_ms must go from 0 to 100, percentages and milliseconds growing")
+    return found
