@@ -1,5 +1,7 @@
 """Device profiles: what a token takes and costs, played by hand; who is in time follows from it alone."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -237,13 +239,15 @@ def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_change_no_row(harness: Callable[..., Any]) -> None:
+def test_workers_change_no_row(tmp_path: Path) -> None:
+    """Each in a process of its own, as a user types it: a fork has none of an open engine's threads."""
     drive = ("drive", "--model", "swarm-tiny", "--episodes", "9", "--seeds", "0,1", "--condition", "6g")
     on = ("--device-profile", "agx-orin", "--device-model", "qwen3-0.6b", "--quiet")
     for workers in "12":
-        assert harness(*drive, *on, "--workers", workers, "--out", workers)[0] == 0
+        typed = (sys.executable, "-m", "harness", *drive, *on, "--workers", workers, "--out", workers)
+        subprocess.run(typed, cwd=tmp_path, check=True)
     for name in ("decisions.parquet", "episodes.csv", "summary.csv"):
-        assert Path("1", name).read_bytes() == Path("2", name).read_bytes()
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
 
 # -- files ----------------------------------------------------------------------------------------------
