@@ -4,6 +4,7 @@ Importing this loads no engine. A package from outside adds one by an entry poin
 `swarmdrive.backends`: its name is the engine's name in cards, its value a `Registration`.
 """
 
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -208,9 +209,16 @@ def open_backend(
     return backend
 
 
-@lru_cache(maxsize=8)
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> "Backend":
     """This process's backend of a card, opened once (see `open_backend`)."""
+    return _opened_in(os.getpid(), card, device, dtype, batch_size)
+
+
+# A forked process has its parent's, and may not ask it: two at one pipe read each other's answers.
+@lru_cache(maxsize=8)
+def _opened_in(
+    process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int
+) -> "Backend":  # fmt: skip
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
