@@ -10,6 +10,7 @@ from harness.backends.base import AnswerMode
 from harness.backends.failures import Failures
 from harness.coordination.operating_point import POINTS, SETTINGS
 from harness.coordination.rules import EGO_PROMPT, POOLS
+from harness.coordination.schedules import SCHEDULES
 from harness.parsing.parse import Repair, Status
 from harness.report.compare.gate import NAMES
 
@@ -37,8 +38,8 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
     text = (ROOT / "docs/operating-points.md").read_text()
     [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
     default = getattr(POINTS["v2x"], setting)
-    unset = {"ego_distance_m": "its distance", "round_trip_s": "the model's"}.get(setting, "the profile's")
-    words = {"None": unset, "False": "false", "": "none"}
+    others = {"ego_distance_m": "its distance", "round_trip_s": "the model's", "threshold": "its own"}
+    words = {"None": others.get(setting, "the profile's"), "False": "false", "": "none"}
     shown = words.get(str(default), default)
     cell = line.split("|")[3].strip().strip("`")
     assert cell == (f"{shown:g}" if isinstance(shown, float) else str(shown))
@@ -47,6 +48,11 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
 @pytest.mark.parametrize("name", [*POOLS, EGO_PROMPT])
 def test_every_consensus_is_documented(name: str) -> None:
     assert f"| `{name}` |" in (ROOT / "docs/operating-points.md").read_text()
+
+
+@pytest.mark.parametrize("name", SCHEDULES.built_in)
+def test_every_schedule_is_documented(name: str) -> None:
+    assert f"| `{name}` |" in (ROOT / "docs/scheduling.md").read_text()
 
 
 @pytest.mark.parametrize("metric", NAMES)

@@ -25,6 +25,7 @@ PANELS = {
         "drive",
         "grid",
         "sweep",
+        "schedule",
         "compare",
         "twins",
         "attribute",

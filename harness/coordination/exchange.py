@@ -28,9 +28,11 @@ import numpy as np
 
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import FUSION, OperatingPoint
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import Known, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.radio.channel import Channel, Draws, Links, Physical
 from harness.radio.roadside import Consulted, by_unit
@@ -44,7 +46,8 @@ class Exchange:
         own: the ego's intent after the fallback, `(..., A)`.
         own_failed: the ego's answer was unusable and `own` is the fallback, `(...)`.
         entropy_nats: entropy of `own`, `(...)`.
-        triggered: the entropy is above tau and the point has a channel, `(...)`.
+        triggered: the point has a channel, and its schedule asks whoever may be asked, `(...)`: by default
+            where the entropy is above tau.
         asked: helpers asked, each a scheduled reply, `(..., H)`.
         requests: requests broadcast, `(...)`: 1 for all who are asked together, and 1 of a unit that asks for
             the ego; else 0.
@@ -101,36 +104,24 @@ class Exchange:
         return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
 
 
-def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
-    """Trigger and channel for decisions `(...)` with up to H helpers. An unknown time counts as none."""
-    own_failed = np.any(np.isnan(intents.own), axis=-1)
-    fallback = fallback_intent(point.fallback, intents.own.shape[-1])
-    own = np.where(own_failed[..., None], fallback, intents.own)
+def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None) -> Exchange:
+    """Schedule and channel for decisions `(...)` with up to H helpers. An unknown time counts as none.
+
+    `asked` is who is asked, `(..., H)`, of those in the radius, in place of whom the point's schedule asks.
+    """
+    own_failed, own = own_intent(point, intents)
     entropy = entropy_nats(own)
-    asks = (entropy > point.tau_nats) & (point.profile is not None)
-
     in_radius = intents.valid & (intents.range_m <= point.radius_m)
-    asked = asks[..., None] & nearest(in_radius, intents.range_m, point.max_helpers)
-    unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
-
-    inference_s = inferred_s(point, intents, draws)
-    inference_s = np.where(np.isnan(inference_s), 0.0, inference_s)
-    request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
-
-    def ready(heard_s: Floats | float) -> Floats:
-        return heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
-
-    links = Links(
-        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
-        point.request_bits, intents.site,
-    )  # fmt: skip
-    waits_until_s: Floats = np.array(np.inf)
-    if point.edge == FUSION and point.unit and isinstance(point.channel, Physical):
-        waits_until_s = np.maximum(point.window_s, request_s[..., 0])
-        left_s = waits_until_s - request_s[..., 0]
-        sent = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, left_s)
+    if point.profile is None:
+        asks, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
+    elif asked is None:
+        worth, above = worth_of(point, intents, draws), point.asks_above
+        asks = np.any(worth > above, axis=-1)
+        asked = chosen(worth, above, in_radius, intents.range_m, point.max_helpers)
     else:
-        sent = _directly(point.channel, links, draws, ready)
+        asked = asked & in_radius
+        asks = np.any(asked, axis=-1)
+    request_s, sent, waits_until_s = _consulted(point, intents, asked, in_radius, draws)
     delivered = sent.up if intents.silent is None else sent.up & ~intents.silent
     loss, arrival_s = sent.loss, np.where(delivered, request_s + sent.end_s, np.inf)
     return Exchange(
@@ -149,6 +140,75 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws) -> Exchange:
         on_time=sent.fused & (arrival_s <= point.window_s),
         exchange_s=np.minimum(request_s[..., 0] + sent.acts_s, waits_until_s),
     )
+
+
+def _consulted(
+    point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
+) -> tuple[Floats, Consulted, Floats]:
+    """When the ego asks, `(..., 1)`, what becomes of that, and until when it waits at most, `(...)`."""
+    unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
+    inference_s = np.nan_to_num(inferred_s(point, intents, draws))
+    request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
+
+    def ready(heard_s: Floats | float) -> Floats:
+        return heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
+
+    links = Links(
+        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
+        point.request_bits, intents.site,
+    )  # fmt: skip
+    if point.edge == FUSION and point.unit and isinstance(point.channel, Physical):
+        until_s = np.maximum(point.window_s, request_s[..., 0])
+        left_s = until_s - request_s[..., 0]
+        sent = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, left_s)
+        return request_s, sent, until_s
+    return request_s, _directly(point.channel, links, draws, ready), np.array(np.inf)
+
+
+def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
+    """Whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
+    failed = np.any(np.isnan(intents.own), axis=-1)
+    fallback = fallback_intent(point.fallback, intents.own.shape[-1])
+    return failed, np.where(failed[..., None], fallback, intents.own)
+
+
+def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
+    """What asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
+    return SCHEDULES[point.schedule].worth(known_of(point, intents, draws))
+
+
+def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
+    """What the ego knows before it asks, as far as the point's schedule looks at it."""
+    own, in_radius = own_intent(point, intents)[1], intents.valid & (intents.range_m <= point.radius_m)
+    if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
+        raise UserError(NO_SCENE.format(printable(point.schedule)))
+    return Known(
+        own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m,
+        _in_time(point, intents, in_radius, draws) if point.needs("in_time") else None,
+        intents.outlook if point.needs("outlook") else None,
+        draws.of(".lot").wait if point.needs("lot") else None,
+    )  # fmt: skip
+
+
+NO_SCENE = (
+    "schedule {} needs vehicles that are somewhere, and the paper's study has none; "
+    "take `harness eval` or `harness drive`"
+)
+IMAGINED = 8  # exchanges, from which the ego expects what this one will be
+
+
+def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Draws) -> Floats:
+    """Probability that a reply is there in the window, `(..., H)`, over exchanges with draws of their own.
+
+    Both crossings count as independent; a second path, over a roadside unit, is left out.
+    """
+    total = np.zeros(may_ask.shape)
+    for n in range(IMAGINED):
+        others = draws.of(f".imagined-{n}") if draws.trips else draws
+        imagined = replace(others, jitter=np.full_like(draws.jitter, (n + 0.5) / IMAGINED))
+        request_s, sent, _ = _consulted(point, intents, may_ask, may_ask, imagined)
+        total += (1.0 - sent.loss) ** 2 * (request_s + sent.end_s <= point.window_s)
+    return total / IMAGINED
 
 
 def _directly(channel: Channel, links: Links, draws: Draws, ready: Callable[[Floats], Floats]) -> Consulted:

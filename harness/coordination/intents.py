@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Site
 
@@ -29,6 +30,7 @@ class Intents:
         silent: the helper is asked and sends nothing in its slot, `(..., H)`. None: nobody.
         voice_of: place of the vehicle whose voice each of the H is, `(..., H)`, where one has several. None:
             each its own.
+        outlook: what the ego sees and helpers would add, for a schedule that needs it; else None.
     """
 
     own: Floats
@@ -42,12 +44,14 @@ class Intents:
     sensed_m: Floats | None = None
     silent: Bools | None = None
     voice_of: Ints | None = None
+    outlook: Outlook | None = None
 
     def take(self, at: Any) -> "Intents":
         """The decisions at these places of the leading dimension."""
         return replace(
             self,
             site=self.site and self.site.take(at),
+            outlook=self.outlook and self.outlook.take(at),
             **{name: array[at] for name, array in self.arrays().items()},
         )
 
@@ -60,12 +64,19 @@ class Intents:
             if name not in ("own", "helpers")
         }
         helpers = np.take_along_axis(self.helpers, places[..., None], axis=-2)
-        return replace(self, helpers=helpers, site=self.site and self.site.of_helpers(places), **taken)
+        return replace(
+            self,
+            helpers=helpers,
+            site=self.site and self.site.of_helpers(places),
+            outlook=self.outlook and self.outlook.of_helpers(places),
+            **taken,
+        )
 
     def arrays(self) -> dict[str, Any]:
         """Those that are there, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if name != "site" and value is not None}
+        return {name: value for name, value in values.items() if name not in PARTS and value is not None}
 
 
+PARTS = ("site", "outlook")
 WITH_EGO = ("distance_m", "inference_s")  # arrays whose first column is the ego's

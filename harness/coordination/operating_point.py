@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.networks import Network, network
@@ -50,6 +52,9 @@ class OperatingPoint:
         name: what reports call it.
         profile: channel profile; None disables V2V.
         tau_nats: the ego asks when its entropy is above this.
+        schedule: whom the ego asks, and when: `entropy`, the paper's, or another of `SCHEDULES`.
+        threshold: what asking has to be worth more than by another schedule, in its unit; None keeps the
+            schedule's own.
         window_s: decision window, from the start of the decision; a later reply is not fused.
         radius_m: the paper's R; helpers farther from the ego are not asked.
         max_helpers: the cooperative neighbourhood; of more helpers the nearest are asked.
@@ -95,6 +100,8 @@ class OperatingPoint:
     name: str
     profile: str | None
     tau_nats: float = 0.7
+    schedule: str = PAPER
+    threshold: float | None = None
     window_s: float = 0.2
     radius_m: float = 100.0
     max_helpers: int = 3
@@ -133,6 +140,19 @@ class OperatingPoint:
         if str(self.consensus) not in RULES and self.consensus != EGO_PROMPT:
             raise unknown("consensus", str(self.consensus), names())
         self._number("tau_nats", "a finite number of nats, 0 or more", zero=True)
+        if self.schedule == ORACLE:
+            raise UserError(
+                f"operating point {printable(self.name)!r}: schedule {ORACLE} looks at how scenes end; "
+                f"`harness schedule compare` plays it, and others are {', '.join(SCHEDULES)}"
+            )
+        if str(self.schedule) not in SCHEDULES:
+            raise unknown("schedule", str(self.schedule), SCHEDULES)
+        if self.threshold is not None:
+            self._number("threshold", "a finite number, 0 or more", zero=True)
+            if self.schedule == PAPER:
+                raise self._wrong("threshold", f"left out where schedule is {PAPER}: its is tau_nats")
+            if SCHEDULES[self.schedule].threshold is None:
+                raise self._wrong("threshold", f"left out where schedule is {self.schedule}, which has none")
         self._number("window_s", "seconds above 0")
         self._number("radius_m", "metres above 0")
         self._number("min_distance_m", "metres above 0")
@@ -255,6 +275,18 @@ class OperatingPoint:
         """The same with these settings of its channel. Raises UserError for one that it has not."""
         texts = {**pairs(self.radio), **settings}
         return replace(self, radio=",".join(f"{key}={value}" for key, value in texts.items()))
+
+    @property
+    def asks_above(self) -> float:
+        """What asking has to be worth more than, in the schedule's unit."""
+        if self.schedule == PAPER:
+            return self.tau_nats
+        own = SCHEDULES[self.schedule].threshold
+        return self.threshold if self.threshold is not None else 0.0 if own is None else own
+
+    def needs(self, what: str) -> bool:
+        """Whether its schedule looks at `in_time`, `outlook` or `lot`."""
+        return self.profile is not None and what in SCHEDULES[self.schedule].needs
 
     @property
     def asks_again(self) -> bool:

@@ -1,8 +1,8 @@
 """Where prompts, models, channels, devices, networks and datasets lie: in a project, and what ships beside.
 
 What ships lies at the checkout's top level, or inside the wheel. A folder with a file `swarmdrive.toml` is a
-project; its own `prompts/`, `models/`, `channels/`, `devices/`, `networks/` and `datasets/` count where it is
-the current directory.
+project; its own `prompts/`, `models/`, `channels/`, `devices/`, `networks/`, `schedules/` and `datasets/`
+count where it is the current directory.
 """
 
 import os

@@ -35,9 +35,15 @@ from harness.world.state import WorldState
 
 @dataclass(frozen=True)
 class Scene:
-    """One decision point, frozen."""
+    """One decision point, frozen.
+
+    Attributes:
+        record: what the dataset has of it.
+        notes: what was worked out from it, by name, and need not be again.
+    """
 
     record: dict[str, Any]
+    notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def id(self) -> str:

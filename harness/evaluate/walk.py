@@ -16,11 +16,13 @@ from harness.coordination.coordinate import Coordination, Fusion, FusionCall, co
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.scheduling import Outlook
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.fusion import codes_of
+from harness.evaluate.outlook import outlook
 from harness.radio.channel import Draws, Physical, Site, Unit
 from harness.radio.fading import Trips
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
@@ -87,6 +89,10 @@ class World(Protocol[Moment]):
         """Where vehicles and units are in the moments just shown, (n, ...); None without places."""
         ...
 
+    def outlook(self) -> Outlook | None:
+        """What egos see in the moments just shown, (n, ...); None in a world without places."""
+        ...
+
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
@@ -107,6 +113,10 @@ class Placed:
         """Where the vehicles of each scene are, and these units."""
         moments = [(scene.state, scene.viewers) for scene in self.scenes]
         return site(moments, units, self.scenario.road().zone_m)
+
+    def outlook(self) -> Outlook:
+        """What the ego of each scene sees."""
+        return outlook(self.scenario.road(), self.scenes)
 
 
 class Fuses(Protocol):
@@ -144,6 +154,8 @@ def walk(
         due = {point: each for point in points if len((each := world.due(point)).at)}
         if any(isinstance(point.channel, Physical) for point in due):
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
+        if any(point.needs("outlook") for point in due):
+            intents = replace(intents, outlook=world.outlook())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
         said = {

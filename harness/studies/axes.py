@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.coordination.rules import POOLS, names
+from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.profiles import CHANNELS, settable
 
@@ -91,8 +92,9 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.worded:
         for part in parts:
-            if axis.field == "consensus" and part not in names():
-                raise unknown("--grid", part, names())
+            known = {"consensus": names(), "schedule": SCHEDULES}.get(str(axis.field), (part,))
+            if part not in known:
+                raise unknown("--grid", part, known)
         return tuple(dict.fromkeys(parts))
     values = [value for part in parts for value in _values(axis, part)]
     if len(values) > MOST_POINTS:

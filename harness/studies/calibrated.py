@@ -152,6 +152,9 @@ class CalibratedWorld:
     def site(self, units: Collection[Unit]) -> None:
         """The study's vehicles are nowhere in particular."""
 
+    def outlook(self) -> None:
+        """They see nothing in particular."""
+
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""
         [part] = decided

@@ -1,0 +1,128 @@
+"""`harness schedule`: whom to ask and when, compared over stored runs; and one that is learnt from them."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import typer
+
+from harness.cli import options
+from harness.cli.estimates import console, table
+from harness.cli.progress import bar
+from harness.core import extras
+from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import shown
+
+app = typer.Typer(help="Compare whom to ask and when, or learn it.", no_args_is_help=True)
+
+TrainRuns = typer.Argument(help="Folders of finished runs on train layouts.", metavar="RUN...")
+
+
+@app.command()
+def learn(
+    runs: list[Path] = TrainRuns,
+    tune: list[Path] = typer.Option(..., help="Run on tune layouts, to choose the threshold on. Repeatable."),
+    condition: str = typer.Option("6g:max_helpers=1", help="Operating point to learn it for."),
+    out: Path = typer.Option(..., help="File to write: schedules/NAME.toml makes it schedule NAME."),
+    quiet: options.Quiet = False,
+) -> None:
+    """Learn what asking a helper is worth, from runs on train layouts."""
+    from harness.coordination.operating_point import named_point
+    from harness.studies.learning import ROUNDS, run_learn
+    from harness.studies.stored import Stored
+
+    if out.suffix != ".toml":
+        raise UserError(f"--out {printable(out)}: end it in .toml")
+    if out.exists():
+        raise UserError(
+            f"--out {printable(out)} is there already; give a new name, since runs name schedules"
+        )
+    point = named_point(condition)
+    command = shlex.join(["harness", *sys.argv[1:]])
+    with bar("learning", ROUNDS, quiet=quiet) as progress:
+        train, others = ([Stored(run, None, progress.more, progress) for run in of] for of in (runs, tune))
+        progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *others)))
+        made = run_learn(train, others, point, out, command, progress)
+    if not quiet:
+        typer.echo(f"wrote {printable(out)}: threshold {made.threshold:g}, the best on tune layouts")
+
+
+@app.command()
+def compare(
+    runs: options.Runs,
+    tune: list[Path] = typer.Option(
+        [], help="Run on tune layouts, to choose settings on; one for each run, in order."
+    ),
+    condition: str = typer.Option("6g", help="Operating point, whose schedule is replaced."),
+    budget: float = typer.Option(0.5, help="Share of the paper's messages that a setting may take."),
+    schedule: list[str] | None = typer.Option(None, help="Schedule. Repeatable. Default: all."),
+    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
+    latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
+    out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/schedules."),
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Compare schedules on stored answers, between asking nobody and an oracle.
+
+    The model is asked only about decision points to which the run has not come; the run keeps the answers.
+    """
+    from harness.coordination.schedules import SCHEDULES
+    from harness.studies.learning import layouts
+    from harness.studies.schedules import compare as compared_on
+    from harness.studies.stored import Stored
+    from harness.studies.sweep import point_of
+
+    extras.need("harness schedule compare", "matplotlib")
+    names = list(dict.fromkeys(schedule or SCHEDULES))
+    for name in names:
+        if name not in SCHEDULES:
+            raise unknown("--schedule", name, SCHEDULES)
+    if latency not in ("run", "paper"):
+        raise unknown("--latency", latency, ("run", "paper"))
+    if not 0 < budget <= 1:
+        raise UserError(f"--budget {budget:g}: give a share above 0, 1 at most")
+    if tune and len(tune) != len(runs):
+        raise UserError(
+            f"--tune: {len(tune)} given for {len(runs)} runs; give one for each, in order, or none"
+        )
+    silent = as_json or quiet
+    with bar("schedules", quiet=silent) as progress:
+        stored = [Stored(run, latency, progress.more, progress) for run in (*runs, *tune)]
+        for other in stored[len(runs) :]:
+            layouts(other, "tune")
+        draws = options.parse_seeds(seeds) if seeds else stored[0].seeds
+        steps = sum(each.dataset.scenario.parameters.decisions for each in stored)
+        progress.more(steps + len(runs) * len(names))
+        apart: list[Stored | None] = [*stored[len(runs) :]] if tune else [None] * len(runs)
+        found = [
+            compared_on(run, other, point_of([run], condition), names, draws, budget, progress)
+            for run, other in zip(stored, apart, strict=False)
+        ]
+    from harness.studies.schedule_page import in_sentences, said, tables, write_schedules
+
+    where = out or runs[0] / "schedules"
+    page = write_schedules(found, [each.manifest() for each in stored], draws, where)
+    if as_json:
+        typer.echo(tables(found)["schedules"].to_json(orient="records"))
+    if silent:
+        return
+    text = console()
+    for run in found:
+        text.print(f"{printable(run.name, 40)} · {printable(run.point.name, 36)}")
+        table(
+            ("schedule", "success %", "msgs", "over paper's", "gap closed %"),
+            [
+                (
+                    printable(said(row), 24), shown(row.success), f"{row.play.means['messages']:.1f}",
+                    shown(row.over_paper), shown(row.closed, 100.0, 0),
+                )
+                for row in run.rows
+            ],
+        )  # fmt: skip
+        for sentence in in_sentences(run):
+            text.print(printable(sentence, 400))
+    text.print(
+        "helpers asked at most and threshold follow a schedule's name; 95 % intervals over episodes, paired; "
+        "costs, p, areas and random at equal messages are on the page"
+    )
+    typer.echo(f"wrote {printable(page)}")

@@ -1,0 +1,76 @@
+"""What an ego sees of the regions, and what it can tell that its helpers see, before it asks anybody."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from harness.coordination.scheduling import Outlook
+from harness.core.arrays import Bools, Floats
+from harness.dataset.load import Scene
+from harness.world.beacons import known
+from harness.world.perception.rays import blocked_by
+from harness.world.road import Road
+from harness.world.state import VehicleState, WorldState
+
+MOVING_MPS = 0.1  # slower than that is a standstill
+
+
+def outlook(road: Road, moments: Sequence[Scene]) -> Outlook:
+    """The outlook of each moment, (n, ...)."""
+    n, helpers = len(moments), max((len(scene.viewers) for scene in moments), default=1) - 1
+    unseen, to_zone_s = np.zeros((n, len(road.sectors))), np.zeros(n)
+    added = np.full((n, helpers, len(road.sectors)), np.nan)
+    for i, scene in enumerate(moments):
+        of = _outlook(road, scene)
+        unseen[i], added[i, : len(of.added)], to_zone_s[i] = of.unseen, of.added, of.to_zone_s
+    return Outlook(unseen, added, to_zone_s)
+
+
+def _outlook(road: Road, scene: Scene) -> Outlook:
+    """A moment's outlook; kept with the scene, which never changes."""
+    if (kept := scene.notes.get("outlook")) is None:
+        graph, state = scene.record["graphs"][scene.viewers[0]], scene.state
+        helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]
+        there = _as_known(state, graph["nodes"], helpers)
+        # What hides a point from the ego it sees for itself; where that stands it has to measure.
+        reported = {state.ego.id, *(node["id"] for node in graph["nodes"])}
+        in_sight = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
+        unseen = _unseen(road, in_sight, state.ego)
+        added = [_by_region(road, unseen & ~_unseen(road, there, helper)) for helper in helpers]
+        itself = graph["ego"]
+        left_m, speed_mps = max(itself["zone_m"], 0.0), itself["speed_mps"]
+        to_zone_s = left_m / speed_mps if speed_mps > MOVING_MPS else np.inf if left_m else 0.0
+        regions = len(road.sectors)
+        kept = Outlook(_by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s))
+        scene.notes["outlook"] = kept
+    return kept
+
+
+def _as_known(
+    state: WorldState, nodes: Sequence[Mapping[str, Any]], helpers: Sequence[VehicleState]
+) -> WorldState:
+    """The state with nobody but those that the ego's sensors report or its radio hears, where these say."""
+    ego, by_beacon = state.ego, {helper.id: helper for helper in helpers}
+    cos, sin = np.cos(ego.heading_rad), np.sin(ego.heading_rad)
+    vehicles = [ego, *helpers]
+    for node in nodes:
+        if node["id"] not in by_beacon:
+            forward_m, left_m = node["forward_m"], node["left_m"]
+            x_m = ego.x_m + forward_m * cos + left_m * sin
+            y_m = ego.y_m + forward_m * sin - left_m * cos
+            vehicles.append(replace(state.vehicle(node["id"]), x_m=float(x_m), y_m=float(y_m)))
+    return replace(state, vehicles=tuple(vehicles))
+
+
+def _unseen(road: Road, state: WorldState, viewer: VehicleState) -> Bools:
+    """Which of the points to be watched something hides from a viewer."""
+    points = road.watched if road.sectors else np.empty((0, 2))
+    return np.array([by is not None for by in blocked_by(state, viewer, points)], dtype=bool)
+
+
+def _by_region(road: Road, points: Bools) -> Floats:
+    """Share of each region's points, (R,)."""
+    ends = np.cumsum([len(of) for of in road.sectors.values()])[:-1]
+    return np.array([part.mean() for part in np.split(points, ends)] if road.sectors else [], dtype=float)

@@ -1,0 +1,206 @@
+"""Every set of helpers that an ego could ask, at every decision point that asking them leads to.
+
+Frozen scenes say how each course ends, and draws are keyed by seed, layout and step. So what any choice of
+helpers comes to, with these answers and these draws, follows backwards from the ends, exactly. The best of
+all choices is the oracle: a bound, since no car knows what a helper will say, or how an episode ends.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from harness.coordination.coordinate import fuse
+from harness.coordination.exchange import exchange, worth_of
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import EGO_PROMPT, RULES
+from harness.coordination.scheduling import chosen
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError, printable
+from harness.dataset.forest import Forest
+from harness.evaluate.outlook import outlook
+from harness.evaluate.walk import channel_draws
+from harness.radio.channel import Draws, Physical
+from harness.studies.stored import Stored
+from harness.world.sight_lines import site
+
+MOST_SETS = 64
+COSTS = ("messages", "airtime_ms", "latency_ms", "decisions")  # of a decision; an episode has their sums
+PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
+
+
+@dataclass(frozen=True)
+class Level:
+    """Decision points N of one step, seeds S, sets of helpers K.
+
+    Attributes:
+        at: the points, ascending, (N,).
+        action: what the ego does if it asks a set, (S, N, K).
+        costs: `COSTS` of asking a set, (S, N, K, C); NaN where unknown.
+        intents: what the vehicles of each decision intend, with the outlook, (S x N, ...).
+        draws: the channel's, (S x N, ...).
+    """
+
+    at: Ints
+    action: Ints
+    costs: Floats
+    intents: Intents
+    draws: Draws
+
+
+Choose = Callable[[Level, Floats, Floats], Ints]
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What each set of helpers comes to.
+
+    Attributes:
+        forest: of the run's dataset.
+        sets: which helpers each has, the empty one first, (K, H).
+        levels: of decision points, the first step's first.
+    """
+
+    forest: Forest
+    sets: Bools
+    levels: tuple[Level, ...]
+
+    def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
+        """Each level, the last first, with what its sets come to and which are chosen.
+
+        Args:
+            choose: index of the set chosen in each decision, (S, N), from the level, and from the success,
+                (S, N, K), and the costs, (S, N, K, C), that each set comes to with the rest of the course.
+        """
+        following, success, costs = np.empty(0, dtype=int), np.empty((0, 0)), np.empty((0, 0, len(COSTS)))
+        for level in reversed(self.levels):
+            at = level.at[:, None]
+            child, tree = self.forest.child[at, level.action], self.forest.tree[at]
+            ends = self.forest.succeeds(self.forest.edge[at, level.action], tree).astype(float)
+            spent = level.costs
+            if len(following):
+                seed = np.arange(len(child))[:, None, None]
+                place = np.minimum(np.searchsorted(following, child), len(following) - 1)
+                ends = np.where(child >= 0, success[seed, place], ends)
+                spent = spent + np.where((child >= 0)[..., None], costs[seed, place], 0.0)
+            k = choose(level, ends, spent)
+            success, costs = _of(ends, k), _of(spent, k)
+            following = level.at
+            yield level, ends, spent, k
+
+    def played(self, choose: Choose) -> tuple[Floats, Floats]:
+        """Success, (S, E), and costs, (S, E, C), of every episode, by a rule as in `backwards`."""
+        [*_, (level, ends, spent, k)] = self.backwards(choose)
+        root = np.searchsorted(level.at, self.forest.root)
+        return _of(ends, k)[:, root], _of(spent, k)[:, root]
+
+    def oracle(self) -> tuple[Floats, Floats]:
+        """What the best choice of helpers comes to, with the fewest messages that it takes."""
+        return self.played(lambda level, ends, spent: np.argmax(ends - PRICE * spent[..., 0], axis=-1))
+
+    def index(self, asked: Bools) -> Ints:
+        """The sets of these helpers `(..., H)`, by number."""
+        codes = self.sets @ (1 << np.arange(self.sets.shape[1]))
+        order = np.argsort(codes)
+        wide = np.pad(asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])])
+        found: Ints = order[np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))]
+        return found
+
+    def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
+        """The rule that asks whom a point's schedule asks; `worths` of each level, if they are known."""
+        known = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
+
+        def choose(level: Level, ends: Floats, spent: Floats) -> Ints:
+            intents = level.intents
+            worth = worth_of(point, intents, level.draws) if known is None else known[id(level)]
+            may_ask = intents.valid & (intents.range_m <= point.radius_m)
+            asked = chosen(worth, point.asks_above, may_ask, intents.range_m, point.max_helpers)
+            return self.index(asked).reshape(ends.shape[:2])
+
+        return choose
+
+    def worths(self, point: OperatingPoint) -> list[Floats]:
+        """What asking each helper is worth by the point's schedule, `(S x N, H)` or `(S x N, 1)` a level."""
+        return [worth_of(point, level.intents, level.draws) for level in self.levels]
+
+
+def _of(values: Floats, k: Ints) -> Floats:
+    """Of the sets `k`, (S, N), what `values` say of each set, (S, N, K, ...)."""
+    index = k.reshape(*k.shape, *[1] * (values.ndim - 2))
+    return np.asarray(np.take_along_axis(values, index, 2)[:, :, 0])
+
+
+def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
+    """Raise UserError where what follows depends on more than who is heard now."""
+    shown = printable(point.name)
+    if point.consensus == EGO_PROMPT or RULES[point.consensus].start((), helpers, actions).shape[-1]:
+        raise UserError(
+            f"--condition {shown}: consensus {point.consensus} is no function of who is heard now, so that "
+            "the oracle would be none; give linear, or another without memory"
+        )
+    for setting, honest in (("messages", "own"), ("attack", "")):
+        if getattr(point, setting) != honest:
+            raise UserError(f"--condition {shown}: the oracle knows no {setting}; leave it out")
+
+
+def choices(
+    stored: Stored, point: OperatingPoint, seeds: Sequence[int], progress: Callable[[int], None]
+) -> Choices:
+    """All choices of an operating point. What the run has no answer to its model is asked.
+
+    Args:
+        stored: a run.
+        point: the operating point; whom its schedule asks does not matter.
+        seeds: of the channel.
+        progress: called with 1 for each step.
+
+    Raises:
+        UserError: what follows depends on more than who is heard now, or there are too many sets.
+    """
+    dataset, forest, seed = stored.dataset, stored.dataset.forest, np.array(seeds)
+    helpers = stored.vehicles - 1
+    refuse(point, helpers, len(dataset.actions))
+    sizes = range(min(point.max_helpers, helpers) + 1)
+    members = [of for size in sizes for of in combinations(range(helpers), size)]
+    if len(members) > MOST_SETS:
+        raise UserError(
+            f"--condition {printable(point.name)}: {len(members)} sets of helpers, {MOST_SETS} at most; "
+            "give a smaller max_helpers"
+        )
+    sets = np.array([[h in of for h in range(helpers)] for of in members]).reshape(len(members), helpers)
+    at, levels = forest.root, list[Level]()
+    while len(at):
+        level = _level(stored, point, seed, at, sets)
+        levels.append(level)
+        following = forest.child[at[:, None], level.action]
+        at = np.unique(following[following >= 0])
+        progress(1)
+    return Choices(forest, sets, tuple(levels))
+
+
+def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools) -> Level:
+    dataset, forest = stored.dataset, stored.dataset.forest
+    scenario, shape = dataset.scenario, (len(seeds), len(at))
+    scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
+    intents = replace(stored(scenes), outlook=outlook(scenario.road(), scenes))
+    if isinstance(point.channel, Physical):
+        moments = [(scene.state, scene.viewers) for scene in scenes]
+        units = [point.unit] if point.unit else []
+        intents = replace(intents, site=site(moments, units, scenario.road().zone_m))
+    seed, node = (index.ravel() for index in np.indices(shape))
+    steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
+    draws = channel_draws(
+        seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
+    )
+    intents = intents.take(node)
+    actions, costs = [], []
+    for who in sets[:, :width]:
+        heard = fuse(
+            point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents
+        )
+        actions.append(heard.action.reshape(shape))
+        each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)))
+        costs.append(np.stack(each, -1).reshape(*shape, len(COSTS)))
+    return Level(at, np.stack(actions, -1), np.stack(costs, 2), intents, draws)

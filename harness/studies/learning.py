@@ -1,0 +1,155 @@
+"""`harness schedule learn`: what asking a helper is worth, learnt from where decisions lead on train layouts.
+
+At every decision point that some choice of helpers leads to, asking one helper alone has a gain: success with
+it less success without, the rest of the course decided as the schedule decides. The network learns the gain,
+averaged over the channel's draws; then the rest of the courses is decided by the network, and it learns anew.
+The threshold is chosen on tune layouts.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from harness.coordination.exchange import known_of
+from harness.coordination.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
+from harness.coordination.operating_point import OperatingPoint
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
+from harness.core.files import write_whole
+from harness.core.seeds import Purpose, purposes, stated
+from harness.studies.choices import Choices, Choose, choices
+from harness.studies.stored import Stored
+
+UNITS = 12
+ROUNDS = 6
+STEPS = 1500
+RATE, DECAY = 0.02, 1e-3  # of Adam; of the weights, per step and per row
+WHILE_LEARNING = 0.02  # gain above which courses go on by asking
+DIGITS = 4  # of a weight in a file
+LEAST = 1e-3  # standard deviation of an input that varies
+THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
+
+
+def layouts(stored: Stored, wanted: Purpose) -> str:
+    """A run with its layout seeds in words. Raises UserError unless all are for this purpose."""
+    seeds = stored.dataset.forest.seeds
+    first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
+    if purposes(first, count) != [wanted]:
+        raise UserError(
+            f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} layouts, which "
+            "`harness dataset build --seed` makes"
+        )
+    return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {len(seeds)} layouts"
+
+
+def gains(made: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
+    """Inputs (n, F) and gains (n,) of asking each helper alone, at every point where it may be asked."""
+    alone = [made.index(np.eye(made.sets.shape[1], dtype=bool)[h]) for h in range(made.sets.shape[1])]
+    rows, targets = [], []
+    for level, ends, _, _ in made.backwards(choose):
+        known = known_of(point, level.intents, level.draws)
+        places = slice(0, len(level.at))  # what is known is the same under every seed
+        gain = (ends[..., alone] - ends[..., :1]).mean(axis=0)
+        there = known.may_ask[places]
+        rows.append(inputs(known)[places][there])
+        targets.append(gain[:, : there.shape[1]][there])
+    return np.concatenate(rows), np.concatenate(targets)
+
+
+def fit(x: Floats, y: Floats) -> Network:
+    """The network that says y (n,) of x (n, F), by least squares: Adam, whole batches, weights decay."""
+    draws = noise.generator("schedule", "weights")
+    centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
+    z, n = (x - centre) / scale, len(y)
+    weights = [
+        draws.normal(0, x.shape[1] ** -0.5, (x.shape[1], UNITS)), np.zeros(UNITS),
+        draws.normal(0, 0.1, UNITS), np.array(y.mean()),
+    ]  # fmt: skip
+    means, squares = ([np.zeros_like(w) for w in weights] for _ in range(2))
+    for step in range(1, STEPS + 1):
+        into, bias, out, base = weights
+        units = np.tanh(z @ into + bias)
+        error = units @ out + base - y
+        back = np.outer(error, out) * (1 - units**2)
+        of_into, of_out = z.T @ back / n + DECAY * into, units.T @ error / n + DECAY * out
+        slopes = (of_into, back.mean(axis=0), of_out, error.mean())
+        means = [0.9 * m + 0.1 * s for m, s in zip(means, slopes, strict=True)]
+        squares = [0.999 * q + 0.001 * s**2 for q, s in zip(squares, slopes, strict=True)]
+        rate = RATE * (1 - step / STEPS)
+        weights = [
+            w - rate * (m / (1 - 0.9**step)) / (np.sqrt(q / (1 - 0.999**step)) + 1e-8)
+            for w, m, q in zip(weights, means, squares, strict=True)
+        ]
+    parts = [np.round(part, DIGITS) for part in (centre, scale, *weights)]
+    return Network(parts[0], parts[1], parts[2], parts[3], parts[4], float(parts[5]))
+
+
+def learn(train: Sequence[Stored], point: OperatingPoint, progress: Callable[[int], None]) -> Network:
+    """The network learnt from runs on train layouts, under an operating point.
+
+    Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
+    """
+    made = [choices(stored, point, stored.seeds, progress) for stored in train]
+    network, rest = None, [each.scheduled(point) for each in made]
+    looks = replace(point, schedule="coverage", threshold=None)  # it needs the outlook, as the network does
+    for _ in range(ROUNDS):
+        pairs = [gains(each, looks, choose) for each, choose in zip(made, rest, strict=True)]
+        network = fit(*(np.concatenate(part) for part in zip(*pairs, strict=True)))
+        rest = [by_network(each, looks, network, WHILE_LEARNING) for each in made]
+        progress(1)
+    assert network is not None
+    return network
+
+
+def by_network(made: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
+    """The rule that asks whom the network says to."""
+    schedule = Learnt(network, threshold)
+    worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in made.levels]
+    return made.scheduled(replace(point, threshold=threshold), worths)
+
+
+def tuned(
+    network: Network, tune: Sequence[Stored], point: OperatingPoint, progress: Callable[[int], None]
+) -> float:
+    """The threshold with the most success on tune layouts, the mean over runs; of equals the highest."""
+    success = np.zeros(len(THRESHOLDS))
+    looks = replace(point, schedule="coverage", threshold=None)
+    for stored in tune:
+        made = choices(stored, point, stored.seeds, progress)
+        success += [made.played(by_network(made, looks, network, each))[0].mean() for each in THRESHOLDS]
+    return THRESHOLDS[int(np.flatnonzero(np.isclose(success, success.max()))[-1])]
+
+
+def text(stated: Stated) -> str:
+    """The file of a schedule: TOML, whose strings and lists are JSON's."""
+    fields = asdict(stated)
+    network = fields.pop("network")
+    lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
+    return "\n".join([*lines, "", "[network]", *(f"{k} = {json.dumps(v)}" for k, v in network.items()), ""])
+
+
+def run_learn(
+    train: Sequence[Stored], tune: Sequence[Stored], point: OperatingPoint, out: Path, command: str,
+    progress: Callable[[int], None],
+) -> Stated:  # fmt: skip
+    """Learn a schedule, choose its threshold, and write its file.
+
+    Raises:
+        UserError: a run is on layouts for another purpose, or the operating point's answers are no function
+            of who is heard.
+    """
+    learnt_from = tuple(layouts(stored, "train") for stored in train)
+    tuned_on = tuple(layouts(stored, "tune") for stored in tune)
+    network = learn(train, point, progress)
+    weights = {name: np.asarray(part).tolist() for name, part in asdict(network).items()}
+    made = Stated(
+        description=f"Learnt: the gain of asking a helper, under {point.name}.", command=command,
+        learnt_from=learnt_from, tuned_on=tuned_on, condition=point.name,
+        threshold=tuned(network, tune, point, progress), inputs=INPUTS, network=Weights(**weights),
+    )  # fmt: skip
+    write_whole(out, text(made))
+    return made

@@ -1,0 +1,310 @@
+"""`harness schedule compare`: schedules on stored answers, between asking nobody and the oracle.
+
+All schedules decide the same episodes with the same draws, so what they differ in is whom they ask, and when.
+A schedule's settings are its threshold and how many helpers it asks at most. Which setting is best is chosen
+on tune layouts, where a run on such is given, and reported on others.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import ORACLE, PAPER
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.multiplicity import holm
+from harness.core.statistics import Estimate, resampled
+from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
+from harness.studies.choices import COSTS, Choices, choices
+from harness.studies.stored import Stored
+
+RESAMPLES = 2000
+SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
+NEVER, ALWAYS, RANDOM = "never", "always", "random"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A schedule with a threshold, None without one, that asks `most` helpers at most."""
+
+    schedule: str
+    threshold: float | None
+    most: int
+
+    def at(self, point: OperatingPoint) -> OperatingPoint:
+        """The operating point with this setting."""
+        if self.schedule == PAPER and self.threshold is not None:
+            changed = replace(point, schedule=PAPER, threshold=None, tau_nats=self.threshold)
+        else:
+            changed = replace(point, schedule=self.schedule, threshold=self.threshold)
+        return replace(changed, max_helpers=self.most)
+
+    def __str__(self) -> str:
+        return f"{self.most}" if self.threshold is None else f"{self.most}, {self.threshold:g}"
+
+
+@dataclass(frozen=True)
+class Play:
+    """What came of a setting: success, (S, E), and `COSTS`, (S, E, C), of every episode."""
+
+    setting: Setting
+    success: Floats
+    costs: Floats
+
+    @property
+    def messages(self) -> Floats:
+        """Of every episode, (S, E)."""
+        return np.asarray(self.costs[..., COSTS.index("messages")])
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Messages and milliseconds on air of an episode, and milliseconds of a decision."""
+        messages, air, latency, decisions = (self.costs.sum(axis=(0, 1)) / self.success.size).tolist()
+        return {"messages": messages, "airtime_ms": air, "latency_ms": latency / decisions}
+
+
+def plays(made: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> list[Play]:
+    """Play settings of one schedule; what asking is worth by it is worked out once."""
+    worths = made.worths(settings[0].at(point))
+    rules = [made.scheduled(setting.at(point), worths) for setting in settings]
+    return [Play(s, *made.played(rule)) for s, rule in zip(settings, rules, strict=True)]
+
+
+def settings(made: Choices, point: OperatingPoint, schedule: str) -> list[Setting]:
+    """The settings of a schedule that are tried: tenths of what asking is worth, its own threshold, and 0."""
+    most = range(1, point.max_helpers + 1)
+    own = replace(point, schedule=schedule, threshold=None)
+    if schedule != PAPER and SCHEDULES[schedule].threshold is None:
+        return [Setting(schedule, None, m) for m in most]
+    best = [np.fmax.reduce(worth, axis=-1) for worth in made.worths(own)]
+    tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
+    tried = {0.0, own.asks_above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
+    return [Setting(schedule, threshold, m) for threshold in sorted(tried) for m in most]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A schedule at the setting chosen for it, and what it is worth.
+
+    Attributes:
+        play: what came of it.
+        success: of episodes.
+        over_paper: success less that of the paper's schedule.
+        p: of no such difference, by Holm's method for all schedules of the run; None without an interval, and
+            for the paper's own and the oracle.
+        over_random: success less that of `random` with as many messages.
+        closed: share of the gap between the paper's schedule and the oracle that it closes.
+        messages: its messages as a share of the paper's.
+        area: success averaged over budgets from no message to those of `always`, at the settings of `front`.
+    """
+
+    play: Play
+    success: Estimate
+    over_paper: Estimate
+    p: float | None
+    over_random: Estimate
+    closed: Estimate
+    messages: Estimate
+    area: Estimate
+
+
+@dataclass(frozen=True)
+class Compared:
+    """All schedules on one run.
+
+    Attributes:
+        name: the run's model, prompt and answer mode.
+        point: the operating point.
+        names: of the schedules that are compared.
+        plays: of every setting, by schedule.
+        tune: the same on tune layouts; empty without.
+        oracle: the bound.
+        budget: share of the paper's messages within which settings are chosen.
+    """
+
+    name: str
+    point: OperatingPoint
+    names: tuple[str, ...]
+    plays: Mapping[str, Sequence[Play]]
+    tune: Mapping[str, Sequence[Play]]
+    oracle: Play
+    budget: float
+
+    @property
+    def paper(self) -> Play:
+        """The paper's schedule at the operating point's tau, with all the helpers that it allows."""
+        return _found(self.plays[PAPER], self._paper)
+
+    @property
+    def _paper(self) -> Setting:
+        return Setting(PAPER, self.point.tau_nats, self.point.max_helpers)
+
+    @property
+    def everybody(self) -> Play:
+        """Always asking all the helpers that the point allows."""
+        return _found(self.plays[ALWAYS], Setting(ALWAYS, None, self.point.max_helpers))
+
+    @cached_property
+    def weights(self) -> Floats:
+        """The weight of each episode, as played and in each resample, (1 + RESAMPLES, E)."""
+        n = self.oracle.success.shape[1]
+        return np.asarray(resampled(noise.generator("schedule", "episodes"), n, RESAMPLES) / n)
+
+    def chosen(self, schedule: str) -> Play:
+        """At the setting with the most success on tune layouts within the budget; of equals the cheapest.
+
+        Where none is within the budget, at the cheapest.
+        Without tune layouts at the schedule's own threshold, with all the helpers that the point allows.
+        """
+        if not self.tune:
+            threshold = self.point.tau_nats if schedule == PAPER else SCHEDULES[schedule].threshold
+            return _found(self.plays[schedule], Setting(schedule, threshold, self.point.max_helpers))
+        budget = self.budget * _found(self.tune[PAPER], self._paper).messages.mean()
+        cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
+        within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
+        best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
+        return _found(self.plays[schedule], best.setting)
+
+    def front(self, schedule: str) -> list[Play]:
+        """The settings that are taken as the budget grows: of those it allows, the best on tune layouts.
+
+        Without tune layouts the best on these, which flatters them. The first asks nobody.
+        """
+        taken, best = list[Play](), -np.inf
+        for play, rank in sorted(
+            self._ranked(schedule), key=lambda pair: (pair[0].messages.mean(), -pair[1])
+        ):
+            if rank > best:
+                taken.append(play)
+                best = rank
+        return taken
+
+    def _ranked(self, schedule: str) -> list[tuple[Play, float]]:
+        """A schedule's plays, and never asking, each with its success on tune layouts, else its own."""
+        every = [self.plays[NEVER][0], *(self.plays[schedule] if schedule != NEVER else ())]
+        tuned = {play.setting: play for of in self.tune.values() for play in of}
+        return [(play, float(tuned.get(play.setting, play).success.mean())) for play in every]
+
+    def of_oracle(self) -> list[Play]:
+        """The oracle where a success may cost so many messages at most, from none on."""
+        bound, most = self.oracle, int(self.oracle.messages.max())
+        cheap = [bound.messages <= cap for cap in range(most + 1)]
+        return [Play(bound.setting, bound.success * of, bound.costs * of[..., None]) for of in cheap]
+
+    def area(self, schedule: str) -> Estimate:
+        """Success averaged over budgets, with a bootstrap interval over episodes."""
+        of_bound = [(play, float(play.success.mean())) for play in self.of_oracle()]
+        ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
+        success = self._resampled([play.success for play, _ in ranked])
+        messages = self._resampled([play.messages for play, _ in ranked])
+        most = self._resampled([self.everybody.messages])
+        ranks = np.array([rank for _, rank in ranked])
+        return _interval(_area(success, np.minimum(messages, most), ranks, most[:, 0]))
+
+    def _resampled(self, values: Sequence[Floats]) -> Floats:
+        """Means of values (S, E) in each resample, (1 + RESAMPLES, P)."""
+        return np.asarray(self.weights @ np.array([each.mean(axis=0) for each in values]).T)
+
+    @cached_property
+    def regret(self) -> Estimate:
+        """Success of the oracle less that of the paper's schedule."""
+        return difference(SUCCESS, self.oracle.success.T, self.paper.success.T)
+
+    @cached_property
+    def rows(self) -> list[Chosen]:
+        """The paper's schedule, every one at the setting chosen for it, and last the oracle."""
+        found = [self.paper, *map(self.chosen, self.names), self.oracle]
+        raw = [p_value(SUCCESS, play.success.T, self.paper.success.T) for play in found[1:-1]]
+        corrected = iter(holm([p for p in raw if p is not None]))
+        p_values = [None, *(None if p is None else next(corrected) for p in raw), None]
+        return [self._row(play, p) for play, p in zip(found, p_values, strict=True)]
+
+    def _row(self, play: Play, p: float | None) -> Chosen:
+        success = self._resampled([play.success, self.paper.success, self.oracle.success])
+        messages = self._resampled([play.messages, self.paper.messages])
+        return Chosen(
+            play, over_episodes(SUCCESS, play.success),
+            difference(SUCCESS, play.success.T, self.paper.success.T), p,
+            difference(SUCCESS, play.success.T, self.random_like(play).T),
+            _interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
+            _interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.setting.schedule),
+        )  # fmt: skip
+
+    def random_like(self, play: Play) -> Floats:
+        """Success of `random` with as many messages, (S, E): a mean of its two shares next to that budget."""
+        most = self.point.max_helpers
+        every = [play for play in self.plays[RANDOM] if play.setting.most == most]
+        ladder = sorted(
+            [self.plays[NEVER][0], *every, self.everybody], key=lambda p: float(p.messages.mean())
+        )
+        means = np.array([p.messages.mean() for p in ladder])
+        wanted = min(float(play.messages.mean()), float(means[-1]))
+        above = int(np.clip(np.searchsorted(means, wanted), 1, len(ladder) - 1))
+        part = (wanted - means[above - 1]) / max(means[above] - means[above - 1], 1e-12)
+        return np.asarray((1 - part) * ladder[above - 1].success + part * ladder[above].success)
+
+
+def compare(
+    stored: Stored, tune: Stored | None, point: OperatingPoint, names: Sequence[str], seeds: Sequence[int],
+    budget: float, progress: Callable[[int], None],
+) -> Compared:  # fmt: skip
+    """Play every schedule on a run, and on one on tune layouts.
+
+    Args:
+        stored: a run.
+        tune: a run on tune layouts; the settings that are tried are its own then.
+        point: the operating point, whose schedule is replaced.
+        names: of schedules.
+        seeds: of the channel.
+        budget: share of the paper's messages within which settings are chosen.
+        progress: called with 1 for each step of the choices and each schedule.
+    """
+    made = choices(stored, point, seeds, progress)
+    apart = choices(tune, point, seeds, progress) if tune else None
+    found: dict[str, list[Play]] = {}
+    tuned: dict[str, list[Play]] = {}
+    for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
+        tried = settings(apart or made, point, name)
+        found[name] = plays(made, point, tried)
+        if apart:
+            tuned[name] = plays(apart, point, tried)
+        progress(1)
+    bound = Play(Setting(ORACLE, None, point.max_helpers), *made.oracle())
+    return Compared(stored.name, point, tuple(names), found, tuned, bound, budget)
+
+
+def _found(played: Sequence[Play], setting: Setting) -> Play:
+    return next(play for play in played if play.setting == setting)
+
+
+def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Floats:
+    """Mean over budgets from 0 to `most`, (B,), of the success, (B, P), of the setting taken at each budget.
+
+    At a budget that setting is taken which ranks highest, (P,), of those whose messages, (B, P), it allows.
+    """
+    order = np.lexsort((np.broadcast_to(-ranks, messages.shape), messages), axis=1)
+    costs = np.take_along_axis(messages, order, 1)
+    until = np.concatenate([costs[:, 1:], most[:, None]], axis=1)
+    best = np.full(len(success), -np.inf)
+    rows, taken, area = np.arange(len(success)), np.zeros(len(success)), np.zeros(len(success))
+    for place, at in enumerate(order.T):
+        better = ranks[at] > best
+        best, taken = np.where(better, ranks[at], best), np.where(better, success[rows, at], taken)
+        area += taken * (until[:, place] - costs[:, place])
+    return area / most
+
+
+def _ratio(part: Floats, whole: Floats) -> Floats:
+    """A share, NaN of nothing."""
+    return np.where(whole > 0, part / np.where(whole > 0, whole, 1.0), np.nan)
+
+
+def _interval(values: Floats) -> Estimate:
+    """The first of the values, with the percentiles of the others, which are its resamples."""
+    known = values[1:][~np.isnan(values[1:])]
+    low, high = np.percentile(known, (2.5, 97.5)).tolist() if len(known) else (np.nan, np.nan)
+    return Estimate(float(values[0]), low, high, len(known), len(values) - 1 - len(known))

@@ -1,0 +1,312 @@
+"""Schedules on stored runs: choices against walks, the oracle as a bound, fronts and areas by hand."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import live_spec_of, run, spec_of
+
+from harness.coordination.learnt import Learnt
+from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.schedules import SCHEDULES
+from harness.core.config import toml
+from harness.core.errors import UserError
+from harness.core.resources import MARKER, find
+from harness.dataset.build import build
+from harness.dataset.load import Dataset, load
+from harness.evaluate.outlook import outlook
+from harness.runs.folder import read
+from harness.runs.metrics import METRICS, of_decisions
+from harness.studies.choices import COSTS, Choices, choices
+from harness.studies.learning import fit, layouts
+from harness.studies.schedules import Compared, Play, Setting, _area, compare
+from harness.studies.stored import Stored
+from harness.world import scenarios
+
+SEED = 100  # of the first layout of `small`
+SIXG = POINTS["6g"]
+POINTS_PLAYED = (
+    "6g", "v2x", "6g:tau=0.9", "6g:max_helpers=1", "6g:schedule=coverage,max_helpers=2", "6g:schedule=random",
+    "6g:schedule=risk", "6g:schedule=margin", "v2x:schedule=deadline", "6g:schedule=learnt",
+    "6g:schedule=always", "mode4:schedule=deadline,threshold=0.01", "6g:schedule=never", "6g:radius_m=30",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stored(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    return Stored(run(spec_of(small), tmp_path_factory.mktemp("schedules") / "run").out)
+
+
+def made(stored: Stored, text: str) -> Choices:
+    return choices(stored, named_point(text), stored.seeds, lambda n: None)
+
+
+@pytest.mark.parametrize("text", POINTS_PLAYED)
+def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: Stored, text: str):
+    """The oracle is at least as good in every episode, and needs as few messages for a success."""
+    point = named_point(text)
+    every = made(stored, text)
+    success, costs = every.played(every.scheduled(point))
+    [walked] = stored.walked(point, stored.vehicles, stored.seeds)
+    assert np.array_equal(success, walked.ends["success_rate"])
+    for cost, metric in (("messages", "messages_per_episode"), ("airtime_ms", "airtime_ms")):
+        values = of_decisions(METRICS[metric], walked.columns, walked.places, success.size)
+        assert costs[..., COSTS.index(cost)] == pytest.approx(values.reshape(success.shape), abs=1e-3)
+    mean = of_decisions(METRICS["latency_proxy_ms"], walked.columns, walked.places, success.size)
+    latency, decisions = costs[..., COSTS.index("latency_ms")], costs[..., COSTS.index("decisions")]
+    assert latency / decisions == pytest.approx(mean.reshape(success.shape), abs=1e-2)
+    best, fewest = every.oracle()
+    assert (best >= success).all()
+    assert (fewest[..., 0] <= costs[..., 0])[success == 1].all()
+
+
+def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: Stored):
+    every = made(stored, "6g:max_helpers=0")
+    [alone] = stored.walked(POINTS["single-local"], stored.vehicles, stored.seeds)
+    success, costs = every.oracle()
+    assert np.array_equal(success, alone.ends["success_rate"])
+    assert not costs[..., 0].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("6g:consensus=ego-prompt", "consensus ego-prompt is no function of who is heard now"),
+        ("6g:messages=shuffled", "the oracle knows no messages; leave it out"),
+        ("6g:attack=liar", "the oracle knows no attack; leave it out"),
+    ],
+)
+def test_what_the_oracle_cannot_bound_is_refused(stored: Stored, text: str, says: str):
+    with pytest.raises(UserError, match=says):
+        made(stored, text)
+
+
+def test_the_ego_knows_of_regions_what_its_graph_says(small: Dataset):
+    """And a helper adds no more than the ego lacks."""
+    scenes = small.scenes(small.courses())
+    seen = outlook(small.scenario.road(), scenes)
+    for n, scene in enumerate(scenes):
+        graph = scene.record["graphs"][scene.viewers[0]]
+        shares = [1 - sector["seen_share"] for sector in graph["sectors"]]
+        assert seen.unseen[n] == pytest.approx(shares, abs=0.0051)
+        assert (np.nan_to_num(seen.added[n]) <= seen.unseen[n] + 1e-9).all()
+    assert (seen.added[~np.isnan(seen.added)] > 0.1).any()
+    again = outlook(small.scenario.road(), scenes[3:4])
+    assert np.array_equal(again.added[0], seen.added[3], equal_nan=True)
+
+
+@pytest.mark.slow
+def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
+    texts = ("6g:schedule=coverage,max_helpers=1", "6g:schedule=random", "6g:schedule=learnt")
+    same: Any = {"points": tuple(map(named_point, texts)), "latency": "paper"}
+    frozen = read(run(spec_of(small, **same), tmp_path / "frozen").out)
+    driven = read(run(live_spec_of(episodes=4, first_seed=SEED, **same), tmp_path / "driven").out)
+    assert [e.success for e in frozen.episodes] == [e.success for e in driven.episodes]
+    for of in texts:
+        asked = [
+            done.decisions["messages"][np.array(done.decisions.labels("condition")) == of].tolist()
+            for done in (frozen, driven)
+        ]
+        assert asked[0] == asked[1]
+        assert sum(asked[0]) > 0
+
+
+# -- fronts and areas, by hand -----------------------------------------------------------------------------
+
+
+def play(schedule: str, most: int, threshold: float | None, success: Any, messages: Any) -> Play:
+    """One seed."""
+    costs = np.array([messages, [0.1] * len(success), [150.0] * len(success), [1.0] * len(success)]).T
+    return Play(Setting(schedule, threshold, most), np.array([success], dtype=float), costs[None])
+
+
+def by_hand(tune: bool = True) -> Compared:
+    """Four episodes. Never: 1 succeeds. Always: 3 with 4 messages each. The oracle: 4 with 1 on average."""
+    plays = {
+        "entropy": [
+            play("entropy", 2, 0.7, [1, 1, 0, 0], [4, 4, 2, 2]),
+            play("entropy", 1, 0.7, [1, 1, 1, 0], [1] * 4),
+        ],
+        "never": [play("never", most, None, [1, 0, 0, 0], [0] * 4) for most in (1, 2)],
+        "always": [
+            play("always", 1, None, [1, 1, 0, 0], [2] * 4), play("always", 2, None, [1, 1, 1, 0], [4] * 4)
+        ],
+        "random": [play("random", 2, 0.5, [1, 1, 0, 0], [2] * 4)],
+    }  # fmt: skip
+    # On tune layouts the cheap entropy is worse than never, and dear.
+    worse = [plays["entropy"][0], play("entropy", 1, 0.7, [0, 0, 0, 0], [1] * 4)]
+    oracle = play("oracle", 2, None, [1, 1, 1, 1], [0, 1, 1, 2])
+    point = replace(SIXG, max_helpers=2)
+    return Compared("x", point, ("entropy",), plays, {**plays, "entropy": worse} if tune else {}, oracle, 0.5)
+
+
+def test_a_setting_is_chosen_on_tune_layouts_within_the_budget():
+    """The paper's takes 3 messages an episode, half of it is 1.5: one helper alone is within."""
+    compared = by_hand()
+    assert compared.paper.setting == Setting("entropy", 0.7, 2)
+    assert compared.chosen("entropy").setting.most == 1
+    assert compared.chosen("always").setting.most == 1, "none is within the budget: the cheapest"
+    assert by_hand(tune=False).chosen("entropy").setting.most == 2, "the point's own"
+
+
+def test_the_front_takes_what_was_best_on_tune_layouts():
+    taken = by_hand().front("entropy")
+    assert [(p.setting.schedule, p.setting.most) for p in taken] == [("never", 1), ("entropy", 2)]
+    flattered = by_hand(tune=False).front("entropy")
+    assert [(p.setting.schedule, p.setting.most) for p in flattered] == [("never", 1), ("entropy", 1)]
+
+
+def test_areas_are_means_over_budgets_up_to_always_asking_all():
+    """Entropy on tune layouts: 1/4 below 3 messages of 4, then 2/4. The oracle: 1/4 from 0, 4/4 from 1 on.
+
+    A success for one message at most is one of three episodes at 2/4 messages.
+    """
+    compared = by_hand()
+    assert compared.area("entropy").value == pytest.approx((3 * 1 / 4 + 1 * 2 / 4) / 4)
+    assert compared.area("never").value == pytest.approx(1 / 4)
+    # Caps of 0, 1 and 2 messages: 1/4 at 0, 3/4 at 2/4 and 4/4 at 4/4 messages an episode.
+    assert compared.area("oracle").value == pytest.approx((0.5 * 1 / 4 + 0.5 * 3 / 4 + 3 * 1) / 4)
+
+
+def test_random_at_as_many_messages_lies_between_its_neighbours():
+    """1 message: half of the way from never to random at 2."""
+    compared = by_hand()
+    like = compared.random_like(play("entropy", 1, 0.7, [1, 1, 1, 0], [1] * 4))
+    assert like.tolist() == [[1, 0.5, 0, 0]]
+    assert compared.random_like(compared.everybody).tolist() == [[1, 1, 1, 0]]
+
+
+def test_the_table_says_how_much_of_the_gap_is_closed():
+    """The paper's 2/4, the oracle 4/4, the one chosen 3/4: half of the gap at a third of the messages."""
+    paper, one, bound = by_hand().rows
+    assert (paper.closed.value, one.closed.value, bound.closed.value) == (0, 0.5, 1)
+    assert one.messages.value == pytest.approx(1 / 3)
+    assert one.over_paper.value == pytest.approx(0.25)
+    assert one.over_random.value == pytest.approx(3 / 4 - 1.5 / 4)
+    assert by_hand().regret.value == pytest.approx(0.5)
+
+
+def test_an_area_has_the_best_rank_and_not_the_best_luck():
+    success, messages = np.array([[0.2, 0.9, 0.5]]), np.array([[0.0, 1.0, 2.0]])
+    assert _area(success, messages, np.array([1.0, 2.0, 3.0]), np.array([4.0])) == pytest.approx(
+        (0.2 + 0.9 + 2 * 0.5) / 4
+    )
+    assert _area(success, messages, np.array([1.0, 0.5, 3.0]), np.array([4.0])) == pytest.approx(
+        (2 * 0.2 + 2 * 0.5) / 4
+    )
+
+
+# -- the commands ------------------------------------------------------------------------------------------
+
+
+def test_schedules_are_compared_from_the_command_line(
+    stored: Stored, harness: Callable[..., Any], tmp_path: Path
+):
+    out = tmp_path / "out"
+    chosen = ("--schedule", "entropy", "--schedule", "coverage", "--schedule", "learnt", "--out", out)
+    code, said, _ = harness("schedule", "compare", stored.run.path, "--tune", stored.run.path, *chosen)
+    assert code == 0
+    assert max(map(len, said.splitlines()[:-1])) <= 80, "but for the path"
+    names = {"index.html", "schedule.json"}
+    names |= {f"{table}.{kind}" for table in ("schedules", "settings") for kind in ("csv", "jsonl")}
+    assert {path.name for path in out.iterdir()} == names | {f"fronts.{k}" for k in ("svg", "pdf", "png")}
+    code, said, _ = harness("schedule", "compare", stored.run.path, *chosen, "--json", "--seeds", "0:1")
+    rows = json.loads(said)
+    assert [row["schedule"] for row in rows] == ["entropy", "entropy", "coverage", "learnt", "oracle"]
+    assert rows[-1]["gap_closed"] in (1.0, None)
+    assert all(row["success"] <= rows[-1]["success"] for row in rows)
+
+
+def test_the_same_twice(stored: Stored):
+    once, twice = (
+        compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, lambda n: None) for _ in range(2)
+    )
+    for name, plays in once.plays.items():
+        assert [np.array_equal(a.costs, b.costs) for a, b in zip(plays, twice.plays[name], strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("--schedule", "coverag"), "unknown --schedule 'coverag'; did you mean 'coverage'?"),
+        (("--budget", "0"), "--budget 0: give a share above 0, 1 at most"),
+        (("--condition", "single-local"), "has no channel"),
+        (("--latency", "mine"), "unknown --latency 'mine'"),
+        (
+            ("--tune", "RUN", "--tune", "RUN"),
+            "--tune: 2 given for 1 runs; give one for each, in order, or none",
+        ),
+    ],
+)
+def test_bad_input_is_one_line(stored: Stored, harness: Callable[..., Any], args: Any, says: str):
+    given = [stored.run.path if a == "RUN" else a for a in args]
+    code, _, err = harness("schedule", "compare", stored.run.path, *given)
+    assert code == 2
+    assert says in err
+    assert err.count("\n") == 1
+
+
+# -- learning ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def train(tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    """A run on train layouts."""
+    folder = tmp_path_factory.mktemp("train")
+    build(scenarios.get("occluded-intersection"), folder / "data", 2, 150_000, 1, lambda done: None, False)
+    return Stored(run(spec_of(load(folder / "data")), folder / "run").out)
+
+
+@pytest.mark.slow
+def test_a_schedule_is_learnt_and_then_one_of_its_name(
+    stored: Stored, train: Stored, harness: Callable[..., Any], tmp_path: Path
+):
+    (tmp_path / MARKER).touch()
+    typed = ("schedule", "learn", train.run.path, "--tune", stored.run.path, "--out", "schedules/mine.toml")
+    assert harness(*typed)[0] == 0
+    text = toml(Path("schedules/mine.toml"), "it")
+    assert text["learnt_from"] == [layouts(train, "train")]
+    assert "2 layouts" in text["learnt_from"][0]
+    mine = SCHEDULES["mine"]
+    assert isinstance(mine, Learnt)
+    assert mine.threshold == text["threshold"] == named_point("6g:schedule=mine").asks_above
+    once = Path("schedules/mine.toml").read_text()
+    code, _, err = harness(*typed)
+    assert code == 2
+    assert "is there already" in err
+    Path("schedules/mine.toml").unlink()
+    assert harness(*typed)[0] == 0
+    assert Path("schedules/mine.toml").read_text() == once
+    code, _, err = harness("schedule", "learn", stored.run.path, "--tune", stored.run.path, "--out", "x.toml")
+    assert code == 2
+    assert "(tune), 4 layouts" not in err
+    assert "give a run on train layouts" in err
+
+
+def test_a_network_learns_what_there_is_to_learn():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(400, 14))
+    y = np.tanh(x[:, 0]) * 0.3 + 0.1
+    network = fit(x, y)
+    assert np.mean((network(x) - y) ** 2) < 0.02 * y.var()
+    assert network(x[7]) == pytest.approx(network(x)[7])
+
+
+def test_a_file_that_does_not_fit_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / MARKER).touch()
+    shipped = find("schedules", "learnt.toml").read_text()
+    (tmp_path / "schedules").mkdir()
+    (tmp_path / "schedules/odd.toml").write_text(shipped.replace('"entropy", ', ""))
+    with pytest.raises(UserError, match="has other inputs or sizes than the program; learn it again"):
+        named_point("6g:schedule=odd")
+
+
+def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
+    shipped = toml(find("schedules", "learnt.toml"), "it")
+    assert all("(train)" in source for source in shipped["learnt_from"])
+    assert all("(tune)" in source for source in shipped["tuned_on"])
