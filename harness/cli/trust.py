@@ -30,7 +30,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Play every attack against every consensus rule, on a run's answers.
+    """Play every attack against every consensus rule.
 
     The model is asked only what the run has not. The same command continues a study that was stopped.
     """

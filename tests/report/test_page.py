@@ -81,9 +81,9 @@ def by_scene(run):
 
 def messages_in(row):
     """A decision's messages, as a page has them."""
-    columns = {"delivered": "delivered", "on_time": "on_time", "arrival_ms": "arrival_ms", "weight": "weight"}
+    names = ("delivered", "on_time", "arrival_ms", "weight", "trust", "attacker")
     return [
-        {"from": row[f"helper_{n}"], **{name: row[f"{column}_{n}"] for name, column in columns.items()}}
+        {"from": row[f"helper_{n}"], **{name: row[f"{name}_{n}"] for name in names}}
         for n in (1, 2, 3)
         if row[f"helper_{n}"]
     ]
