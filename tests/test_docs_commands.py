@@ -55,6 +55,7 @@ CUT_ENDS = {
 
 # Held against the program's options, and not run.
 NOT_RUN = {
+    "harness device measure --model swarm-tiny": "needs a meter of energy",
     "harness view": "serves until it is interrupted; tests/view starts it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model check qwen3-4b": "needs those weights",

@@ -149,6 +149,79 @@ def check(
     _origins(device, [row])
 
 
+@app.command()
+def measure(
+    model: str = typer.Option("swarm-tiny", help="Model card, or a folder of weights."),
+    engine: options.Engine = None,
+    prompt: options.Prompt = "v2",
+    answer: options.Answer = "json",
+    window_s: float = typer.Option(2.0, help="Least seconds of each of five windows of asking."),
+    device: options.Device = None,
+    as_json: options.Json = False,
+) -> None:
+    """Measure the joules of a model's answers by this machine's meters.
+
+    NVML, RAPL and a Jetson's rails, as far as they can be read: `harness doctor` lists them. Answers are
+    asked one by one, after as long a time of idling.
+    """
+    from dataclasses import asdict
+
+    from harness.backends import cards
+    from harness.backends.counters import counters
+    from harness.backends.registry import open_backend
+    from harness.cli.progress import bar
+    from harness.core.figures import as_mapping, shown
+    from harness.core.resources import DATASET
+    from harness.dataset import load
+    from harness.evaluate.agent import Agent
+    from harness.evaluate.asking import requests
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+    from harness.prompts import versions
+    from harness.studies.device_power import WINDOWS
+    from harness.studies.device_power import measure as measured
+
+    if not 0.1 <= window_s <= MOST_MS / 1000:
+        raise UserError(f"--window-s {window_s:g} is out of range; give 0.1 to {MOST_MS // 1000}")
+    meters = counters()
+    if not meters:
+        raise UserError(
+            "harness device measure: no meter can be read here: NVML needs an NVIDIA GPU and the package "
+            "nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
+        )
+    data = load.load(load.find(DATASET), 10)
+    card = cards.load(f"{model}:{engine}" if engine else model)
+    agent = Agent(card, versions.load(prompt), answer)
+    spec = Spec(agent, FrozenSource(data), (), (0,), batch_size=1, device=device)
+    asked = list(requests(spec, data.scenes(data.forest.ids[:10])))
+    with bar("windows", WINDOWS, quiet=as_json) as progress:
+        backend = open_backend(agent.card, device=device, dtype=None, batch_size=1)
+        drawn, n = measured(backend, asked, meters, window_s, progress)
+    if as_json:
+        figures = ("watts", "answer_j", "more_j")
+        echo_json({
+            "model": agent.name, "answers": n, "windows": WINDOWS, "window_s": window_s,
+            "meters": [
+                {**asdict(each), **{name: as_mapping(getattr(each, name)) for name in figures}}
+                for each in drawn
+            ],
+        })  # fmt: skip
+        return
+    typer.echo(f"{printable(agent.name)} · {n} answers, one by one")
+    table(
+        ["meter", "idle W", "asking W", "J an answer", "J above idling"],
+        [
+            (printable(each.meter), f"{each.idle_watts:.2f}", shown(each.watts, 1.0, 2),
+             shown(each.answer_j, 1.0, 3), shown(each.more_j, 1.0, 3))
+            for each in drawn
+        ],
+    )  # fmt: skip
+    _say(
+        f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a meter "
+        "counts all that draws from it, other programs and idling included"
+    )
+
+
 def _rows(device: "Device", model: str | None) -> "list[DeviceRow]":
     from harness.backends.devices import row_of
 

@@ -42,6 +42,7 @@ def command(
         "GPU", "; ".join(map(printable, facts["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
     )
     size = f"{facts['cache']['bytes'] / 1e6:.1f} MB" if facts["cache"]["bytes"] else "empty"
+    _line("meters", ", ".join(facts["meters"]) or "none of energy that can be read")
     _line("cache", f"{printable(facts['cache']['file'], 1000)}, {size}")
     _line("engines", ", ".join(engine for engine, lack in facts["engines"].items() if lack is None))
     _lacking([(engine, lack) for engine, lack in facts["engines"].items() if lack is not None])
@@ -69,6 +70,7 @@ def look(gpu: bool) -> dict[str, Any]:
     """
     from harness.backends import cards, registry
     from harness.backends.cache import default_file
+    from harness.backends.counters import counters
     from harness.backends.transformers.engine import gpus
     from harness.evaluate.spec import versions
 
@@ -84,6 +86,7 @@ def look(gpu: bool) -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory_gib": _memory_gib(),
         "gpu": gpus() if gpu else _smi_gpus(),
+        "meters": [meter.name for meter in counters()],
         "engines": {engine: _package_remedy(engine) for engine in registry.engines()},
         "models": models,
         "cache": {"file": str(cache), "bytes": cache.stat().st_size if cache.is_file() else 0},

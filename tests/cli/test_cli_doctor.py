@@ -44,7 +44,7 @@ def test_people_read_it_in_eighty_columns(harness: Callable[..., Said]) -> None:
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     heads = [line.split()[0] for line in out.splitlines() if not line.startswith(" ")]
-    assert heads == ["harness", "packages", "machine", "GPU", "cache", "engines", "models"]
+    assert heads == ["harness", "packages", "machine", "GPU", "meters", "cache", "engines", "models"]
     assert "openai-example: needs a server at http://127.0.0.1:8080/v1 (not tried)" in out
 
 

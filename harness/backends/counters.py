@@ -1,0 +1,123 @@
+"""Energy counters that a machine may have: NVML, RAPL, and the power rails of a Jetson.
+
+What they can be trusted with differs. NVML's total (GPUs since Volta) and RAPL's count energy themselves;
+RAPL's wraps around, and Linux lets root alone read it. A Jetson states power, which is sampled and summed up
+here. All are too coarse for one answer: NVML looks at the power a quarter of the time on some GPUs (Yang et
+al., SC24, arXiv 2312.02741), so a measurement lasts seconds and is repeated (`harness device measure`).
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+SYS = Path("/sys")
+SAMPLED_S = 0.02  # between two looks at a power
+
+
+@dataclass(frozen=True)
+class Counter:
+    """One meter.
+
+    Attributes:
+        name: `nvml 0`, `rapl package-0`, `jetson VDD_IN`.
+        joules: counted so far, from whenever; None where the meter states power.
+        watts: drawn now; None where it counts energy.
+    """
+
+    name: str
+    joules: Callable[[], float] | None = None
+    watts: Callable[[], float] | None = None
+
+
+def counters(sys: Path = SYS) -> list[Counter]:
+    """The meters that can be read here. `sys` is where the kernel shows its own."""
+    return [*_nvml(), *_rapl(sys), *_jetson(sys)]
+
+
+@contextmanager
+def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
+    """Joules by a meter's name of what is done inside, there once it is done."""
+    spent: dict[str, float] = {}
+    sums = {meter.name: 0.0 for meter in meters if meter.watts}
+    ended = Event()
+
+    def sample() -> None:
+        before = time.perf_counter()
+        while not ended.wait(SAMPLED_S):
+            now = time.perf_counter()
+            for meter in meters:
+                if meter.watts:
+                    sums[meter.name] += meter.watts() * (now - before)
+            before = now
+
+    sampling = Thread(target=sample, daemon=True)
+    begun = {meter.name: meter.joules() for meter in meters if meter.joules}
+    sampling.start()
+    try:
+        yield spent
+    finally:
+        ended.set()
+        sampling.join()
+        spent |= sums | {m.name: m.joules() - begun[m.name] for m in meters if m.joules}
+
+
+def _nvml() -> Iterator[Counter]:
+    try:
+        nvml: Any = import_module("pynvml")
+        nvml.nvmlInit()
+        devices = [nvml.nvmlDeviceGetHandleByIndex(n) for n in range(nvml.nvmlDeviceGetCount())]
+    except Exception:  # no package, no driver, no GPU: each has an error of its own
+        return
+    for n, device in enumerate(devices):
+
+        def joules(device: Any = device) -> float:
+            return float(nvml.nvmlDeviceGetTotalEnergyConsumption(device)) / 1e3
+
+        with suppress(Exception):  # a GPU before Volta has no total
+            joules()
+            yield Counter(f"nvml {n}", joules)
+
+
+def _rapl(sys: Path) -> Iterator[Counter]:
+    for folder in sorted((sys / "class/powercap").glob("*-rapl:*")):
+        if folder.name.count(":") > 1:  # a part of a package, which that one has in it
+            continue
+        with suppress(OSError, ValueError):
+            name = (folder / "name").read_text().strip()
+            most = _number(folder / "max_energy_range_uj")
+            yield Counter(f"rapl {name}", _Wrapping(folder / "energy_uj", most))
+
+
+class _Wrapping:
+    """Joules of a counter of microjoules that begins anew at its end."""
+
+    def __init__(self, path: Path, most: float) -> None:
+        self._path, self._most = path, most
+        self._last, self._total = _number(path), 0.0
+
+    def __call__(self) -> float:
+        now = _number(self._path)
+        self._total += now - self._last + (self._most if now < self._last else 0.0)
+        self._last = now
+        return self._total / 1e6
+
+
+def _jetson(sys: Path) -> Iterator[Counter]:
+    for label in sorted((sys / "bus/i2c/drivers/ina3221").glob("*/hwmon/hwmon*/in[1-3]_label")):
+        n, folder = label.name[2], label.parent
+
+        def watts(folder: Path = folder, n: str = n) -> float:
+            return _number(folder / f"in{n}_input") * _number(folder / f"curr{n}_input") / 1e6
+
+        with suppress(OSError, ValueError):
+            watts()
+            yield Counter(f"jetson {label.read_text().strip()}", watts=watts)
+
+
+def _number(path: Path) -> float:
+    return float(path.read_text())

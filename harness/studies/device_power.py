@@ -1,0 +1,75 @@
+"""What a model's answers take in joules, by the meters of this machine."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.backends.base import Backend, Request
+from harness.backends.counters import Counter, metered
+from harness.core.statistics import Estimate, seed_interval
+
+WINDOWS = 5  # of asking; the intervals are over them
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What one meter says.
+
+    Attributes:
+        meter: its name.
+        idle_watts: before, while nothing is asked.
+        watts: while answers are asked one by one.
+        answer_j: of an answer, all that the meter counts.
+        more_j: of that, what is above idling.
+    """
+
+    meter: str
+    idle_watts: float
+    watts: Estimate
+    answer_j: Estimate
+    more_j: Estimate
+
+
+def measure(
+    backend: Backend, requests: Sequence[Request], meters: Sequence[Counter], window_s: float,
+    progress: Callable[[int], None], sleep: Callable[[float], None] = time.sleep,
+) -> tuple[list[Drawn], int]:  # fmt: skip
+    """Ask alone, again and again, for some windows of time, and say what that took.
+
+    Args:
+        backend: the model; the first answer of it, which pays for warming up, is not counted.
+        requests: asked in turn.
+        meters: one or more.
+        window_s: least seconds of a window; meters are coarse, so 2 or more.
+        progress: called with 1 after each window.
+        sleep: idles.
+
+    Returns:
+        What each meter says, and how many answers there were.
+    """
+    backend.complete(requests[:1])
+    begun = time.perf_counter()
+    with metered(meters) as idle:
+        sleep(window_s)
+    idled_s = time.perf_counter() - begun
+    seconds, answers = np.zeros(WINDOWS), np.zeros(WINDOWS, dtype=int)
+    joules = {meter.name: np.zeros(WINDOWS) for meter in meters}
+    for n in range(WINDOWS):
+        begun = time.perf_counter()
+        with metered(meters) as spent:
+            while (took := time.perf_counter() - begun) < window_s or not answers[n]:
+                backend.complete([requests[answers.sum() % len(requests)]])
+                answers[n] += 1
+            seconds[n] = took
+        for name, total in spent.items():
+            joules[name][n] = total
+        progress(1)
+    drawn = []
+    for name, spent_j in joules.items():
+        idle_watts = idle[name] / idled_s
+        more = spent_j - idle_watts * seconds
+        estimates = (seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers))
+        drawn.append(Drawn(name, idle_watts, *estimates))
+    return drawn, int(answers.sum())
