@@ -3,7 +3,7 @@
 What moves is drawn over a ground that was drawn once.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -66,7 +66,8 @@ class Canvas:
         self._over(*_sight(still.state, seen))
         for vehicle in still.state.vehicles:
             self._over(_vehicle(vehicle, vehicle.id in (*seen[ego.id], ego.id)))
-        self._over(_names(still.state.vehicles))
+        attackers = {message.sender for message in still.decision.messages if message.attacker}
+        self._over(_names(still.state.vehicles, attackers))
         self._over(*_messages(self.played, still))
         for bar in _bars(still, self.actions):
             self.bars.add_artist(bar)
@@ -120,10 +121,10 @@ def _vehicle(vehicle: VehicleState, known: bool) -> Artist:
     return Polygon(north_up(vehicle.corners()), **style)
 
 
-def _names(vehicles: Iterable[VehicleState]) -> Artist:
+def _names(vehicles: Iterable[VehicleState], attackers: Collection[str]) -> Artist:
     """Every vehicle's id beside it, as one outline, which costs a fifth of as many texts."""
     at = north_up(np.array([(v.x_m, v.y_m) for v in vehicles])) + 2.5
-    outlines = [_outline(v.id) for v in vehicles]
+    outlines = [_outline(f"{v.id} attacks" if v.id in attackers else v.id) for v in vehicles]
     moved = [Outline(o.vertices + place, o.codes) for o, place in zip(outlines, at, strict=True)]
     return PathPatch(Outline.make_compound_path(*moved), facecolor=INK, edgecolor="none")
 
