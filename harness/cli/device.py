@@ -249,7 +249,7 @@ def _source(device: "Device", constant: "Constant") -> str:
 
 
 def _say(text: str) -> None:
-    typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  "))
+    typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  ", break_on_hyphens=False))
 
 
 def _number(value: float) -> float | None:

@@ -269,7 +269,7 @@ class OperatingPoint:
     @cached_property
     def network(self) -> Network | None:
         """The network to a cloud, as its file was when the point was made. Raises UserError."""
-        return network(self.round_trip) if self.round_trip else None
+        return network(str(self.round_trip)) if self.round_trip else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
         """The same with these settings of its channel. Raises UserError for one that it has not."""
