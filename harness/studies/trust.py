@@ -7,7 +7,7 @@ episode.
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -30,7 +30,7 @@ from harness.core.statistics import (
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.walk import Decided, walk
-from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
+from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
 from harness.studies.stored import Stored
 from harness.studies.sweep import point_of
 
@@ -72,11 +72,6 @@ class Cell:
     nats: Floats
     flagged: Floats | None
     first: tuple[int, ...]
-
-    @property
-    def key(self) -> str:
-        """Names the cell among those of its study."""
-        return f"{self.rule}|{self.attack}|{self.share:.6g}"
 
     def detection(self) -> Mapping[str, Estimate] | None:
         """Precision, recall, F1 and false alarms of messages, with a bootstrap over episodes.
@@ -172,15 +167,8 @@ def play(stored: Stored, point: OperatingPoint, seeds: Sequence[int], of: tuple[
     ]
     nats = np.concatenate([_nats(stored, part) for part in parts])
     flagged, first = _flagged(parts, len(place), place)
-    shape = len(seeds), len(place)
-    return Cell(
-        *of,
-        ends["success_rate"],
-        ends["unsafe_rate"],
-        _means(np.concatenate(cells), nats, shape),
-        flagged,
-        first,
-    )
+    means = mean_by_place(nats, np.concatenate(cells), len(seeds) * len(place)).reshape(len(seeds), -1)
+    return Cell(*of, ends["success_rate"], ends["unsafe_rate"], means, flagged, first)
 
 
 def _nats(stored: Stored, part: Decided[Scene]) -> Floats:
@@ -188,13 +176,6 @@ def _nats(stored: Stored, part: Decided[Scene]) -> Floats:
     forest = stored.dataset.forest
     at = np.array([forest.place[scene.id] for scene in part.moments])[part.due.at]
     return negative_log_likelihood(part.result.fused, forest.safe[at])
-
-
-def _means(places: Any, values: Floats, shape: tuple[int, int]) -> Floats:
-    known = ~np.isnan(values)
-    n = np.bincount(places[known], minlength=shape[0] * shape[1])
-    total = np.bincount(places[known], values[known], minlength=shape[0] * shape[1])
-    return np.where(n > 0, total / np.maximum(n, 1), np.nan).reshape(shape)
 
 
 def _flagged(
@@ -336,18 +317,16 @@ def run_bench(
 
 
 class _Kept:
-    """Finished cells in a file, a line each; those of another study are left behind."""
+    """Finished cells in a file, a line each; those of other answers, conditions or seeds do not count."""
 
     def __init__(self, path: Path, stored: Stored, point: OperatingPoint, seeds: Sequence[int]) -> None:
-        self._path, self._episodes = path, len(stored.dataset.episodes)
-        plain = {
-            key: value for key, value in vars(point).items() if isinstance(value, str | float | int | None)
-        }
-        self._of = digest([stored.manifest(), str(stored.run.manifest.identity), plain, list(seeds)])
+        self._path = path
+        self._of = digest([stored.manifest(), str(stored.run.manifest.identity), asdict(point), list(seeds)])
         self._cells: dict[tuple[str, str, float], Cell] = {}
-        lines = path.read_bytes().splitlines() if path.is_file() else []
-        for line in lines:
+        data = path.read_bytes() if path.is_file() else b""
+        for line in data.splitlines():
             self._read(line)
+        self._torn = not data.endswith(b"\n") and bool(data)
 
     def _read(self, line: bytes) -> None:
         try:
@@ -368,7 +347,8 @@ class _Kept:
         plain = {key: _plain(value) for key, value in vars(cell).items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
-            file.write(json.dumps({"of": self._of, **plain}).encode() + b"\n")
+            file.write(b"\n" * self._torn + json.dumps({"of": self._of, **plain}).encode() + b"\n")
+        self._torn = False
         return cell
 
 
