@@ -27,9 +27,10 @@ def command(folder: options.Reports = Path("reports"), as_json: options.Json = F
         name, date = printable(run.name, WIDTH - 17), f"{run.date.astimezone():%Y-%m-%d %H:%M}"
         typer.echo(f"{name:<{WIDTH - 17}} {date}")
         outcome = _outcome(run)
-        left = WIDTH - 9 - len(outcome)
+        kind = f"{run.kind:<5} "
+        left = WIDTH - 3 - len(kind) - len(outcome)
         parts = " · ".join(part for part in (run.model, run.prompt, run.answer) if part is not None)
-        typer.echo(f"  {run.kind:<6}{printable(parts, left):<{left}} {outcome}".rstrip())
+        typer.echo(f"  {kind}{printable(parts, left):<{left}} {outcome}".rstrip())
         if run.unread is not None and run.unread >= UNREAD:
             share = "none" if run.unread == 1 else f"only {100 * (1 - run.unread):.1f} %"
             typer.echo(f"{'':8}{share} of the ego's answers could be read: it drives by the fallback")

@@ -19,6 +19,8 @@ STUDIES = {
     "sweep.json": "sweep",
     "grid.json": "grid",
     "repeats.json": "repeats",
+    "trust.json": "trust",
+    "schedule.json": "schedule",
     "study.json": "study",
     "closed-loop.json": "study",
     "fidelity.csv": "study",
@@ -43,8 +45,7 @@ class Listed:
 
     Attributes:
         name: its folder, from the folder that is listed.
-        kind: `eval`, `drive`, `suite`, `repeats`, `sweep`, `grid` or `study`; `run` where a broken one does
-            not say.
+        kind: `eval`, `drive`, `suite`, or of a study one of `STUDIES`; `run` where a broken one does not say.
         state: `finished`, `unfinished` or `broken`.
         date: when it began; of a suite, when the last of its runs did; of a study and a broken run, when
             it was last written.
@@ -130,7 +131,7 @@ def _one(path: str, root: str) -> Listed | None:
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
             try:
-                sources = _json(path, name)["sources"] if kind in ("sweep", "grid", "repeats") else ()
+                sources = _json(path, name)["sources"] if kind != "study" else ()
                 model = ", ".join(str(source["name"]) for source in sources if "name" in source)
                 return Listed("", kind, "finished", written, model=model or None)
             except _BROKEN:

@@ -12,6 +12,7 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.run import Evaluated
+from harness.runs.listing import runs
 from harness.studies import trust
 from harness.studies.stored import Stored
 from harness.studies.trust import EXCLUDED, PEACE, Bench, names_of, run_bench, shares_of
@@ -101,6 +102,8 @@ def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Pat
     names = {path.name for path in tmp_path.iterdir()}
     assert {"index.html", "trust.json", "figures.csv", "figures.jsonl", "heat-map.svg"} <= names
     rows = [json.loads(line) for line in (tmp_path / "figures.jsonl").read_text().splitlines()]
+    [listed] = runs(tmp_path)
+    assert (listed.kind, listed.state, listed.model) == ("trust", "finished", bench.name)
     assert {row["metric"] for row in rows} >= {
         "success_rate",
         "unsafe_rate",
