@@ -250,12 +250,3 @@ def fallback_intent(fallback: str, n_actions: int) -> Floats:
         first: Floats = np.eye(1, n_actions)[0]
         return first
     return np.full(n_actions, 1.0 / n_actions)
-
-
-def nearest(candidates: Bools, range_m: Floats, most: int) -> Bools:
-    """The `most` nearest of the candidates, `(..., H)`; of equals, the earlier ones."""
-    if most >= candidates.shape[-1]:
-        return candidates
-    order = np.argsort(np.where(candidates, range_m, np.inf), axis=-1, kind="stable")
-    rank = np.argsort(order, axis=-1, kind="stable")
-    return candidates & (rank < most)

@@ -91,7 +91,7 @@ class Chosen:
     """A schedule at the setting chosen for it, and what it is worth.
 
     Attributes:
-        play: what came of it.
+        play: its setting, and success and costs of every episode.
         success: of episodes.
         over_paper: success less that of the paper's schedule.
         p: of no such difference, by Holm's method for all schedules of the run; None without an interval, and

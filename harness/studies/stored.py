@@ -15,9 +15,9 @@ from harness.backends.cache import default_file
 from harness.backends.cards import Card
 from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
-from harness.coordination.exchange import nearest
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
@@ -233,7 +233,8 @@ class _Nearest:
 
     def _of(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
-        return replace(intents, valid=intents.valid & nearest(np.isfinite(reach), reach, self._helpers))
+        near = chosen(np.zeros_like(reach), -1.0, np.isfinite(reach), reach, self._helpers)
+        return replace(intents, valid=intents.valid & near)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         return self._stored.fusion_call(moments, codes, rewrites)
