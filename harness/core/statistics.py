@@ -214,6 +214,18 @@ def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
     return np.vstack([np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)])
 
 
+def of_resamples(values: Floats, n: int) -> Estimate:
+    """A figure of n units and its 95 % interval: the first of the values, `(1 + times,)`, as `resampled`.
+
+    Resamples without the figure, NaN, are left out; without a figure there is no interval.
+    """
+    known = values[1:][~np.isnan(values[1:])]
+    if np.isnan(values[0]):
+        return Estimate(math.nan, math.nan, math.nan, 0, n)
+    low, high = np.percentile(known, (2.5, 97.5)).tolist() if len(known) else (math.nan, math.nan)
+    return Estimate(float(values[0]), low, high, n, 0)
+
+
 def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:
     """Mean of shares `(E,)`, their distances from it, both ends of its interval, and their worth."""
     rate = float(np.mean(values))

@@ -19,7 +19,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, resampled
+from harness.core.statistics import Estimate, of_resamples, resampled
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import made
 from harness.evaluate.spec import Spec
@@ -277,12 +277,7 @@ class Grid:
         shares = _shares(np.maximum(squares - times * by_chance[:, None], 0.0))
         if np.isnan(shares[:, 0]).any() or np.isnan(shares[0]).mean() > LEVEL:
             return None
-        ends = np.nanpercentile(shares[:, 1:], (2.5, 97.5), axis=1).T
-        found = [
-            Estimate(float(value), float(low), float(high), n, 0)
-            for value, (low, high) in zip(shares[:, 0], ends, strict=True)
-        ]
-        return Halves(condition, *found)
+        return Halves(condition, *(of_resamples(share, n) for share in shares))
 
 
 def _squares(means: Floats) -> Floats:

@@ -17,7 +17,7 @@ from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.multiplicity import holm
-from harness.core.statistics import Estimate, resampled
+from harness.core.statistics import Estimate, of_resamples, resampled
 from harness.runs.metrics import SUCCESS, difference, over_episodes, p_value
 from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.stored import Stored
@@ -203,7 +203,10 @@ class Compared:
         messages = self._resampled([play.messages for play, _ in ranked])
         most = self._resampled([self.everybody.messages])
         ranks = np.array([rank for _, rank in ranked])
-        return _interval(_area(success, np.minimum(messages, most), ranks, most[:, 0]))
+        return self._interval(_area(success, np.minimum(messages, most), ranks, most[:, 0]))
+
+    def _interval(self, values: Floats) -> Estimate:
+        return of_resamples(values, self.weights.shape[1])
 
     def _resampled(self, values: Sequence[Floats]) -> Floats:
         """Means of values (S, E) in each resample, (1 + RESAMPLES, P)."""
@@ -230,8 +233,8 @@ class Compared:
             play, over_episodes(SUCCESS, play.success),
             difference(SUCCESS, play.success.T, self.paper.success.T), p,
             difference(SUCCESS, play.success.T, self.random_like(play).T),
-            _interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
-            _interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.setting.schedule),
+            self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
+            self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.setting.schedule),
         )  # fmt: skip
 
     def random_like(self, play: Play) -> Floats:
@@ -301,10 +304,3 @@ def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Flo
 def _ratio(part: Floats, whole: Floats) -> Floats:
     """A share, NaN of nothing."""
     return np.where(whole > 0, part / np.where(whole > 0, whole, 1.0), np.nan)
-
-
-def _interval(values: Floats) -> Estimate:
-    """The first of the values, with the percentiles of the others, which are its resamples."""
-    known = values[1:][~np.isnan(values[1:])]
-    low, high = np.percentile(known, (2.5, 97.5)).tolist() if len(known) else (np.nan, np.nan)
-    return Estimate(float(values[0]), low, high, len(known), len(values) - 1 - len(known))
