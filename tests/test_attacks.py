@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Turn, attackers, attacks_of
+from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Fusion, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, Rewrites, named_point
@@ -32,7 +33,11 @@ def intents(helpers: Any, own: Any = (0.4, 0.3, 0.3)) -> Intents:
         own=np.array([own]), helpers=p, valid=np.ones((1, n), dtype=bool),
         distance_m=np.array([[20.0, *(10.0 + np.arange(n))]]), range_m=np.array([30.0 + np.arange(n)]),
         payload_bits=np.full((1, n), 800.0), inference_s=np.full((1, 1 + n), 0.1),
-        sensed_m=np.array([10.0 + np.arange(n)]),
+        claims=Claims(
+            np.array([[(20.0, 0.0), *((0.0, 10.0 + h) for h in range(n))]]), np.full((1, n), 7.0),
+            np.zeros(1), np.full(1, 0.2), np.array([10.0 + np.arange(n)]),
+            lambda xy_m: np.zeros(xy_m.shape[:-1]),
+        ),
     )  # fmt: skip
 
 
@@ -87,8 +92,21 @@ def test_a_spoofed_pose_is_a_place_on_the_egos_way_and_the_intent_stays():
     claim = said("spoof")
     assert claim.distance_m[0].tolist() == [20.0, 3.0, 11.0, 12.0]
     assert claim.range_m[0].tolist() == [17.0, 31.0, 32.0]
-    assert claim.sensed_m is TRUTH.sensed_m
+    assert claim.claims is not None
+    assert claim.claims.xy_m[0].tolist() == [[20, 0], [3, 0], [0, 11], [0, 12]]
+    assert claim.claims.sensed_m.tolist() == [[10, 11, 12]], "sensors see where it is"
     assert claim.helpers[0, 0].tolist() == CAREFUL
+
+
+def test_a_jump_is_another_place_at_each_step_and_distances_follow():
+    """Helper 0 is 10 m to the south of the zone's centre and the ego 20 m to the east of it."""
+    for draw, x_m, y_m in ((0.0, 20.0, 10.0), (0.25, 0.0, 30.0)):
+        claim = said("jump", uniforms=np.full((1, 3), draw))
+        assert claim.claims is not None
+        assert claim.claims.xy_m[0, 1] == pytest.approx([x_m, y_m])
+        assert claim.claims.xy_m[0, 2:].tolist() == [[0, 11], [0, 12]]
+        assert claim.distance_m[0] == pytest.approx([20, np.hypot(x_m, y_m), 11, 12])
+        assert claim.range_m[0] == pytest.approx([np.hypot(x_m - 20, y_m), 31, 32])
 
 
 def test_silence_is_selective():
@@ -113,8 +131,10 @@ def test_a_sybil_is_several_vehicles_two_metres_apart():
     assert voices.voice_of is not None
     assert voices.voice_of[0].tolist() == [0, 1, 2, 0, 0]
     assert voices.valid.all()
-    assert voices.sensed_m is not None
-    assert np.isnan(voices.sensed_m[0]).tolist() == [False, False, False, True, True], "nobody sees a voice"
+    claims = voices.claims
+    assert claims is not None
+    assert claims.xy_m[0].tolist() == [[20, 0], [0, 10], [0, 11], [0, 12], [0, 12], [0, 14]]
+    assert np.isnan(claims.sensed_m[0]).tolist() == [False, False, False, True, True], "nobody sees a voice"
 
 
 def test_a_flood_says_nothing_with_many_voices():

@@ -11,6 +11,7 @@ import pytest
 from packaged import register
 from swarm_extras import FOG, SMOOTHING, Fog
 
+from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, Rule
 from harness.coordination.coordinate import Coordination, Fusion, coordinate
 from harness.coordination.intents import Intents
@@ -186,19 +187,25 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
     rule, rng = RULES[name], np.random.default_rng(1)
     state = rule.start((20,), 3, 4)
     alone = rule.start((), 3, 4)
-    for _ in range(3):
+    for step in range(3):
         heard = rng.random((20, 3)) < 0.6
         weights = np.insert(heard, 0, True, axis=-1) * rng.uniform(0.1, 1, (20, 4))
         weights /= weights.sum(axis=-1, keepdims=True)
         intents = np.where((weights > 0)[..., None], rng.dirichlet(np.ones(4), (20, 4)), np.nan)
         messages = Messages(
             intents, weights, heard, np.where(heard, 0.1, np.inf), np.ones((20, 4)), np.ones((20, 3)),
-            np.full((20, 3), np.nan),
+            Claims(
+                rng.normal(0, 20, (20, 4, 2)), rng.uniform(0, 14, (20, 3)), np.full(20, float(step)),
+                np.full(20, 0.2), np.where(rng.random((20, 3)) < 0.5, 1.0, np.nan),
+                lambda xy_m: np.abs(xy_m[..., 0]) / 10,
+            ),
         )  # fmt: skip
         fused = rule.fuse(messages, state)
         assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
         assert (fused.policy >= 0).all()
-        row = Messages(**{field: getattr(messages, field)[7] for field in messages.__dataclass_fields__})
+        arrays = {field: getattr(messages, field) for field in messages.__dataclass_fields__}
+        claims = arrays.pop("claims").take(7)
+        row = Messages(**{name: array[7] for name, array in arrays.items()}, claims=claims)
         single = rule.fuse(row, alone)
         assert single.policy == pytest.approx(fused.policy[7])
         order = [2, 0, 1]

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, capped, inverse_distance_weights
 from harness.coordination.robust import HEADS, bayes, centred_clipping, geometric_median, head_trimmed_mean
 from harness.coordination.rules import RULES
@@ -18,12 +19,25 @@ EQUAL = np.full(4, 0.25)
 CAREFUL, DOUBT, BOLD = [0.8, 0.1, 0.1], [0.4, 0.3, 0.3], [0.0, 0.0, 1.0]
 
 
-def messages(p: Any, distance_m: Any, sensed_m: Any = None, heard: Any = None) -> Messages:
+def claims(distance_m: Any, sensed_m: Any, **other: Any) -> Claims:
+    """All on roads, out of each other's way, at standstill, in the first second of an episode."""
+    places, helpers = len(distance_m), len(distance_m) - 1
+    angle = np.arange(places) * 2 * np.pi / max(places, 4)
+    usual: dict[str, Any] = {
+        "xy_m": np.array(distance_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+        "speed_mps": np.zeros(helpers), "time_s": np.array(0.0), "error_m": np.array(0.2),
+        "sensed_m": np.full(helpers, np.nan) if sensed_m is None else np.array(sensed_m, dtype=float),
+        "from_road_m": lambda xy_m: np.zeros(xy_m.shape[:-1]),
+    }  # fmt: skip
+    return Claims(**usual | other)
+
+
+def messages(p: Any, distance_m: Any, sensed_m: Any = None, heard: Any = None, **claimed: Any) -> Messages:
     p, distance_m = np.array(p, dtype=float), np.array(distance_m, dtype=float)
     heard = np.ones(len(p) - 1, dtype=bool) if heard is None else np.array(heard)
     weights = inverse_distance_weights(distance_m, heard, 1.0)
-    sensed = np.full(len(heard), np.nan) if sensed_m is None else np.array(sensed_m, dtype=float)
-    return Messages(p, weights, heard, np.where(heard, 0.1, np.inf), distance_m, np.ones(len(heard)), sensed)
+    arrival_s, said = np.where(heard, 0.1, np.inf), claims(distance_m, sensed_m, **claimed)
+    return Messages(p, weights, heard, arrival_s, distance_m, np.ones(len(heard)), said)
 
 
 def decided(rule: str, told: Messages) -> int:
@@ -126,6 +140,87 @@ def test_a_claim_within_the_tolerance_is_corrected_and_believed():
     """It claims 8 m and is seen at 10 m, as far as the other."""
     fused = TRUST.fuse(messages([DOUBT] * 3, [20, 8, 10], sensed_m=[10, 10]), TRUST.start((), 2, 3))
     assert fused.weights[1] == pytest.approx(fused.weights[2])
+
+
+def trusted(*steps: Any) -> list[bool]:
+    """Whom it trusts after these steps, in which all are in doubt; helpers at 10, 20 and 30 m."""
+    state, fused = START, None
+    for claimed in steps:
+        fused = TRUST.fuse(messages([DOUBT] * 4, [20, 10, 20, 30], **claimed), state)
+        state = fused.state
+    assert fused is not None
+    return (fused.trust >= 0.5).tolist()
+
+
+EGO, ABOUT = [20.0, 0.0], [[0.0, 10.0], [-20.0, 0.0], [0.0, -30.0]]
+FAST = np.array([7.0, 7.0, 70.0])
+
+
+def places(*helpers: Any) -> Any:
+    return {"xy_m": np.array([EGO, *helpers])}
+
+
+def test_who_claims_to_drive_and_stays_where_it_is_is_trusted_no_more():
+    """Two that claim 7 m/s and have moved 7 m and 0 m in a second; the slack is 2 + 2 x 4 x .2 = 3.6 m."""
+    speed = {"speed_mps": np.array([7.0, 7.0, 3.5])}
+    moved = [[0.0, 17.0], [-20.0, 0.0], [0.0, -30.0]]
+    steps = places(*ABOUT) | speed, places(*moved) | speed | {"time_s": np.array(1.0)}
+    assert trusted(*steps[:1]) == [True, True, True], "there is no past yet"
+    assert trusted(*steps) == [True, False, True]
+
+
+def test_no_vehicle_is_as_fast_as_that_whatever_it_claims():
+    """The third moves by 70 m in a second, as it claims to; the first jumps by 70 m and claims 7 m/s."""
+    later = {"time_s": np.array(1.0), "speed_mps": FAST}
+    moved = [[0.0, 80.0], [-27.0, 0.0], [0.0, -100.0]]
+    assert trusted(places(*ABOUT) | {"speed_mps": FAST}, places(*moved) | later) == [False, True, False]
+
+
+def test_who_has_not_been_heard_for_a_while_may_be_farther_off():
+    speed = {"speed_mps": np.full(3, 7.0)}
+    moved = [[0.0, 31.0], [-41.0, 0.0], [0.0, -37.0]]
+    late = places(*moved) | speed | {"time_s": np.array(3.0)}
+    assert trusted(places(*ABOUT) | speed, late) == [True, True, False]
+
+
+def test_who_claims_to_be_off_the_road_is_trusted_no_more():
+    """A lane and a beacon's errors are 2 + 4 x .2 = 2.8 m; a larger declared error allows more."""
+    away = {"from_road_m": lambda xy_m: np.array([2.7, 2.9, 50.0])}
+    assert trusted(away) == [True, False, False]
+    assert trusted(away | {"error_m": np.array(1.0)}) == [True, True, False]
+
+
+def test_two_in_one_place_are_both_trusted_no_more_but_for_one_that_the_ego_sees_there():
+    one_place = places([0.0, 10.0], [0.0, 12.0], [0.0, 30.0])
+    assert trusted(one_place) == [False, False, True]
+    assert trusted(one_place | {"sensed_m": [10.0, np.nan, np.nan]}) == [True, False, True]
+
+
+def test_where_nobody_looked_nothing_is_held_against_anybody():
+    told = replace(messages([DOUBT] * 4, [20, 10, 20, 30]), claims=None)
+    fused = TRUST.fuse(told, START)
+    assert (fused.trust > 0.5).all()
+    assert fused.weights == pytest.approx(told.weights)
+
+
+@given(
+    speed=arrays(float, 3, elements=st.floats(0, 40)),
+    pulls=arrays(float, (5, 3), elements=st.floats(-8, 3)),
+    heading=arrays(float, 3, elements=st.floats(0, 6.28)),
+    errors=arrays(float, (6, 3, 2), elements=st.floats(-0.6, 0.6)),
+)
+def test_nobody_is_distrusted_for_driving(speed: Any, pulls: Any, heading: Any, errors: Any):
+    """Braking at 8 m/s² at most and pulling away at 3, straight on, with errors up to three sigma."""
+    at = np.array([[0.0, 500.0], [-500.0, 0.0], [500.0, 900.0]])
+    along, steps = np.stack([np.cos(heading), np.sin(heading)], axis=-1), []
+    for n in range(6):
+        claimed = {"speed_mps": speed, "time_s": np.array(float(n))}
+        steps.append(places(*(at + errors[n])) | claimed)
+        if n < 5:
+            faster = np.clip(speed + pulls[n], 0, 40)
+            at = at + along * ((speed + faster) / 2)[:, None]
+            speed = faster
+    assert trusted(*steps) == [True, True, True]
 
 
 def test_a_liar_far_from_all_others_is_distrusted_at_once_and_forgiven_in_time():

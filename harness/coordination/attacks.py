@@ -202,7 +202,36 @@ class Spoof(Attack):
         distance_m, by = said.distance_m.copy(), turn.attackers
         distance_m[:, 1:] = np.where(by, self.distance_m, distance_m[:, 1:])
         range_m = np.where(by, np.abs(distance_m[:, :1] - self.distance_m), said.range_m)
-        return replace(said, distance_m=distance_m, range_m=range_m)
+        claims = said.claims
+        if claims is not None:
+            ego = claims.xy_m[:, :1]
+            claims = claims.moved(
+                by, self.distance_m * ego / np.maximum(np.linalg.norm(ego, axis=-1), 1e-9)[..., None]
+            )
+        return replace(said, distance_m=distance_m, range_m=range_m, claims=claims)
+
+
+@dataclass(frozen=True)
+class Jump(Attack):
+    """Claims to stand elsewhere at each step, so far from its true place in a direction drawn anew.
+
+    Attributes:
+        offset_m: how far.
+    """
+
+    offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0
+    needs: ClassVar[tuple[str, ...]] = ("claims",)
+
+    def act(self, said: Intents, turn: Turn) -> Intents:
+        assert said.claims is not None
+        angle = 2 * np.pi * turn.uniforms[..., None]
+        away_m = self.offset_m * np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
+        claims = said.claims.moved(turn.attackers, said.claims.xy_m[:, 1:] + away_m)
+        ego, places = np.split(claims.xy_m, [1], axis=1)
+        distance_m, to_ego_m = said.distance_m.copy(), np.linalg.norm(places - ego, axis=-1)
+        distance_m[:, 1:] = np.where(turn.attackers, np.linalg.norm(places, axis=-1), distance_m[:, 1:])
+        range_m = np.where(turn.attackers, to_ego_m, said.range_m)
+        return replace(said, distance_m=distance_m, range_m=range_m, claims=claims)
 
 
 @dataclass(frozen=True)
@@ -296,7 +325,7 @@ ATTACKS: Plugins[Attack] = Plugins(
     {
         "liar": Liar(), "stuck": Stuck(), "stale": Stale(), "replay": Replay(), "spoof": Spoof(),
         "sybil": Sybil(), "flood": Flood(), "brake": FeignedBraking(), "silent": Silent(),
-        "overconfident": Overconfident(), "random": RandomIntent(), "injection": Injection(),
+        "overconfident": Overconfident(), "random": RandomIntent(), "injection": Injection(), "jump": Jump(),
         "absent": Absent(),
     },
 )  # fmt: skip
@@ -370,15 +399,19 @@ def with_voices(said: Intents, by: Bools, voices: int) -> Intents:
     distance_m = wide.distance_m + np.insert(shift_m, 0, 0.0)
     alive = np.concatenate([np.ones((n, helpers), dtype=bool), there], axis=-1)
     range_m = np.where(alive, wide.range_m + shift_m, np.nan)
-    sensed_m = None  # no sensor sees a vehicle that is not there
-    if wide.sensed_m is not None:
-        sensed_m = np.where(np.arange(index.shape[1]) < helpers, wide.sensed_m, np.nan)
+    claims = wide.claims
+    if claims is not None:
+        own, xy_m = np.arange(index.shape[1]) < helpers, claims.xy_m[:, 1:]
+        farther = 1 + shift_m[:, None] / np.maximum(np.linalg.norm(xy_m, axis=-1, keepdims=True), 1e-9)
+        claims = claims.moved(alive & ~own, xy_m * farther).moved(~alive, np.full_like(xy_m, np.nan))
+        # No sensor sees a vehicle that is not there.
+        claims = replace(claims, sensed_m=np.where(own, claims.sensed_m, np.nan))
     return replace(
         wide,
         valid=wide.valid & alive,
         distance_m=distance_m,
         range_m=range_m,
-        sensed_m=sensed_m,
+        claims=claims,
         voice_of=index,
     )
 

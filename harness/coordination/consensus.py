@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from harness.coordination.claims import Claims
 from harness.core.arrays import Bools, Floats
 
 
@@ -26,8 +27,7 @@ class Messages:
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its
             operating point declares, if it does.
         range_m: distance to the ego, `(..., H)`.
-        sensed_m: distance to that centroid as the ego's own sensors have it, `(..., H)`; NaN where they do
-            not see the helper.
+        claims: what helpers say of themselves, for a rule whose `needs` names it; None where nobody looked.
     """
 
     intents: Floats
@@ -36,7 +36,7 @@ class Messages:
     arrival_s: Floats
     distance_m: Floats
     range_m: Floats
-    sensed_m: Floats
+    claims: Claims | None = None
 
 
 class Fused(NamedTuple):
@@ -61,7 +61,8 @@ class Rule(Protocol):
     """A pure function of arrays, with a memory of its own for each episode.
 
     Steps of an episode are fused in order, each from the state that the last one left, those in which the ego
-    hears nobody as well. In those it acts on its own intent, whatever the rule says.
+    hears nobody as well. In those it acts on its own intent, whatever the rule says. A rule that looks at
+    `Messages.claims` has `needs = ("claims",)`.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:

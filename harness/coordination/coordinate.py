@@ -106,8 +106,9 @@ def fuse(
         state = np.zeros((*failed.shape, 0))
     else:
         rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
-        sensed_m = trust if intents.sensed_m is None else intents.sensed_m  # NaN: nobody looked
-        messages = Messages(p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, sensed_m)
+        messages = Messages(
+            p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims
+        )
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
         fused, weights, state, trusted = rule.fuse(messages, state)
         trust = trust if trusted is None else np.where(heard.on_time, trusted, np.nan)

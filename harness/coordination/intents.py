@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.coordination.claims import Claims
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Site
@@ -25,12 +26,11 @@ class Intents:
         payload_bits: size of the reply, `(..., H)`.
         inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
         site: where the vehicles truly are, for a channel that needs it; else None.
-        sensed_m: the helper's distance to that centroid as the ego's own sensors have it, `(..., H)`; NaN
-            where they do not see it. None where nobody looked.
         silent: the helper is asked and sends nothing in its slot, `(..., H)`. None: nobody.
         voice_of: place of the vehicle whose voice each of the H is, `(..., H)`, where one has several. None:
             each its own.
         outlook: what the ego sees and helpers would add, for a schedule that needs it; else None.
+        claims: what helpers say of themselves, for a rule or an attack that needs it; else None.
     """
 
     own: Floats
@@ -41,10 +41,10 @@ class Intents:
     payload_bits: Floats
     inference_s: Floats
     site: Site | None = None
-    sensed_m: Floats | None = None
     silent: Bools | None = None
     voice_of: Ints | None = None
     outlook: Outlook | None = None
+    claims: Claims | None = None
 
     def take(self, at: Any) -> "Intents":
         """The decisions at these places of the leading dimension."""
@@ -52,6 +52,7 @@ class Intents:
             self,
             site=self.site and self.site.take(at),
             outlook=self.outlook and self.outlook.take(at),
+            claims=self.claims and self.claims.take(at),
             **{name: array[at] for name, array in self.arrays().items()},
         )
 
@@ -69,6 +70,7 @@ class Intents:
             helpers=helpers,
             site=self.site and self.site.of_helpers(places),
             outlook=self.outlook and self.outlook.of_helpers(places),
+            claims=self.claims and self.claims.of_helpers(places),
             **taken,
         )
 
@@ -78,5 +80,5 @@ class Intents:
         return {name: value for name, value in values.items() if name not in PARTS and value is not None}
 
 
-PARTS = ("site", "outlook")
+PARTS = ("site", "outlook", "claims")
 WITH_EGO = ("distance_m", "inference_s")  # arrays whose first column is the ego's

@@ -285,8 +285,9 @@ class OperatingPoint:
         return self.threshold if self.threshold is not None else 0.0 if own is None else own
 
     def needs(self, what: str) -> bool:
-        """Whether its schedule looks at `in_time`, `outlook` or `lot`."""
-        return self.profile is not None and what in SCHEDULES[self.schedule].needs
+        """Whether its schedule, its rule or an attack looks at `in_time`, `outlook`, `lot` or `claims`."""
+        parts = (SCHEDULES[self.schedule], RULES.get(self.consensus), *attacks_of(self.attack))
+        return self.profile is not None and any(what in getattr(part, "needs", ()) for part in parts)
 
     @property
     def asks_again(self) -> bool:

@@ -202,7 +202,7 @@ class Asker:
         width, actions = max(map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
         distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
-        bits, sensed = np.zeros((len(moments), width - 1)), np.full((len(moments), width - 1), np.nan)
+        bits = np.zeros((len(moments), width - 1))
         for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
             at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
             for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
@@ -212,24 +212,10 @@ class Asker:
                 if j:
                     reach[i, j - 1] = scene.record["range_m"][viewer]
                     bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
-                    sensed[i, j - 1] = self._sensed_m(scene, viewer)
             row += [None] * (width - len(row))
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)
         times = inference_s(self.latency, answers)
-        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, times, sensed_m=sensed)
-
-    def _sensed_m(self, scene: Scene, helper: str) -> float:
-        """Distance of a helper to the conflict zone by the ego's sensors; NaN if they do not see it."""
-        ego = scene.record["state"]["vehicles"][0]
-        nodes = scene.record["graphs"][scene.viewers[0]]["nodes"]
-        seen = next((node for node in nodes if node["id"] == helper), None)
-        if seen is None:
-            return math.nan
-        cos, sin = math.cos(ego["heading_rad"]), math.sin(ego["heading_rad"])
-        zone_x, zone_y = self.spec.scenario.road().zone_m
-        x = ego["x_m"] + seen["forward_m"] * cos + seen["left_m"] * sin
-        y = ego["y_m"] + seen["forward_m"] * sin - seen["left_m"] * cos
-        return math.hypot(x - zone_x, y - zone_y)
+        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, times)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
         """The ego's answers to these sets of messages, shown so."""

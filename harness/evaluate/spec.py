@@ -4,6 +4,7 @@ import platform
 import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +16,7 @@ from harness.backends.cards import Card, argument
 from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
+from harness.core.files import digest, sha256_file
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.device import rows_of
@@ -327,6 +329,13 @@ class Spec:
             ("--helper-prompt", first.prompt.version),
             ("--helper-answer", first.answer),
         ]
+
+
+@cache
+def program_sha256() -> str:
+    """Digest of the harness's own code."""
+    root = Path(__file__).parents[1]
+    return digest({str(path.relative_to(root)): sha256_file(path) for path in root.rglob("*.py")})
 
 
 def versions(

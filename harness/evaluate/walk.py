@@ -12,6 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
@@ -21,6 +22,7 @@ from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
+from harness.evaluate.claims import claims
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
 from harness.radio.channel import Draws, Physical, Site, Unit
@@ -93,6 +95,10 @@ class World(Protocol[Moment]):
         """What egos see in the moments just shown, (n, ...); None in a world without places."""
         ...
 
+    def claims(self) -> Claims | None:
+        """What helpers say of themselves in the moments just shown, (n, ...); None as above."""
+        ...
+
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
         """Act on the decisions, one `Decided` a condition, and advance to the next moments."""
         ...
@@ -117,6 +123,10 @@ class Placed:
     def outlook(self) -> Outlook:
         """What the ego of each scene sees."""
         return outlook(self.scenario.road(), self.scenes)
+
+    def claims(self) -> Claims:
+        """What the helpers of each scene say of themselves."""
+        return claims(self.scenario, self.scenes)
 
 
 class Fuses(Protocol):
@@ -156,6 +166,8 @@ def walk(
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         if any(point.needs("outlook") for point in due):
             intents = replace(intents, outlook=world.outlook())
+        if any(point.needs("claims") for point in due):
+            intents = replace(intents, claims=world.claims())
         places = [each.at for point, each in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
         said = {

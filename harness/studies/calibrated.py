@@ -155,6 +155,9 @@ class CalibratedWorld:
     def outlook(self) -> None:
         """They see nothing in particular."""
 
+    def claims(self) -> None:
+        """They say nothing of themselves."""
+
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""
         [part] = decided

@@ -25,10 +25,12 @@ from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import (
     Estimate,
     negative_log_likelihood,
+    of_resamples,
     resampled,
 )
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
+from harness.evaluate.spec import program_sha256, versions
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
 from harness.studies.stored import Stored
@@ -39,10 +41,10 @@ TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
 CAPPED = "linear:weight_cap=0.3"
-# What `--attacks all` is: each alone, and a spoofed pose and several voices with a lie.
+# What `--attacks all` is: each alone, and a false place and several voices with a lie.
 USUAL = (
     "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
-    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof",
+    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump",
 )  # fmt: skip
 
 
@@ -91,21 +93,13 @@ class Cell:
                 "f1": 2 * hits / (2 * hits + wrongs + misses),
                 "false_alarms": wrongs / (wrongs + rights),
             }
-        return {name: _bootstrapped(of, len(hit)) for name, of in found.items()}
+        return {name: of_resamples(of, len(hit)) for name, of in found.items()}
 
     @property
     def time_to_detection(self) -> float:
         """Median of how many messages it takes until an attacker is found, of those that are; NaN if none."""
         found = [n for n in self.first if n]
         return float(np.median(found)) if found else float("nan")
-
-
-def _bootstrapped(values: Floats, n: int) -> Estimate:
-    """A figure of n episodes, the first of the values, and its interval by those of resampled ones."""
-    if np.isnan(values[0]):
-        return Estimate(np.nan, np.nan, np.nan, 0, 0)
-    low, high = np.nanpercentile(values[1:], (2.5, 97.5)).tolist()
-    return Estimate(float(values[0]), low, high, n, 0)
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
@@ -317,11 +311,14 @@ def run_bench(
 
 
 class _Kept:
-    """Finished cells in a file, a line each; those of other answers, conditions or seeds do not count."""
+    """Finished cells in a file, a line each; those of other answers, settings or code do not count."""
 
     def __init__(self, path: Path, stored: Stored, point: OperatingPoint, seeds: Sequence[int]) -> None:
         self._path = path
-        self._of = digest([stored.manifest(), str(stored.run.manifest.identity), asdict(point), list(seeds)])
+        self._of = digest([
+            stored.manifest(), str(stored.run.manifest.identity), asdict(point), list(seeds),
+            versions(), program_sha256(),
+        ])  # fmt: skip
         self._cells: dict[tuple[str, str, float], Cell] = {}
         data = path.read_bytes() if path.is_file() else b""
         for line in data.splitlines():
