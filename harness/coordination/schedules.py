@@ -12,6 +12,7 @@ from harness.coordination.learnt import Learnt, Stated
 from harness.coordination.scheduling import FORMULAS, Schedule
 from harness.core.config import convert, toml
 from harness.core.errors import printable
+from harness.core.files import sha256_file
 from harness.core.plugins import Plugins
 from harness.core.resources import entries, find
 
@@ -22,6 +23,10 @@ class Schedules(Plugins[Schedule]):
     def __getitem__(self, name: str) -> Schedule:
         """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
         return _read(find("schedules", f"{name}.toml")) if name in _files() else super().__getitem__(name)
+
+    def file_sha256(self, name: str) -> str | None:
+        """Digest of the file that holds a schedule; None for one that no file holds."""
+        return sha256_file(find("schedules", f"{name}.toml")) if name in _files() else None
 
     def __iter__(self) -> Iterator[str]:
         return iter({**dict.fromkeys(self.built_in), **dict.fromkeys(_files()), **self._entries()})

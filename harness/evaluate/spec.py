@@ -15,6 +15,7 @@ from harness import __version__
 from harness.backends.cards import Card, argument
 from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 from harness.dataset.load import Scene
@@ -288,6 +289,11 @@ class Spec:
             "conditions": [asdict(point) for point in self.points],
             "channels": {name: CHANNELS.record(name) for point in self.points if (name := point.profile)},
             "networks": {point.round_trip: asdict(point.network) for point in self.points if point.network},
+            "schedules": {
+                name: sha256
+                for name in (point.schedule for point in self.points)
+                if (sha256 := SCHEDULES.file_sha256(name))
+            },
             "seeds": list(self.seeds),
             "batch_size": self.batch_size,
             "dtype": self.dtype,

@@ -504,6 +504,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     conditions: tuple[dict[str, Any], ...]
     channels: dict[str, ChannelRecord] = {}
     networks: dict[str, dict[str, Any]] = {}
+    schedules: dict[str, str] = {}
     seeds: tuple[int, ...]
     thinking: bool
     answer: str

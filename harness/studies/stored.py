@@ -17,6 +17,7 @@ from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Ints
 from harness.core.config import convert
@@ -78,20 +79,18 @@ class Stored:
         manifest = self.run.manifest
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
-        for profile, recorded in manifest.channels.items():
-            if profile not in CHANNELS or CHANNELS.record(profile) != msgspec.json.decode(
-                msgspec.json.encode(recorded)
-            ):
-                raise UserError(
-                    f"{printable(folder)}: channel profile {printable(profile)} has changed since; restore "
-                    "it or run again"
-                )
-        for name, of_run in manifest.networks.items():
-            if asdict(network(name)) != of_run:
-                raise UserError(
-                    f"{printable(folder)}: network {printable(name)} has changed since; restore it or run "
-                    "again"
-                )
+        stated: dict[str, tuple[Mapping[str, Any], Callable[[str], Any]]] = {
+            "channel profile": (manifest.channels, lambda name: name in CHANNELS and CHANNELS.record(name)),
+            "network": (manifest.networks, lambda name: asdict(network(name))),
+            "schedule": (manifest.schedules, SCHEDULES.file_sha256),
+        }
+        for what, (of_run, now) in stated.items():
+            for name, recorded in of_run.items():
+                if now(name) != msgspec.json.decode(msgspec.json.encode(recorded)):
+                    raise UserError(
+                        f"{printable(folder)}: {what} {printable(name)} has changed since; restore it or run "
+                        "again"
+                    )
         self.points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
         self.dataset = dataset_of(self.run).of_episodes(self.run.grid.episodes)
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))

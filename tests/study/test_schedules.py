@@ -15,6 +15,7 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import toml
 from harness.core.errors import UserError
+from harness.core.files import sha256_file
 from harness.core.resources import MARKER, find
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
@@ -304,6 +305,23 @@ def test_a_file_that_does_not_fit_is_one_line(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "schedules/odd.toml").write_text(shipped.replace('"entropy", ', ""))
     with pytest.raises(UserError, match="has other inputs or sizes than the program; learn it again"):
         named_point("6g:schedule=odd")
+
+
+def test_a_run_pins_the_file_of_its_schedule(small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / MARKER).touch()
+    (tmp_path / "schedules").mkdir()
+    mine, shipped = tmp_path / "schedules/mine.toml", find("schedules", "learnt.toml").read_text()
+    mine.write_text(shipped)
+    points = tuple(map(named_point, ("6g:schedule=mine", "6g:schedule=coverage")))
+    out = run(spec_of(small, points=points), tmp_path / "run").out
+    assert read(out).manifest.schedules == {"mine": sha256_file(mine)}
+    (out / ".work").mkdir()
+    mine.write_text(shipped.replace("threshold = 0.005", "threshold = 0.006"))
+    with pytest.raises(UserError, match="was begun with another schedules"):
+        run(spec_of(small, points=points), out)
+    with pytest.raises(UserError, match="schedule mine has changed since; restore it or run again"):
+        Stored(out)
 
 
 def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
