@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from swarm_extras import MUMBLE
 
 from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Turn, attackers, attacks_of
 from harness.coordination.claims import Claims
@@ -200,7 +201,13 @@ def test_an_episode_remembers_its_own_past_and_no_other():
     assert now.intents.helpers.tolist() == [[CAREFUL, KEEP, BOLD], [BOLD, BOLD, BOLD]]
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+@pytest.fixture
+def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "mumble", MUMBLE)
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize("name", [*ATTACKS, "mumble"])
 def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
     rng = np.random.default_rng(3)
     p = rng.dirichlet(np.ones(3), (40, 3))
@@ -215,7 +222,8 @@ def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
     assert told.intents.helpers.shape[1] == told.draws.jitter.shape[1] == told.attackers.shape[1]
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize("name", [*ATTACKS, "mumble"])
 def test_an_attack_of_nobody_changes_nothing(name: str):
     told = Attackers(named_point(f"6g:attack={name}:share=0")).said(TRUTH, drawn([0]), [(0, 0)])
     assert not told.attackers.any()

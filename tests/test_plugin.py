@@ -1,4 +1,4 @@
-"""The seams from outside: `tests/plugin`, installed beside the harness, adds a rule, a channel and a backend.
+"""The seams from outside: `tests/plugin`, installed beside the harness, adds one of each kind of plug-in.
 
 Commands run as typed, in a process of their own that has the package; this one only reads what they wrote.
 """
@@ -25,7 +25,9 @@ inference_s = 0.01
 basis = "declared: for this test"
 """
 SMOOTHED, FOG_SMOOTHED, CLOSE = "6g:consensus=smoothing", "fog:consensus=smoothing", "fog:radius_m=60"
-FROZEN, DRIVEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE), (SMOOTHED, FOG_SMOOTHED)
+MUMBLED, NEAREST = "6g:attack=mumble:share=1", "6g:schedule=near,max_helpers=1"
+FROZEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE, MUMBLED, NEAREST)
+DRIVEN = (SMOOTHED, FOG_SMOOTHED)
 ACTIONS, PLACES = ("SLOWER", "IDLE", "FASTER"), (1, 2, 3)
 
 pytestmark = pytest.mark.slow
@@ -159,6 +161,38 @@ def test_what_crosses_the_fog_crosses_a_better_channel_by_the_same_luck(frozen: 
     assert len(both) > 30
     assert (clear.delivered | ~fog.delivered).all()
     assert fog.delivered.sum() < clear.delivered.sum()
+
+
+def test_helpers_that_mumble_are_half_as_sure(frozen: Tables):
+    """The linear pool of what the ego intends and of what helpers do, halfway to a third each."""
+    said = {
+        (a.scene, a.viewer): np.array([getattr(a, f"intent_{action}") for action in ACTIONS])
+        for a in frozen.answers.itertuples()
+    }
+    heard = 0
+    for row in decided(frozen, MUMBLED).to_dict("records"):
+        there = [n for n in PLACES if row[f"on_time_{n}"] is True]
+        policy = (row["own_weight"] if there else 1.0) * said[row["scene"], "v1"]
+        for n in there:
+            policy = policy + row[f"weight_{n}"] * (said[row["scene"], row[f"helper_{n}"]] + 1 / 3) / 2
+        assert [row[f"fused_{action}"] for action in ACTIONS] == pytest.approx(policy, abs=5e-6)
+        heard += len(there)
+    assert heard > 30
+
+
+def test_the_nearest_helper_within_half_the_way_is_asked(frozen: Tables, small: Dataset):
+    known_m = {
+        scene.id: scene.record["range_m"] for scene in small.scenes(frozen.answers.scene.unique().tolist())
+    }
+    decisions, asked = decided(frozen, NEAREST), 0
+    sent = replies(decisions)
+    assert sent.groupby(["scene", "seed"]).size().max() == 1
+    asked_there = {(row.scene, row.seed): row.helper for row in sent.itertuples()}
+    for row in decisions.to_dict("records"):
+        helper, range_m = min(known_m[row["scene"]].items(), key=lambda pair: pair[1])
+        assert asked_there.get((row["scene"], row["seed"])) == (helper if range_m < 50 else None)
+        asked += range_m < 50
+    assert 0 < asked < len(decisions)
 
 
 def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from swarm_extras import NEAR
 
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
@@ -25,8 +26,14 @@ from harness.radio.fading import Trips
 
 SIXG = POINTS["6g"]
 SURE = (0.98, 0.01, 0.01)
-EVERY = [name for name in SCHEDULES if name in SCHEDULES.built_in]
-FREE = {name for name in EVERY if SCHEDULES[name].threshold is None}  # no threshold of their own
+BUILT_IN = [name for name in SCHEDULES if name in SCHEDULES.built_in]
+EVERY = [*BUILT_IN, "near"]  # which is of `tests/plugin`
+FREE = {name for name in BUILT_IN if SCHEDULES[name].threshold is None}  # no threshold of their own
+
+
+@pytest.fixture(autouse=True)
+def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCHEDULES._loaded, "near", NEAR)
 
 
 def scene(own=(0.5, 0.3, 0.2), range_m=(10.0, 20.0, 30.0), valid=(True, True, True), unseen=(0.8, 0.4)):

@@ -1,4 +1,4 @@
-"""What a package adds to the harness without a change of it: a consensus rule, a channel and a backend."""
+"""What a package adds to the harness without a change of it: one of each kind of plug-in."""
 
 import json
 from collections.abc import Sequence
@@ -10,7 +10,10 @@ import numpy as np
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
+from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages, linear_pool
+from harness.coordination.intents import Intents
+from harness.coordination.scheduling import Formula, Known
 from harness.core.arrays import Floats
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.constant import link_up
@@ -57,6 +60,20 @@ class Fog:
         return Delivery(link_up(draws.link, loss), delay_s, loss, np.full_like(loss, np.nan))
 
 
+@dataclass(frozen=True)
+class Mumble(Attack):
+    """Is half as sure as it is: the mean of its intent and of all actions alike."""
+
+    def act(self, said: Intents, turn: Turn) -> Intents:
+        """From what attacks before it have made of the truth."""
+        return self.intend(said, turn, (said.helpers + 1 / said.helpers.shape[-1]) / 2)
+
+
+def near(known: Known) -> Floats:
+    """How near a helper is, from 0 at 100 m to 1 beside the ego."""
+    return np.where(known.may_ask, 1 - known.range_m / 100, np.nan)
+
+
 class Cautious:
     """Slows down where its own view shows a conflict, and is in doubt all the same."""
 
@@ -84,6 +101,8 @@ def opened(card: Card, **options: Any) -> Cautious:
 
 SMOOTHING = Smoothing()
 FOG = Fog()
+MUMBLE = Mumble()
+NEAR = Formula(near, 0.5)
 CAUTIOUS = Registration(
     "swarm_extras:opened",
     Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False),
