@@ -2,31 +2,43 @@
 
 from pathlib import Path
 from textwrap import fill
+from typing import TYPE_CHECKING
 
 import typer
 
 from harness.cli import options
 from harness.cli.estimates import WIDTH, echo_json, table
 from harness.cli.progress import bar
-from harness.core.errors import printable
+from harness.cli.run import Swarm, file_name
+from harness.core import resources
+from harness.core.errors import UserError, printable
 from harness.core.figures import shown
+
+if TYPE_CHECKING:
+    from harness.evaluate.spec import Spec
 
 HEADS = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
 
 
 def command(
-    run: Path = typer.Argument(help="Folder of a finished run of `harness eval`.", metavar="RUN"),
+    run: Path | None = typer.Argument(
+        None, help="Folder of a finished run of `harness eval`; or give --model.", metavar="[RUN]"
+    ),
+    model: str | None = typer.Option(None, help="Model to evaluate first, on the default dataset."),
+    prompt: options.ScenarioPrompt = None,
     attacks: str = typer.Option(
         "all", help="Attacks, such as liar,liar+spoof,stale:decisions=2. `harness trust --help` lists them."
     ),
     rules: str = typer.Option("all", help="Consensus rules, such as median,trust,linear:weight_cap=0.3."),
     share: str = typer.Option("0,1/3,2/3", help="Shares of the helpers that attack; 0 is always played."),
     condition: str = typer.Option("6g", help="Operating point that is attacked, or a change of one."),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
+    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's, else 0:5."),
     no_model: bool = typer.Option(
         False, "--no-model", help="Leave out walks to decision points that the run has no answer for."
     ),
-    out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/trust."),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: RUN/trust, or reports/trust-<model>-<prompt>-<dataset>."
+    ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -34,8 +46,11 @@ def command(
 
     The model is asked only what the run has not. The same command continues a study that was stopped.
     """
+    from harness.backends.cache import default_file
+    from harness.backends.registry import open_backend
     from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES
+    from harness.evaluate.run import made
     from harness.studies.stored import Stored
     from harness.studies.trust import CAPPED, USUAL, names_of, run_bench, shares_of
     from harness.studies.trust_page import as_json as plain
@@ -43,7 +58,15 @@ def command(
 
     chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
     ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
+    if (run is None) == (model is None) or (run and prompt):
+        raise UserError("give RUN, a finished run's folder, or a --model with its --prompt: one of the two")
     with bar("rules under attack", quiet=as_json or quiet) as progress:
+        if model is not None:
+            spec = _spec(model, prompt, condition, seeds)
+            name = f"trust-{file_name(model)}-{spec.ego.prompt.version}-{spec.source.name}"
+            out = out or Path("reports") / name
+            run = made(spec, out / "run", progress, default_file(), progress.more, open_backend).path
+        assert run is not None
         stored = Stored(run, more=progress.more, done=progress, asks=not no_model)
         draws = options.parse_seeds(seeds) if seeds else stored.seeds
         where = out or run / "trust"
@@ -72,3 +95,19 @@ def command(
         "success against linear while nobody attacks, paired"
     )
     typer.echo(f"wrote {printable(page)}")
+
+
+def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
+    """The evaluation whose answers are walked."""
+    from harness.dataset import load
+    from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.spec import Spec
+
+    frozen = load.load(load.find(resources.DATASET))
+    swarm = Swarm(model, None, prompt, "json", False, "own", None, None, None, None)
+    return Spec(
+        **swarm.agents(frozen.scenario),
+        source=FrozenSource(frozen),
+        points=options.points([condition], None, None),
+        seeds=options.parse_seeds(seeds or "0:5"),
+    )

@@ -1,6 +1,7 @@
 """The bench of rules under attack: its cells are runs, its figures paired, and it goes on when stopped."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ import pytest
 from evaluating import figure, run, spec_of
 
 from harness.coordination.operating_point import named_point
+from harness.core import resources
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.run import Evaluated
+from harness.runs.folder import read
 from harness.runs.listing import runs
 from harness.studies import trust
 from harness.studies.stored import Stored
@@ -132,6 +135,34 @@ def test_what_it_cannot_play_is_one_line(act: Any, said: str) -> None:
     with pytest.raises(UserError, match=said) as problem:
         act()
     assert "\n" not in str(problem.value)
+
+
+def test_of_a_model_a_run_is_made_first_and_not_twice(
+    harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resources, "DATASET", str(small_path))
+    typed = (
+        *("trust", "--model", "proxy", "--prompt", "v4", "--attacks", "liar", "--rules", "trust"),
+        *("--share", "0,1/3", "--out", "bench"),
+    )
+    code, out, _ = harness(*typed)
+    assert code == 0
+    assert "Over all 1 attacks" in out
+    cells = Path("bench/cells.jsonl").read_bytes()
+    assert read(Path("bench/run")).manifest.prompt["version"] == "v4"
+    assert harness(*typed)[0] == 0
+    assert Path("bench/cells.jsonl").read_bytes() == cells
+    code, _, err = harness(*typed, "--seeds", "0:1")
+    assert code == 2
+    assert "was begun with another seeds" in err
+    for wrong in (
+        ("trust",),
+        ("trust", "bench/run", "--model", "proxy"),
+        ("trust", "bench/run", "--prompt", "v4"),
+    ):
+        code, _, err = harness(*wrong)
+        assert code == 2
+        assert "give RUN, a finished run's folder, or a --model with its --prompt: one of the two" in err
 
 
 def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) -> None:
