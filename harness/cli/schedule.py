@@ -109,11 +109,13 @@ def compare(
     text = console()
     for run in found:
         text.print(f"{printable(run.name, 40)} · {printable(run.point.name, 36)}")
+        joules = ("J",) if run.energy else ()
         table(
-            ("schedule", "success %", "msgs", "over paper's", "gap closed %"),
+            ("schedule", "success %", "msgs", *joules, "over paper's", "gap closed %"),
             [
                 (
                     printable(said(row), 24), shown(row.success), f"{row.play.means['messages']:.1f}",
+                    *(f"{row.play.means['energy_j']:.0f}" for _ in joules),
                     shown(row.over_paper), shown(row.closed, 100.0, 0),
                 )
                 for row in run.rows

@@ -5,7 +5,7 @@ share is read anew each time.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -20,6 +20,7 @@ from harness.runs.records import Answer, Constant, Device, DeviceRow, Latency, S
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
+    from harness.dataset.load import Scene
     from harness.evaluate.agent import Agent
 
 
@@ -74,6 +75,22 @@ def answer_s(speed: Speed, answer: Answer) -> float:
 def answer_j(speed: Speed, answer: Answer) -> float:
     """Joules of one answer, as `answer_s` has its seconds."""
     return devices.joules(speed, *tokens(answer))
+
+
+def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]) -> Floats:
+    """Joules of each vehicle's own answer, (n, 1+H), the ego first; NaN where it has none.
+
+    Args:
+        latency: of a run with a device profile.
+        scenes: decision points.
+        answers: by request id.
+    """
+    taken = np.full((len(scenes), max(len(scene.viewers) for scene in scenes)), np.nan)
+    for n, scene in enumerate(scenes):
+        for place, viewer in enumerate(scene.viewers):
+            if answer := answers.get(f"{scene.id}/{viewer}"):
+                taken[n, place] = answer_j(latency.speed(place), answer)
+    return taken
 
 
 def tokens(answer: Answer) -> tuple[float, float]:

@@ -27,7 +27,13 @@ from harness.studies.stored import Stored
 from harness.world.sight_lines import site
 
 MOST_SETS = 64
-COSTS = ("messages", "airtime_ms", "latency_ms", "decisions")  # of a decision; an episode has their sums
+COSTS = (
+    "messages",
+    "airtime_ms",
+    "latency_ms",
+    "decisions",
+    "energy_j",
+)  # of a decision; an episode has their sums
 PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 
@@ -195,12 +201,15 @@ def _level(stored: Stored, point: OperatingPoint, seeds: Ints, at: Ints, sets: B
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
     intents = intents.take(node)
-    actions, costs = [], []
+    own_j, watts = stored.joules(scenes, point)
+    own_j, actions, costs = own_j[node], [], []
     for who in sets[:, :width]:
         heard = fuse(
             point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents
         )
         actions.append(heard.action.reshape(shape))
-        each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)))
+        helpers_j = np.sum(np.where(heard.asked, own_j[:, 1 : 1 + width], 0.0), axis=-1)
+        energy_j = own_j[:, 0] + helpers_j + watts * heard.airtime_s
+        each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)), energy_j)
         costs.append(np.stack(each, -1).reshape(*shape, len(COSTS)))
     return Level(at, np.stack(actions, -1), np.stack(costs, 2), intents, draws)

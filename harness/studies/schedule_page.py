@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SLACK = 1.1  # by which messages may exceed on these layouts what they were on tune layouts
+BUDGETS = {"messages": "messages an episode", "energy_j": "joules an episode"}
 TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -54,21 +55,22 @@ def in_sentences(compared: Compared) -> list[str]:
 
 @styled
 def fronts(compared: Sequence[Compared]) -> Figure:
-    """Success against messages, a panel a run: the settings that are taken as the budget grows."""
-    figure = Figure(figsize=(max(3.6 * len(compared), 4.4), 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
-    panels = figure.subplots(1, len(compared), squeeze=False, sharey=True)[0]
-    for axes, run in zip(panels, compared, strict=True):
+    """Success against messages, and joules where they are known: settings taken as the budget grows."""
+    each = [(run, cost) for run in compared for cost in BUDGETS if cost == "messages" or run.energy]
+    figure = Figure(figsize=(max(3.6 * len(each), 4.4), 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    panels = figure.subplots(1, len(each), squeeze=False, sharey=True)[0]
+    for axes, (run, cost) in zip(panels, each, strict=True):
         for n, name in enumerate(name for name in run.names if name != NEVER):
             axes.plot(
-                *_line(run.front(name)), "-" if n < len(COLOURS) else ":", drawstyle="steps-post",
+                *_line(run.front(name, cost), cost), "-" if n < len(COLOURS) else ":", drawstyle="steps-post",
                 color=COLOURS[n % len(COLOURS)], marker=MARKERS[n % len(MARKERS)], markersize=3, linewidth=1,
                 label=name,
             )  # fmt: skip
         bound: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1, "label": "oracle, a bound"}
-        axes.plot(*_line(run.of_oracle()), "--", color=INK, **bound)
+        axes.plot(*_line(run.of_oracle(), cost), "--", color=INK, **bound)
         tau = f"entropy above {run.point.tau_nats:g}"
-        axes.plot(*_line([run.paper]), "*", color=INK, markersize=9, label=tau)
-        axes.set(xlabel="messages an episode", xlim=(0, None))
+        axes.plot(*_line([run.paper], cost), "*", color=INK, markersize=9, label=tau)
+        axes.set(xlabel=BUDGETS[cost], xlim=(0, None))
         axes.set_title(f"{run.name}, {run.point.name}", fontsize=8)
         axes.grid(color=PALE, linewidth=0.6)
         axes.set_axisbelow(True)
@@ -79,8 +81,8 @@ def fronts(compared: Sequence[Compared]) -> Figure:
     return figure
 
 
-def _line(played: Sequence[Play]) -> tuple[list[float], list[float]]:
-    return [play.means["messages"] for play in played], [100 * float(play.success.mean()) for play in played]
+def _line(played: Sequence[Play], cost: str) -> tuple[list[float], list[float]]:
+    return [play.means[cost] for play in played], [100 * float(play.success.mean()) for play in played]
 
 
 def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
@@ -100,7 +102,7 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
             **place(run, row.play), **ends("success", row.success), "n": row.success.n, **row.play.means,
             **ends("over_paper", row.over_paper), "p_holm": row.p, **ends("over_random", row.over_random),
             **ends("gap_closed", row.closed), **ends("messages_share", row.messages),
-            **ends("area", row.area),
+            **ends("area", row.area), **ends("area_j", row.area_j),
         }
         for run in compared for row in run.rows
     ]  # fmt: skip

@@ -55,16 +55,21 @@ class Play:
     success: Floats
     costs: Floats
 
+    def of(self, cost: str) -> Floats:
+        """One of `COSTS` of every episode, (S, E)."""
+        return np.asarray(self.costs[..., COSTS.index(cost)])
+
     @property
     def messages(self) -> Floats:
         """Of every episode, (S, E)."""
-        return np.asarray(self.costs[..., COSTS.index("messages")])
+        return self.of("messages")
 
     @property
     def means(self) -> dict[str, float]:
-        """Messages and milliseconds on air of an episode, and milliseconds of a decision."""
-        messages, air, latency, decisions = (self.costs.sum(axis=(0, 1)) / self.success.size).tolist()
-        return {"messages": messages, "airtime_ms": air, "latency_ms": latency / decisions}
+        """Messages, milliseconds on air and joules of an episode, and milliseconds of a decision."""
+        means = dict(zip(COSTS, (self.costs.sum(axis=(0, 1)) / self.success.size).tolist(), strict=True))
+        decisions = means.pop("decisions")
+        return {**means, "latency_ms": means["latency_ms"] / decisions}
 
 
 def plays(made: Choices, point: OperatingPoint, settings: Sequence[Setting]) -> list[Play]:
@@ -100,6 +105,7 @@ class Chosen:
         closed: share of the gap between the paper's schedule and the oracle that it closes.
         messages: its messages as a share of the paper's.
         area: success averaged over budgets from no message to those of `always`, at the settings of `front`.
+        area_j: the same over joules, from those of asking nobody; NaN where they are unknown.
     """
 
     play: Play
@@ -110,6 +116,7 @@ class Chosen:
     closed: Estimate
     messages: Estimate
     area: Estimate
+    area_j: Estimate
 
 
 @dataclass(frozen=True)
@@ -169,14 +176,19 @@ class Compared:
         best = max(within, key=lambda play: (round(float(play.success.mean()), 9), -play.messages.mean()))
         return _found(self.plays[schedule], best.setting)
 
-    def front(self, schedule: str) -> list[Play]:
+    @property
+    def energy(self) -> bool:
+        """Whether joules are known."""
+        return bool(np.isfinite(self.oracle.means["energy_j"]))
+
+    def front(self, schedule: str, cost: str = "messages") -> list[Play]:
         """The settings that are taken as the budget grows: of those it allows, the best on tune layouts.
 
         Without tune layouts the best on these, which flatters them. The first asks nobody.
         """
         taken, best = list[Play](), -np.inf
         for play, rank in sorted(
-            self._ranked(schedule), key=lambda pair: (pair[0].messages.mean(), -pair[1])
+            self._ranked(schedule), key=lambda pair: (pair[0].of(cost).mean(), -pair[1])
         ):
             if rank > best:
                 taken.append(play)
@@ -191,19 +203,23 @@ class Compared:
 
     def of_oracle(self) -> list[Play]:
         """The oracle where a success may cost so many messages at most, from none on."""
-        bound, most = self.oracle, int(self.oracle.messages.max())
-        cheap = [bound.messages <= cap for cap in range(most + 1)]
-        return [Play(bound.setting, bound.success * of, bound.costs * of[..., None]) for of in cheap]
+        bound, alone = self.oracle, self.plays[NEVER][0].costs
+        cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
+        costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
+        return [
+            Play(bound.setting, bound.success * of, spent) for of, spent in zip(cheap, costs, strict=True)
+        ]
 
-    def area(self, schedule: str) -> Estimate:
-        """Success averaged over budgets, with a bootstrap interval over episodes."""
+    def area(self, schedule: str, cost: str = "messages") -> Estimate:
+        """Success averaged over budgets beyond never asking, with a bootstrap interval over episodes."""
         of_bound = [(play, float(play.success.mean())) for play in self.of_oracle()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
         success = self._resampled([play.success for play, _ in ranked])
-        messages = self._resampled([play.messages for play, _ in ranked])
-        most = self._resampled([self.everybody.messages])
+        least = self._resampled([self.plays[NEVER][0].of(cost)])
+        spent = self._resampled([play.of(cost) for play, _ in ranked]) - least
+        most = self._resampled([self.everybody.of(cost)]) - least
         ranks = np.array([rank for _, rank in ranked])
-        return self._interval(_area(success, np.minimum(messages, most), ranks, most[:, 0]))
+        return self._interval(_area(success, np.clip(spent, 0.0, most), ranks, most[:, 0]))
 
     def _interval(self, values: Floats) -> Estimate:
         return of_resamples(values, self.weights.shape[1])
@@ -235,6 +251,7 @@ class Compared:
             difference(SUCCESS, play.success.T, self.random_like(play).T),
             self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
             self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.setting.schedule),
+            self.area(play.setting.schedule, "energy_j"),
         )  # fmt: skip
 
     def random_like(self, play: Play) -> Floats:

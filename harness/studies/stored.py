@@ -1,5 +1,6 @@
 """A finished run as a source: its answers are coordinated again, and no model is asked what the run has."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -19,11 +20,12 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import chosen
-from harness.core.arrays import Bools, Ints
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import alone, canonical_json
 from harness.dataset.load import Scene
+from harness.evaluate import device
 from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -96,6 +98,7 @@ class Stored:
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks = asks
         self.left_out: set[str] = set()
+        self._opened: dict[int, Backend] = {}
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
             {answer.id: answer for answer in self.run.answers}, done, more,
@@ -124,6 +127,16 @@ class Stored:
         ask = _Nearest(self, vehicles - 1, partial(world.leave_out, point))
         columns, places = walk_through(world, point, ask, seeds, world.numbers)
         yield Walked(world.numbers, world.ends(point), columns, places)
+
+    def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
+        """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""
+        manifest = self.run.manifest
+        if manifest.device_profile is None:
+            return np.full((len(moments), self.vehicles), np.nan), np.nan
+        taken = device.vehicles_j(manifest.latency, moments, self._asker.answers)
+        if point.round_trip_s is not None or point.round_trip:
+            taken[:, 0] = np.nan  # the ego's model is in a cloud
+        return taken, device.transmit_watts(manifest.device_profile, point)
 
     @property
     def spec(self) -> Spec:
@@ -199,6 +212,12 @@ class Stored:
         )  # fmt: skip
 
     def _open(self) -> Backend:
+        """This process's backend, opened once: a forked process may not ask its parent's."""
+        if (process := os.getpid()) not in self._opened:
+            self._opened[process] = self._newly_opened()
+        return self._opened[process]
+
+    def _newly_opened(self) -> Backend:
         spec, shown, manifest = self._asker.spec, printable(self.run.path), self.run.manifest
         for agent, stated in zip(spec.agents, (manifest.agent(0), *manifest.helpers), strict=True):
             if agent.prompt.sha256 != stated["prompt"]["sha256"]:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
+from harness.backends import devices
+from harness.backends.registry import open_backend
 from harness.coordination.learnt import Learnt
 from harness.coordination.operating_point import POINTS, named_point
 from harness.coordination.schedules import SCHEDULES
@@ -19,6 +21,7 @@ from harness.core.files import sha256_file
 from harness.core.resources import MARKER, find
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.evaluate import asking
 from harness.evaluate.outlook import outlook
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
@@ -120,8 +123,9 @@ def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
 
 
 def play(schedule: str, most: int, threshold: float | None, success: Any, messages: Any) -> Play:
-    """One seed."""
-    costs = np.array([messages, [0.1] * len(success), [150.0] * len(success), [1.0] * len(success)]).T
+    """One seed. An episode takes 10 J, and 5 J a message."""
+    n, joules = len(success), 10.0 + 5.0 * np.array(messages)
+    costs = np.array([messages, [0.1] * n, [150.0] * n, [1.0] * n, joules]).T
     return Play(Setting(schedule, threshold, most), np.array([success], dtype=float), costs[None])
 
 
@@ -171,6 +175,20 @@ def test_areas_are_means_over_budgets_up_to_always_asking_all():
     assert compared.area("never").value == pytest.approx(1 / 4)
     # Caps of 0, 1 and 2 messages: 1/4 at 0, 3/4 at 2/4 and 4/4 at 4/4 messages an episode.
     assert compared.area("oracle").value == pytest.approx((0.5 * 1 / 4 + 0.5 * 3 / 4 + 3 * 1) / 4)
+
+
+def test_joules_are_a_budget_as_messages_are():
+    """Here as many joules go with each message, above those of never asking, so areas are the same."""
+    compared = by_hand()
+    assert compared.energy
+    assert compared.paper.means["energy_j"] == 10 + 5 * 3
+    for name in ("entropy", "never", "oracle"):
+        assert compared.area(name, "energy_j").value == pytest.approx(compared.area(name).value)
+        assert compared.area(name, "energy_j").low == pytest.approx(compared.area(name).low)
+    assert compared.front("entropy", "energy_j") == compared.front("entropy")
+    dear = replace(compared.plays["entropy"][1], costs=compared.everybody.costs * 2)
+    other = replace(compared, plays={**compared.plays, "entropy": [compared.paper, dear]}, tune={})
+    assert other.front("entropy", "energy_j") == [other.plays["never"][0], other.paper, dear]
 
 
 def test_random_at_as_many_messages_lies_between_its_neighbours():
@@ -328,3 +346,39 @@ def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
     shipped = toml(find("schedules", "learnt.toml"), "it")
     assert all("(train)" in source for source in shipped["learnt_from"])
     assert all("(tune)" in source for source in shipped["tuned_on"])
+
+
+@pytest.mark.slow
+def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_path: Path):
+    """Read-outs of the model that ships, at the pace of another on a Jetson."""
+    spec = spec_of(
+        small, "swarm-tiny", answer="readout", points=(SIXG,),
+        device_profile=devices.load("agx-orin"), device_model="qwen3-4b",
+    )  # fmt: skip
+    done = run(spec, tmp_path / "run")
+    [energy] = [score for score in done.scores if score.metric == "energy_j" and score.interval == "episodes"]
+    stored = Stored(done.out)
+    every = made(stored, "6g")
+    _, costs = every.played(every.scheduled(SIXG))
+    joules, decisions = (costs[..., COSTS.index(name)] for name in ("energy_j", "decisions"))
+    assert joules.sum() / decisions.sum() == pytest.approx(energy.value, abs=1e-4)
+    assert np.isnan(
+        made(Stored(run(spec_of(small), tmp_path / "other").out), "6g").levels[0].costs[..., 4]
+    ).all()
+
+
+def test_a_model_is_opened_once_whatever_it_is_asked(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    opened: list[Any] = []
+    out = run(spec_of(small, points=(POINTS["single-local"],)), tmp_path / "run").out
+    (out / "answers.jsonl").write_bytes(b"".join((out / "answers.jsonl").read_bytes().splitlines(True)[:1]))
+
+    def counting(card: Any, **options: Any) -> Any:
+        opened.append(card.name)
+        return open_backend(card, **options)
+
+    monkeypatch.setattr("harness.studies.stored.open_backend", counting)
+    monkeypatch.setattr(asking, "CHUNK", 2)
+    made(Stored(out), "6g")
+    assert opened == ["proxy"]
