@@ -29,6 +29,7 @@ from evaluating import (
 from run_on_disk import UNTIMED, answers_of, configure
 
 from harness.backends.base import Completion, Request
+from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.arrays import Ints
@@ -66,7 +67,8 @@ def clear(n: int, helpers: int = 3) -> Due:
 def heard(due: dict[OperatingPoint, Due], intents: Intents) -> Ints:
     """The sets of messages that are heard where nobody attacks."""
     nobody = np.zeros(intents.valid.shape, dtype=bool)
-    return heard_codes(due, {point: Said(intents, of.draws, nobody) for point, of in due.items()})
+    sent = {point: exchange(point, intents, of.draws) for point, of in due.items()}
+    return heard_codes(due, {point: Said(intents, of.draws, nobody) for point, of in due.items()}, sent)
 
 
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.coordination.claims import Claims
-from harness.coordination.coordinate import Coordination, Fusion, FusionCall, coordinate
-from harness.coordination.exchange import exchange
+from harness.coordination.coordinate import Coordination, Fusion, FusionCall, fuse
+from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.scheduling import Outlook
@@ -174,13 +174,14 @@ def walk(
             point: attackers[point.name].said(heard(point, intents, blind, each), each.draws, each.episodes)
             for point, each in due.items()
         }
-        calls = _fusion_calls(due, said, moments, ask)
+        sent = {point: exchange(point, of.intents, of.draws) for point, of in said.items()}
+        calls = _fusion_calls(due, said, sent, moments, ask)
         decided = []
         for point, each in due.items():
             of = said[point]
             call = calls[point.rewrites](each.at, shown(point, of)) if point.asks_again else None
             fusion = Fusion(call, memories[point.name].recall(each))
-            result = coordinate(point, of.intents, of.draws, fusion)
+            result = fuse(point, sent[point], of.intents, fusion)
             decided.append(Decided(point, moments, each, result, of))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
@@ -230,25 +231,27 @@ class Memory:
 
 
 def _fusion_calls(
-    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said], moments: Sequence[Moment],
-    ask: Ask[Moment],
+    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
+    sent: Mapping[OperatingPoint, Exchange], moments: Sequence[Moment], ask: Ask[Moment],
 ) -> dict[Rewrites, Fuses]:  # fmt: skip
     """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
     calls = {}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.asks_again):
         alike = {point: each for point, each in due.items() if point.rewrites == rewrites}
-        calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said), rewrites)
+        calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said, sent), rewrites)
     return calls
 
 
-def heard_codes(due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said]) -> Ints:
+def heard_codes(
+    due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
+    sent: Mapping[OperatingPoint, Exchange],
+) -> Ints:  # fmt: skip
     """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
     for point, each in due.items():
         if point.asks_again:
-            of = said[point]
-            on_time = exchange(point, of.intents, of.draws).on_time
-            codes.append(codes_of(on_time, each.at, shown(point, of))[on_time.any(axis=1)])
+            on_time = sent[point].on_time
+            codes.append(codes_of(on_time, each.at, shown(point, said[point]))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
 
