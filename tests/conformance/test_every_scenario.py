@@ -9,6 +9,12 @@ import numpy as np
 import one_way_crossing
 import pytest
 
+from harness.coordination.consensus import Messages, inverse_distance_weights
+from harness.coordination.trust import Trust
+from harness.dataset.load import Scene
+from harness.evaluate.branches import Trajectory
+from harness.evaluate.claims import claims
+from harness.evaluate.live_world import look
 from harness.world import scenarios
 from harness.world.reference import drive
 from harness.world.scenario import Scenario
@@ -104,3 +110,28 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
 def test_a_driver_who_sees_everything_reaches_the_goal_and_one_who_waits_does_not(scenario: Scenario) -> None:
     assert {drive(scenario, "full-view", seed).result for seed in SEEDS} == {"cleared"}
     assert {drive(scenario, "brake", seed).result for seed in SEEDS} - {"cleared"}
+
+
+def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenario) -> None:
+    """All that could speak against a helper is what it claims: everybody is undecided."""
+    rule = Trust()
+    for seed in SEEDS:
+        trajectory, moments = Trajectory(seed, World.start(scenario, seed), []), list[Scene]()
+        while len(moments) < scenario.parameters.decisions and not trajectory.world.outcome.ended:
+            moments.append(look(trajectory, len(moments), ego_alone=False))
+            trajectory.world.act(scenario.actions[0])
+        said = claims(scenario, moments)
+        state = rule.start((), said.speed_mps.shape[1], len(scenario.actions))
+        for n, scene in enumerate(moments):
+            now, there = said.take(n), np.isfinite(said.speed_mps[n])
+            distance_m = np.linalg.norm(now.xy_m, axis=-1)
+            assert distance_m[np.insert(there, 0, True)] == pytest.approx(
+                [scene.record["distance_m"][viewer] for viewer in scene.viewers], abs=1e-3
+            )
+            undecided = np.full((1 + len(there), len(scenario.actions)), 1 / len(scenario.actions))
+            weights = inverse_distance_weights(distance_m, there, 1.0)
+            arrival_s, range_m = np.where(there, 0.1, np.inf), np.ones(len(there))
+            fused = rule.fuse(Messages(undecided, weights, there, arrival_s, distance_m, range_m, now), state)
+            assert fused.trust is not None
+            assert (fused.trust[there] > 0.8).all()
+            state = fused.state

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import figure, run, spec_of
+from evaluating import figure, live_spec_of, run, spec_of
 
 from harness.coordination.operating_point import named_point
 from harness.core import resources
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
+from harness.evaluate.claims import claims
 from harness.evaluate.run import Evaluated
 from harness.runs.folder import read
 from harness.runs.listing import runs
@@ -135,6 +136,34 @@ def test_what_it_cannot_play_is_one_line(act: Any, said: str) -> None:
     with pytest.raises(UserError, match=said) as problem:
         act()
     assert "\n" not in str(problem.value)
+
+
+@pytest.mark.slow
+def test_frozen_and_driven_trust_alike(small: Dataset, tmp_path: Path) -> None:
+    attacks = ("", ",attack=spoof", ",attack=jump", ",attack=liar+sybil")
+    points = tuple(named_point(f"6g:consensus=trust{attack}") for attack in attacks)
+    same: Any = {"points": points, "latency": "paper"}
+    frozen = read(run(spec_of(small, **same), tmp_path / "frozen").out)
+    driven = read(run(live_spec_of(episodes=4, first_seed=100, **same), tmp_path / "driven").out)
+    assert [e.success for e in frozen.episodes] == [e.success for e in driven.episodes]
+    trust, other = (done.decisions.of_messages("trust") for done in (frozen, driven))
+    assert np.array_equal(trust, other, equal_nan=True)
+    attackers = frozen.decisions.of_messages("attacker") == 1
+    assert np.nanmean(trust[attackers]) < 0.5 < np.nanmean(trust[~attackers])
+
+
+def test_nobody_looks_at_claims_unless_a_rule_or_an_attack_does(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+    monkeypatch.setattr("harness.evaluate.walk.claims", lambda *of: looked.append(1) or claims(*of))
+    for n, (text, looks) in enumerate([
+        ("6g", False), ("6g:attack=liar+sybil", False), ("6g:consensus=median", False),
+        ("6g:consensus=trust", True), ("6g:attack=jump", True),
+    ]):  # fmt: skip
+        looked.clear()
+        run(spec_of(small, points=(named_point(text),), limit=1), tmp_path / str(n))
+        assert bool(looked) == looks, text
 
 
 def test_of_a_model_a_run_is_made_first_and_not_twice(
