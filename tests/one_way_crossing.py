@@ -67,8 +67,8 @@ def layout(seed, parameters):
     return Layout(tuple(spawns), (), "west" if danger else None, "v3" if danger else None)
 
 
-def cleared(vehicles, parameters):
-    return bool(vehicles[0].position[1] < -10.0)
+def cleared(xy_m, approaches, parameters):
+    return xy_m[..., 0, 1] < -10.0
 
 
 SCENARIO = Scenario(

@@ -1,12 +1,13 @@
 """What a scenario provides. All other code takes one as an argument, and names none."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any, Literal, get_args
 
 from harness.core import noise
+from harness.core.arrays import Bools, Floats, Texts
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Physical
 from harness.radio.profiles import CHANNELS, changed
@@ -222,8 +223,9 @@ class Scenario:
         parameters: its dials.
         road: gives the road, always the same one.
         layout: the start of the episode of a seed, `(seed, parameters)`.
-        cleared: whether the ego has reached its goal, asked after every frame, `(vehicles, parameters)`:
-            highway-env's vehicles, the ego first.
+        cleared: whether the ego has reached its goal, asked after every frame of any number of worlds,
+            `(xy_m, approaches, parameters)`: the vehicles' centres in highway-env's own frame (..., V, 2),
+            the ego first, NaN where a world has fewer, and their approaches (..., V).
         words: what prompts say of it: `task`, after "You drive car v1:", and `hiding`, after "Others may be
             hidden by". Templates read `words.<name>`.
         brake_lamps: whether vehicles show that they brake.
@@ -238,7 +240,7 @@ class Scenario:
     parameters: Parameters
     road: Callable[[], Road]
     layout: Callable[[int, Any], Layout]
-    cleared: Callable[[Sequence[Any], Any], bool]
+    cleared: Callable[[Floats, Texts, Any], Bools]
     words: Mapping[str, str]
     brake_lamps: bool = False
     prompt: str = "v4"

@@ -6,7 +6,7 @@ it is decided.
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -177,22 +177,31 @@ class World:
 
     def advance(self, until_frame: int) -> None:
         """Simulate until so many frames have passed or the episode is decided."""
-        vehicles = self.vehicles
-        frames, first, speed_mps = [], self.frame + 1, float(vehicles[0].speed)
+        frames, speed_mps = [], float(self.vehicles[0].speed)
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
             frames.append(self._poses())
         if frames:
-            poses = self._in_road_frame(frames)
-            self._broadcast(poses, first)
-            least_m = least_gap_m(poses[..., :3], vehicles, self.outcome.least_gap_m)
-            self.outcome = replace(self.outcome, least_gap_m=least_m)
-            hard = (
-                -np.diff(poses[:, 0, 3], prepend=speed_mps) * self.scenario.parameters.simulation_hz
-                > HARD_BRAKING_MPS2
-            )
-            self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
-            self.braking_hard = bool(hard[-1])
+            self.passed(np.array(frames), speed_mps)
+
+    def passed(self, poses: Floats, speed_mps: float) -> None:
+        """Take down what the last frames showed.
+
+        Args:
+            poses: x, y, heading and speed of each vehicle in each of them, in highway-env's own frame,
+                (F, V, 4).
+            speed_mps: of the ego before them.
+        """
+        poses[..., :2] -= self.scenario.road().origin_m
+        self._broadcast(poses, self.frame + 1 - len(poses))
+        least_m = least_gap_m(poses[..., :3], self.vehicles, self.outcome.least_gap_m)
+        self.outcome = replace(self.outcome, least_gap_m=least_m)
+        hard = (
+            -np.diff(poses[:, 0, 3], prepend=speed_mps) * self.scenario.parameters.simulation_hz
+            > HARD_BRAKING_MPS2
+        )
+        self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
+        self.braking_hard = bool(hard[-1])
 
     def _poses(self) -> list[tuple[float, ...]]:
         """x, y, heading and speed of each vehicle, in highway-env's own frame."""
@@ -233,10 +242,24 @@ class World:
         return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
 
     def _step(self) -> None:
-        p = self.scenario.parameters
         standing = {v.spawn.id for v in self.vehicles if v.crashed}
         self._move()
         self.frame += 1
+        self.judge(standing)
+
+    def _cleared(self) -> bool:
+        """Whether the ego has reached its goal."""
+        vehicles = self.vehicles
+        xy_m, approaches = [v.position for v in vehicles], [v.spawn.approach for v in vehicles]
+        return bool(self.scenario.cleared(np.array(xy_m), np.array(approaches), self.scenario.parameters))
+
+    def judge(self, standing: Set[str]) -> None:
+        """Look whether the frame that has just passed decided the episode.
+
+        Args:
+            standing: ids of the vehicles that had crashed before it.
+        """
+        p = self.scenario.parameters
         ego, others = self.vehicles[0], self.vehicles[1:]
         crashed = {v.spawn.id for v in others if v.crashed and v.spawn.id not in standing}
         if ego.crashed:
@@ -245,7 +268,7 @@ class World:
             self.outcome = self.outcome.ending("collision", self.time_s, **how)
         elif not ego.on_road:
             self.outcome = self.outcome.ending("off_road", self.time_s)
-        elif self.scenario.cleared(self.vehicles, p):
+        elif self._cleared():
             self.outcome = self.outcome.ending("cleared", self.time_s)
         elif self.frame >= round(p.time_limit_s * p.simulation_hz):
             self.outcome = self.outcome.ending("time_out", self.time_s)

@@ -195,6 +195,9 @@ class EnvironmentWorld(World):
             else:
                 self.failed = True
 
+    def _cleared(self) -> bool:
+        return bool(self.everybody[0].to_go_m <= 0)
+
     def _step(self) -> None:
         super()._step()
         if self.failed and not self.outcome.ended:

@@ -11,13 +11,13 @@ What the ego can see before it is too late (wall, helpers, cars that pass before
 without knowing of the danger.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -167,9 +167,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     return Layout(tuple(spawns), (wall,), "main" if danger_id else None, danger_id)
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego's centre is far enough along the right lane."""
-    return bool(vehicles[0].position[0] > parameters.cleared_m)
+    return np.asarray(xy_m[..., 0, 0] > parameters.cleared_m)
 
 
 SCENARIO = Scenario(

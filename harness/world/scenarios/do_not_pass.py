@@ -13,13 +13,13 @@ does.
 What the ego can see (truck, gap, the car behind) is drawn without knowing of the danger.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.road import Path, PathKey, Road, ground, straights
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -142,16 +142,14 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     return Layout(tuple(spawns), (), "oncoming" if danger else None, danger_id if danger else None)
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego is back ahead of the truck, or has let go by what came towards it."""
-    ego, truck = vehicles[0], vehicles[1]
-    if abs(ego.position[1] - LANE_WIDTH_M) > LANE_WIDTH_M / 4:
-        return False
-    ahead_m = float(ego.position[0] - truck.position[0])
-    if ahead_m > (CAR + TRUCK) / 2 + parameters.ahead_m:
-        return True
-    passed = any(v.spawn.approach == "oncoming" and v.position[0] < ego.position[0] for v in vehicles)
-    return passed and -(CAR + TRUCK) / 2 - parameters.behind_m < ahead_m < -(CAR + TRUCK) / 2
+    x, lengths = xy_m[..., 0], (CAR + TRUCK) / 2
+    in_lane = np.abs(xy_m[..., 0, 1] - LANE_WIDTH_M) <= LANE_WIDTH_M / 4
+    ahead_m = x[..., 0] - x[..., 1]
+    passed = ((approaches == "oncoming") & (x < x[..., :1])).any(axis=-1)
+    let_go = passed & (-lengths - parameters.behind_m < ahead_m) & (ahead_m < -lengths)
+    return np.asarray(in_lane & ((ahead_m > lengths + parameters.ahead_m) | let_go))
 
 
 SCENARIO = Scenario(

@@ -13,13 +13,13 @@ What the ego can see (van, headway, cars on the left) is drawn without knowing o
 the left lane, far ahead, which slows down in some episodes and concerns nobody on the right.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.road import Path, PathKey, Road, ground
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -138,9 +138,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     return Layout(spawns, (), "ahead" if danger else None, "v5" if danger else None)
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego's centre is far enough behind the conflict zone."""
-    return bool(vehicles[0].position[0] > ZONE_M + parameters.cleared_m)
+    return np.asarray(xy_m[..., 0, 0] > ZONE_M + parameters.cleared_m)
 
 
 SCENARIO = Scenario(

@@ -10,12 +10,11 @@ What the ego can see before it is too late (buildings, helpers, the truck, a car
 without knowing of the danger. Where the two would touch, the danger gives way: it comes later.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.crossroads import JUNCTION_M, SECTORS, road
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -153,9 +152,9 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
     return truck_s + apart_s + SPARE_S + (at.other_arc_m - car.project(*where)[0]) / speed_mps
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego's centre is far enough behind the junction's exit."""
-    return bool(JUNCTION_M + parameters.cleared_m <= -vehicles[0].position[1])
+    return np.asarray(JUNCTION_M + parameters.cleared_m <= -xy_m[..., 0, 1])
 
 
 SCENARIO = Scenario(

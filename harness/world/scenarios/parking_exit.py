@@ -12,13 +12,13 @@ it is too late (vans, helpers, a car on the lane for the other direction, a car 
 without knowing of the danger.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.road import Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -183,9 +183,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     return Layout(tuple(spawns), (), "behind" if danger else None, danger_id if danger else None)
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego's centre is far enough along the lane."""
-    return bool(vehicles[0].position[0] > OUT_M + parameters.cleared_m)
+    return np.asarray(xy_m[..., 0, 0] > OUT_M + parameters.cleared_m)
 
 
 SCENARIO = Scenario(

@@ -13,7 +13,6 @@ later) is drawn without knowing of the danger.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
@@ -21,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Bools, Floats, Texts
 from harness.world.road import Lane, Path, Road, crossings, ground
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.scenario import Parameters as Common
@@ -236,10 +235,10 @@ def layout(seed: int, parameters: Parameters) -> Layout:
     return Layout(tuple(spawns), buildings, danger, ids["round"] if danger else None)
 
 
-def cleared(vehicles: Sequence[Any], parameters: Parameters) -> bool:
+def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Whether the ego is past the first exit behind its entry."""
-    x, y = vehicles[0].position
-    return bool(x > 0 and math.atan2(y, x) < _ring_rad(1))
+    x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
+    return np.asarray((x > 0) & (np.arctan2(y, x) < _ring_rad(1)))
 
 
 SCENARIO = Scenario(
