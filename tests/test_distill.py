@@ -134,7 +134,8 @@ def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(fe
                 for action in scenario.actions:
                     world = World.start(scenario, seed)
                     world.act(action)
-                    safe.append(finish(world, "local-view").judged(reference, scenario.parameters).success)
+                    [outcome] = finish([world], ["local-view"])
+                    safe.append(outcome.judged(reference, scenario.parameters).success)
                 assert (each.labels[scene.id] > 0).tolist() == safe
 
 

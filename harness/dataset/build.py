@@ -169,7 +169,8 @@ def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> 
 def _check(scenario: Scenario, tree: Tree) -> None:
     """Drive the layout: a tree in which a reference driver ends otherwise is a bug."""
     forest = Forest.of([tree], scenario.actions, scenario.parameters.delay_allowance_s)
-    for driver, outcome in drive_all(scenario, tree.episode_seed).items():
+    [driven] = drive_all(scenario, [tree.episode_seed])
+    for driver, outcome in driven.items():
         end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))
         walked = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
         if walked != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):

@@ -13,6 +13,7 @@ import numpy as np
 
 from harness.core.files import digest
 from harness.dataset.schema import Branching, Edge, End
+from harness.world import lockstep
 from harness.world.beacons import known
 from harness.world.drivers import DRIVERS, choose
 from harness.world.outcome import Outcome
@@ -29,44 +30,58 @@ def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branc
     level = [World.start(scenario, seed)]
     branchings, scenes = [], []
     while level:
-        following: dict[str, World] = {}
+        ways, following = edges(level, episode)
         records, points = [], []
-        for world in level:
+        for world, out in zip(level, ways, strict=True):
             state = world.state()
             record = _record(world, state, episode)
             drivers = _drivers(scenario, state, record["graphs"][state.ego.id])
-            points.append(Branching(record["scene"], drivers, list(edges(world, episode, following))))
+            points.append(Branching(record["scene"], drivers, out))
             records.append(record)
         scenes.append(records)
         branchings.append(points)
-        level = list(following.values())
+        level = following
     return branchings, scenes
 
 
-def edges(world: World, episode: int, following: dict[str, World]) -> Iterator[Edge]:
-    """Where each action of a decision point leads; new decision points join those `following`, by id."""
-    waiting = world.branch()
-    waiting.outcome, waiting.hard_brakings = Outcome(), 0  # what happens from here on
-    p = world.scenario.parameters
-    waiting.advance(p.due_frame(world.step) + p.lag_frames)
+def edges(worlds: Sequence[World], episode: int) -> tuple[list[list[Edge]], list[World]]:
+    """Where each action of some decision points of one step leads, and the decision points that come."""
+    waiting = [world.branch() for world in worlds]
+    p = worlds[0].scenario.parameters
+    for world in waiting:
+        world.outcome, world.hard_brakings = Outcome(), 0  # what happens from here on
+    lockstep.advance(waiting, [p.due_frame(world.step) + p.lag_frames for world in waiting])
+    ways = [list(_parted(world)) for world in waiting]
+    branches = [branch for parts in ways for _, branch in parts]
+    lockstep.advance(branches, [p.due_frame(branch.step) for branch in branches])
+    following: dict[str, tuple[int, World]] = {}
+    out = [[_edge(*part, episode, following) for part in parts] for parts in ways]
+    return out, [world for _, world in following.values()]
+
+
+def _parted(world: World) -> Iterator[tuple[list[str], World]]:
+    """The actions that set one target, and a world each in which one of them is taken."""
     by_target: dict[Target, list[str]] = {}
     for action in world.actions:
-        target = waiting.target if waiting.outcome.ended else waiting.target_after(action)
+        target = world.target if world.outcome.ended else world.target_after(action)
         by_target.setdefault(target, []).append(action)
     for left, actions in zip(reversed(range(len(by_target))), by_target.values(), strict=True):
-        branch = waiting.branch() if left else waiting
-        branch.act(actions[0])
-        outcome, end, to = branch.outcome, None, None
-        if outcome.ended:
-            assert outcome.time_s is not None
-            how = outcome.partner, outcome.striker, outcome.fault
-            end = End(outcome.result, outcome.time_s, *how)  # type: ignore[arg-type]
-        else:
-            name = scene_id(episode, branch.state())
-            following.setdefault(name, branch)
-            to = list(following).index(name)
-        gap_m = round(outcome.least_gap_m, 3)
-        yield Edge(actions, to, end, gap_m, branch.hard_brakings, outcome.other_crashes)
+        branch = world.branch() if left else world
+        branch.decide(actions[0])
+        yield actions, branch
+
+
+def _edge(actions: list[str], branch: World, episode: int, following: dict[str, tuple[int, World]]) -> Edge:
+    """Where some actions led; a new decision point joins those `following`, by id with its number."""
+    outcome, end, to = branch.outcome, None, None
+    if outcome.ended:
+        assert outcome.time_s is not None
+        how = outcome.partner, outcome.striker, outcome.fault
+        end = End(outcome.result, outcome.time_s, *how)  # type: ignore[arg-type]
+    else:
+        to, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
+    gap_m = round(outcome.least_gap_m, 3)
+    return Edge(actions, to, end, gap_m, branch.hard_brakings, outcome.other_crashes)
 
 
 def _drivers(scenario: Scenario, state: WorldState, seen: Mapping[str, Any]) -> dict[str, str]:

@@ -5,9 +5,12 @@ takes it in another frame, they are in one world, which is simulated and observe
 branches. A branch continues exactly as the whole would, to the last bit.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.world import lockstep
 from harness.world.world import Target, World
 
 
@@ -57,24 +60,7 @@ class Trajectory:
     world: World
     courses: list[Course]
 
-    def advance(self, until_frame: int) -> list["Trajectory"]:
-        """Simulate up to a frame or the end of the episode; decisions act meanwhile.
-
-        Returns:
-            One trajectory for each way in which its episodes continue.
-        """
-        going, arrived = [self], []
-        while going:
-            trajectory = going.pop()
-            frame = min((c.open.frame for c in trajectory.courses if c.open), default=until_frame + 1)
-            trajectory.world.advance(min(frame, until_frame))
-            if trajectory.world.outcome.ended or frame > until_frame:
-                arrived.append(trajectory)
-            else:
-                going += trajectory._act()
-        return arrived
-
-    def _act(self) -> list["Trajectory"]:
+    def act(self) -> list["Trajectory"]:
         """Let what is ready act; one trajectory for each target that the egos have then."""
         now = self.world.target
         worlds, parted = {now: self.world}, {now: list[Course]()}
@@ -95,3 +81,24 @@ class Trajectory:
             worlds[target] = self.world if nobody_stays else self.world.branch()
             worlds[target].take(action)
         return [Trajectory(self.number, worlds[target], some) for target, some in parted.items() if some]
+
+
+def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
+    """Simulate up to a frame or the end of each episode; decisions act meanwhile.
+
+    Returns:
+        One trajectory for each way in which episodes continue, those of one after those of the one before it.
+    """
+    going: list[tuple[tuple[int, ...], Trajectory]] = [((n,), t) for n, t in enumerate(trajectories)]
+    arrived = []
+    while going:
+        frames = [min((c.open.frame for c in t.courses if c.open), default=until_frame + 1) for _, t in going]
+        lockstep.advance([t.world for _, t in going], [min(frame, until_frame) for frame in frames])
+        parted = []
+        for (place, trajectory), frame in zip(going, frames, strict=True):
+            if trajectory.world.outcome.ended or frame > until_frame:
+                arrived.append((place, trajectory))
+            else:
+                parted += [((*place, -n), part) for n, part in enumerate(trajectory.act())]
+        going = parted
+    return [trajectory for _, trajectory in sorted(arrived, key=itemgetter(0))]

@@ -19,6 +19,7 @@ from harness.core.errors import UserError
 from harness.dataset.freeze import moment
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
+from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.walk import Decided, Due, Placed, channel_draws
 from harness.runs import metrics
@@ -177,7 +178,7 @@ class LiveWorld(Placed):
     def _advance(self) -> None:
         self._step += 1
         until = self._p.due_frame(self._step)
-        parts = [part for t in self._going for part in t.advance(until)]
+        parts = branches.advance(self._going, until)
         self._ended += [part for part in parts if part.world.outcome.ended]
         self._going = [part for part in parts if not part.world.outcome.ended]
 
@@ -190,10 +191,10 @@ class LiveWorld(Placed):
 
     def episodes(self) -> list[Episode]:
         """How each episode ended; late against a full-view driver whose decisions act after the lag."""
-        references = {
-            number: reference.drive(self.scenario, PRIVILEGED, self._first_seed + number)
-            for number in sorted({t.number for t in self._ended if t.world.outcome.success})
-        }
+        numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
+        worlds = [World.start(self.scenario, self._first_seed + number) for number in numbers]
+        outcomes = reference.finish(worlds, [PRIVILEGED] * len(numbers))
+        references = dict(zip(numbers, outcomes, strict=True))
         return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
 
 

@@ -2,16 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from harness.core.arrays import Bools
-from harness.core.parallel import spread
 from harness.core.statistics import Estimate, rate_difference, rate_interval
 from harness.dataset.load import Dataset
 from harness.world.drivers import DRIVERS
-from harness.world.reference import drive_all
+from harness.world.reference import drive_apart
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Standing:
 def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
     """Each driver's standing over the dataset's episodes, every one of which is driven again."""
     seeds = [tree.episode_seed for tree in dataset.trees]
-    live = spread(partial(drive_all, dataset.scenario), seeds, workers, progress)
+    live = drive_apart(dataset.scenario, seeds, workers, progress)
     return {
         driver: _standing(dataset.forest.driver_success(driver), np.array([o[driver].success for o in live]))
         for driver in DRIVERS

@@ -25,7 +25,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import write_whole
 from harness.core.parallel import spread
-from harness.dataset.freeze import edges, moment
+from harness.dataset.freeze import edges, moment, scene_id
 from harness.dataset.load import Scene
 from harness.prompts.versions import Prompt
 from harness.world.drivers import PRIVILEGED
@@ -110,25 +110,24 @@ def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:
     level = [World.start(scenario, seed)]
     while level:
         following: dict[str, World] = {}
-        taken = 0
-        for n in rng.permutation(len(level))[:TRIED].tolist():
-            if taken == OF_A_LEVEL:
-                break
-            world, state = level[n], level[n].state()
-            children: dict[str, World] = {}
-            ends_s = dict.fromkeys(world.actions, float(np.inf))
-            for edge in edges(world, number, children):
-                if edge.end:
-                    outcome = Outcome(edge.end.result, edge.end.time_s)
-                else:
-                    outcome = finish(list(children.values())[edge.to or 0].branch(), TEACHER)
-                if outcome.judged(reference, scenario.parameters).success and outcome.time_s is not None:
-                    ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
-            following.update(children)
-            if np.isfinite(list(ends_s.values())).any():
-                taken += 1
-                seen = moment(world, state, number, (state.ego, *state.helpers))
-                points.append({"moment": seen, "label": label(ends_s).tolist()})
+        taken, left = 0, rng.permutation(len(level))[:TRIED].tolist()
+        while left and taken < OF_A_LEVEL:
+            tried, left = left[: OF_A_LEVEL - taken], left[OF_A_LEVEL - taken :]
+            ways, children = edges([level[n] for n in tried], number)
+            outcomes = finish([child.branch() for child in children], [TEACHER] * len(children))
+            for n, out in zip(tried, ways, strict=True):
+                world, state = level[n], level[n].state()
+                ends_s = dict.fromkeys(world.actions, float(np.inf))
+                for edge in out:
+                    end = edge.end
+                    outcome = Outcome(end.result, end.time_s) if end else outcomes[edge.to or 0]
+                    if outcome.judged(reference, scenario.parameters).success and outcome.time_s is not None:
+                        ends_s.update(dict.fromkeys(edge.actions, outcome.time_s))
+                if np.isfinite(list(ends_s.values())).any():
+                    taken += 1
+                    seen = moment(world, state, number, (state.ego, *state.helpers))
+                    points.append({"moment": seen, "label": label(ends_s).tolist()})
+            following.update({scene_id(number, child.state()): child for child in children})
         level = list(following.values())
     return points
 

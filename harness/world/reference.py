@@ -1,6 +1,6 @@
 """Reference drivers in closed loop, from start to outcome."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -8,11 +8,14 @@ import numpy as np
 
 from harness.core.parallel import spread
 from harness.core.statistics import Estimate, rate_interval
+from harness.world import lockstep
 from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.scenario import Scenario
 from harness.world.world import World
+
+TOGETHER = 16  # episodes that are driven in step
 
 
 def decide(driver: str, world: World) -> str:
@@ -22,23 +25,44 @@ def decide(driver: str, world: World) -> str:
     return choose(scenario, driver, seen, truth_graph(scenario, state) if driver == PRIVILEGED else None)
 
 
-def finish(world: World, driver: str) -> Outcome:
-    """Let a driver take every decision that is left."""
-    while not world.outcome.ended:
-        world.act(decide(driver, world))
-    return world.outcome
+def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
+    """Let each world's driver take every decision that is left; the worlds are of one scenario."""
+    going = list(zip(worlds, drivers, strict=True))
+    while going := [(world, driver) for world, driver in going if not world.outcome.ended]:
+        p, driven = worlds[0].scenario.parameters, [world for world, _ in going]
+        actions = [decide(driver, world) for world, driver in going]
+        lockstep.advance(driven, [p.due_frame(world.step) + p.lag_frames for world in driven])
+        for world, action in zip(driven, actions, strict=True):
+            world.decide(action)
+        lockstep.advance(driven, [p.due_frame(world.step) for world in driven])
+    return [world.outcome for world in worlds]
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
     """One whole episode, not yet compared with the full-view driver's time."""
-    return finish(World.start(scenario, seed), driver)
+    [outcome] = finish([World.start(scenario, seed)], [driver])
+    return outcome
 
 
-def drive_all(scenario: Scenario, seed: int) -> dict[str, Outcome]:
-    """One episode by every driver; who clears it too long after the full-view driver is `late`."""
-    outcomes = {driver: drive(scenario, driver, seed) for driver in DRIVERS}
-    reference = outcomes[PRIVILEGED]
-    return {driver: outcome.judged(reference, scenario.parameters) for driver, outcome in outcomes.items()}
+def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
+    """Episodes by every driver; who clears one too long after the full-view driver is `late`."""
+    worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
+    ended = iter(finish(worlds, DRIVERS * len(seeds)))
+    outcomes = [{driver: next(ended) for driver in DRIVERS} for _ in seeds]
+    return [
+        {driver: outcome.judged(of[PRIVILEGED], scenario.parameters) for driver, outcome in of.items()}
+        for of in outcomes
+    ]
+
+
+def drive_apart(
+    scenario: Scenario, seeds: Sequence[int], workers: int, progress: Callable[[int], None]
+) -> list[dict[str, Outcome]]:
+    """`drive_all` in any number of processes; `progress` is called with how many episodes are done."""
+    chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
+    sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
+    parts = spread(partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)))
+    return [outcomes for part in parts for outcomes in part]
 
 
 def check(
@@ -50,7 +74,7 @@ def check(
         Per driver: success, collisions, late, time-outs and road departures as `Estimate`s (Wilson, n is
         episodes), collisions by fault, and how many crashes there were between other vehicles.
     """
-    outcomes = spread(partial(drive_all, scenario), range(seed, seed + episodes), workers, progress)
+    outcomes = drive_apart(scenario, range(seed, seed + episodes), workers, progress)
     return {driver: summary([o[driver] for o in outcomes]) for driver in DRIVERS}
 
 

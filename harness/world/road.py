@@ -8,7 +8,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Any, Literal
 
@@ -27,7 +27,7 @@ STRIPED = 1  # highway-env's LineType of a line that may be crossed
 NORTH = np.array([1.0, -1.0])  # from this frame to that of pictures
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Path:
     """One way along the road, in sections: one a lane of highway-env.
 
@@ -84,6 +84,8 @@ class Path:
         padded = np.pad(turned, reach, mode="edge")
         return np.asarray(np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M))
 
+    # Every viewer of a scene looks at the same vehicles, and scenes that part share most of them.
+    @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is for good
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
         gap = np.hypot(self.points[:, 0] - x_m, self.points[:, 1] - y_m)
@@ -94,6 +96,7 @@ class Path:
         lateral = float(np.sqrt(max(gap[i] ** 2 - along**2, 0.0)))
         return float(self.arc_m[i] + along), lateral, heading
 
+    @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
         """Position (m, m) and heading (rad) at an arc length."""
         x = float(np.interp(arc_m, self.arc_m, self.points[:, 0]))

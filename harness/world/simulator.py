@@ -8,6 +8,7 @@ cost more than all of its arithmetic. A test drives both side by side.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import combinations
 from types import MappingProxyType
@@ -209,6 +210,15 @@ def populated(scenario: Scenario, layout: Layout) -> Any:
             vehicle_on(road, scenario, spawn, section, lane.position(along, 0.0), lane.heading_at(along))
         )
     return road
+
+
+def copied(road: Any) -> Any:
+    """A road with copies of its vehicles; of what they hold, that which is written to is copied too."""
+    new = copy(road)
+    new.vehicles = [copy(v) for v in road.vehicles]
+    for v in new.vehicles:
+        v.road, v.position, v.action = new, v.position.copy(), dict(v.action)
+    return new
 
 
 def new_road(scenario: Scenario) -> Any:

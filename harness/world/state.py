@@ -1,7 +1,7 @@
 """The nouns of a scene: vehicles, buildings, and the state of the whole world at one moment."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -185,14 +185,17 @@ class WorldState:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready mapping; of `braking` only what is true, and of beacons what their rule needs."""
-        record = asdict(self)
-        for vehicle in record["vehicles"]:
+        vehicles, buildings, beacons = (
+            tuple(dict(vars(thing)) for thing in things)
+            for things in (self.vehicles, self.buildings, self.beacons)
+        )
+        for vehicle in vehicles:
             if not vehicle["braking"]:
                 del vehicle["braking"]
-        for beacon in record["beacons"]:
+        for beacon in beacons:
             if beacon["interval_s"] is None:
                 del beacon["interval_s"], beacon["unmoved"]
-        return record
+        return {**vars(self), "vehicles": vehicles, "buildings": buildings, "beacons": beacons}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "WorldState":

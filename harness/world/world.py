@@ -4,7 +4,6 @@ Frames are stepped here rather than by an environment's `step`, so that an episo
 it is decided.
 """
 
-import copy
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from harness.core.arrays import Floats
 from harness.world import beacons
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
-from harness.world.simulator import NOBODY_DRAWS, new_road, populated, spawn_of, state_of, vehicle_on
+from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
 from harness.world.state import Beacon, VehicleState, WorldState, rectangle
 
 Snapshot = Mapping[str, Any]
@@ -84,9 +83,7 @@ class World:
 
     def branch(self) -> "World":
         """A copy that goes its own way."""
-        # Nobody writes to these.
-        shared = (self.scenario, self.layout, self.road.network, NOBODY_DRAWS, self.beacons)
-        return copy.deepcopy(self, {id(thing): thing for thing in shared})
+        return replace(self, road=copied(self.road))
 
     def snapshot(self) -> Snapshot:
         """What `thaw` needs besides `state()` to go on exactly as this world would."""
@@ -151,10 +148,14 @@ class World:
         """
         p = self.scenario.parameters
         self.advance(p.due_frame(self.step) + p.lag_frames)
+        self.decide(action)
+        self.advance(p.due_frame(self.step))
+
+    def decide(self, action: str) -> None:
+        """Take an action if the episode is not decided yet, and count it: the next decision is to come."""
         if not self.outcome.ended:
             self.take(action)
         self.step += 1
-        self.advance(p.due_frame(self.step))
 
     def take(self, action: str) -> None:
         """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""

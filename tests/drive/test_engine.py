@@ -13,7 +13,7 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.noise import uniforms
 from harness.evaluate.asking import Asker
-from harness.evaluate.branches import Course, Decision, Trajectory
+from harness.evaluate.branches import Course, Decision, Trajectory, advance
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.live_world import LiveWorld
@@ -72,7 +72,7 @@ def test_braking_three_frames_later_is_42_centimetres_further():
     south_m = []
     for latency_s in (0.145, 0.219):
         course = Course(ALONE, 0, Decision("SLOWER", 50 + frames(latency_s, 50)))
-        [one] = Trajectory(0, World.start(SCENARIO, NO_DANGER), [course]).advance(250)
+        [one] = advance([Trajectory(0, World.start(SCENARIO, NO_DANGER), [course])], 250)
         assert one.world.state().ego.speed_mps == pytest.approx(7.0, abs=0.02)
         south_m.append(one.world.state().ego.y_m)
     assert south_m[0] - south_m[1] == pytest.approx(0.42, abs=1e-3)
@@ -83,10 +83,10 @@ def test_a_decision_acts_in_its_frame_and_not_before():
         0, World.start(SCENARIO, NO_DANGER), [Course(ALONE, 0, Decision("SLOWER", 8))]
     )  # fmt: skip
     still.advance(8)
-    braking.advance(8)
+    advance([braking], 8)
     assert braking.world.state().vehicles == still.state().vehicles
     assert (still.target[1], braking.world.target[1]) == (2, 1)
-    braking.advance(9)
+    advance([braking], 9)
     still.advance(9)
     assert still.state().ego.speed_mps - braking.world.state().ego.speed_mps == pytest.approx(8.0 * 0.02)
 
@@ -128,7 +128,7 @@ def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_LEFT, ONCOMING])
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
-    outcome = live.drive_all(SCENARIO, seed)[driver]
+    outcome = live.drive_all(SCENARIO, [seed])[0][driver]
     assert len(episodes) == 6
     for episode in episodes:
         assert episode.success == outcome.success

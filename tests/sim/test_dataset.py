@@ -143,7 +143,7 @@ def test_what_becomes_of_an_action_with_the_full_view_driver_is_what_it_drives(s
             world = World.thaw(SCENARIO, scene.state, scene.record["snapshot"])
             world.act(action)
             end = forest.end(int(forest.then_full_view[n, place]))
-            outcome = finish(world, "full-view")
+            [outcome] = finish([world], ["full-view"])
             assert (outcome.result, outcome.time_s) == (end.result, end.time_s)
 
 

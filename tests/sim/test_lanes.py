@@ -104,7 +104,7 @@ def outcome(world: World, *actions: str) -> Outcome:
     for action in actions:
         if not world.outcome.ended:
             world.act(action)
-    return finish(world, "cruise")
+    return finish([world], ["cruise"])[0]
 
 
 def test_passing_and_waiting_both_clear_where_they_should_and_waiting_for_nothing_never_does() -> None:

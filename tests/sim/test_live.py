@@ -7,14 +7,14 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 def test_the_full_view_driver_clears_what_a_cruising_one_runs_into():
-    outcomes = drive_all(SCENARIO, 6)  # a danger from the left
+    outcomes = drive_all(SCENARIO, [6])[0]  # a danger from the left
     assert outcomes["cruise"].result == "collision"
     assert outcomes["full-view"].result == "cleared"
     assert outcomes["brake"].result == "time_out"
 
 
 def test_who_clears_too_long_after_the_full_view_driver_is_late():
-    outcomes = drive_all(SCENARIO, 13)
+    outcomes = drive_all(SCENARIO, [13])[0]
     assert outcomes["local-view"].result == "late"
     assert outcomes["local-view"].time_s - outcomes["full-view"].time_s > 1.01
 

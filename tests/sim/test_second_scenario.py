@@ -60,7 +60,7 @@ def test_it_is_found_by_its_entry_point_and_travels_as_name_and_parameters():
 
 
 def test_drivers_meet_its_danger_or_wait_for_it():
-    meeting, free = drive_all(SCENARIO, MEETING), drive_all(SCENARIO, FREE)
+    meeting, free = drive_all(SCENARIO, [MEETING, FREE])
     results = {driver: (meeting[driver].result, free[driver].result) for driver in DRIVERS}
     assert results == {
         "cruise": ("collision", "cleared"),

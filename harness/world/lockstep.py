@@ -1,0 +1,388 @@
+"""Worlds of one scenario, simulated together: a frame of all of them is one pass over arrays.
+
+The arithmetic is that of `simulator` and of highway-env, operation by operation, so worlds end up the same to
+the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. What
+seldom happens, two vehicles that touch and the end of an episode, is highway-env's and `World`'s own. A test
+drives both side by side.
+
+Arrays are (B, V): worlds, and the vehicles of each by their number, the ego first. Where a world has fewer,
+the rest stand in lanes of their own and are in nobody's way.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
+from highway_env.vehicle.controller import ControlledVehicle
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.world.road import Lane, Road
+from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
+from harness.world.world import World
+
+ALONE = 2  # so many worlds are as fast one by one
+SLOW_MPS = 1e-2  # where one divides by a slower speed, it is taken to be this: highway-env's `not_zero`
+AT_ONCE = 128  # more do not fit into the processor's cache
+
+
+def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
+    """Simulate each of some worlds of one scenario as its own `advance` would."""
+    going = [
+        (world, until)
+        for world, until in zip(worlds, until_frames, strict=True)
+        if world.frame < until and not world.outcome.ended
+    ]
+    scenario = worlds[0].scenario if worlds else None
+    lanes = _lanes(scenario.road) if scenario and not scenario.start else None
+    if lanes is None or len(going) <= ALONE:
+        for world, until in going:
+            world.advance(until)
+        return
+    # Those that end together are simulated together, so that arrays stay full.
+    going.sort(key=lambda pair: pair[1] - pair[0].frame)
+    bounds = [*range(0, len(going), AT_ONCE), len(going)]
+    for begin, end in pairwise(bounds):
+        _together(lanes, *zip(*going[begin:end], strict=True))
+
+
+def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
+    begun = np.array([world.frame for world in worlds])
+    until = np.array(until_frames)
+    speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
+    fleet = _Fleet(lanes, worlds)
+    poses = np.empty((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4))
+    going = np.arange(len(worlds))
+    passed = 0
+    while going.size:
+        happened = fleet.step()
+        poses[going, passed, :, :2] = fleet.xy
+        poses[going, passed, :, 2] = fleet.heading
+        poses[going, passed, :, 3] = fleet.speed
+        passed += 1
+        over = fleet.frame >= until[going]
+        for row in np.flatnonzero(over | happened).tolist():
+            world = worlds[going[row]]
+            standing = fleet.write(row, world)
+            if happened[row]:
+                world.judge(standing)
+                over[row] |= world.outcome.ended
+        if over.any():
+            going = going[~over]
+            fleet.keep(~over)
+    for world, frames, first, speed_mps in zip(worlds, poses, begun.tolist(), speeds_mps, strict=True):
+        world.passed(frames[: world.frame - first, : len(world.vehicles)].copy(), speed_mps)
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """A network's lanes by number: straight ones, and arcs.
+
+    Attributes:
+        number: of each.
+        names: of each number.
+        base: where it begins, or its centre, (L, 2).
+        along: direction of a straight one, (L, 2).
+        across: to its right, (L, 2).
+        heading: of a straight one.
+        length: m.
+        width: m.
+        arc: whether it is an arc.
+        radius: of an arc.
+        phase: of an arc's beginning, rad.
+        sign: 1 where an arc turns clockwise as the picture shows it, else -1.
+    """
+
+    number: dict[Lane, int]
+    names: list[Lane]
+    base: Floats
+    along: Floats
+    across: Floats
+    heading: Floats
+    length: Floats
+    width: Floats
+    arc: Bools
+    radius: Floats
+    phase: Floats
+    sign: Floats
+
+    def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
+        """`local_coordinates`: along and to the right of lanes (...), m."""
+        away = xy - self.base[lane]
+        along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
+        arcs = self.arc[lane]
+        if arcs.any():
+            k, d = lane[arcs], away[arcs]
+            sign, phase, radius = self.sign[k], self.phase[k], self.radius[k]
+            phi = phase + _wrapped(np.arctan2(d[:, 1], d[:, 0]) - phase)
+            along[arcs] = sign * (phi - phase) * radius
+            lateral[arcs] = sign * (radius - np.sqrt(np.vecdot(d, d)))
+        return along, lateral
+
+    def heading_at(self, along: Floats, lane: Ints) -> Floats:
+        """Direction of lanes (...) at places along them, rad."""
+        heading = self.heading[lane]
+        arcs = self.arc[lane]
+        if arcs.any():
+            k = lane[arcs]
+            heading[arcs] = self.sign[k] * along[arcs] / self.radius[k] + self.phase[k]
+            heading[arcs] += np.pi / 2 * self.sign[k]
+        return heading
+
+
+@lru_cache(maxsize=64)
+def _lanes(road: Callable[[], Road]) -> _Lanes | None:
+    """The lanes of a road; None where there are others than straight ones and arcs."""
+    graph = road().network().graph
+    of = {
+        (a, b, n): lane
+        for a, nodes in graph.items() for b, lanes in nodes.items() for n, lane in enumerate(lanes)
+    }  # fmt: skip
+    lanes = list(of.values())
+    if any(type(lane) not in (StraightLane, CircularLane) for lane in lanes):
+        return None
+    arc = np.array([type(lane) is CircularLane for lane in lanes])
+
+    def each(name: str, other: Any, arcs: bool) -> Floats:
+        return np.array(
+            [getattr(lane, name) if one == arcs else other for lane, one in zip(lanes, arc, strict=True)],
+            dtype=float,
+        )
+
+    nowhere = np.zeros(2)
+    return _Lanes(
+        {name: n for n, name in enumerate(of)}, list(of),
+        each("start", nowhere, False) + each("center", nowhere, True),
+        each("direction", nowhere, False), each("direction_lateral", nowhere, False),
+        each("heading", 0.0, False), np.array([lane.length for lane in lanes], dtype=float),
+        np.array([lane.width for lane in lanes], dtype=float), arc,
+        each("radius", 1.0, True), each("start_phase", 0.0, True), each("direction", 1.0, True),
+    )  # fmt: skip
+
+
+class _Fleet:
+    """The vehicles of some worlds, as arrays (B, V); positions and impacts are (B, V, 2)."""
+
+    def __init__(self, lanes: _Lanes, worlds: Sequence[World]) -> None:
+        scenario = worlds[0].scenario
+        p = scenario.parameters
+        self.lanes, self.scenario, self.dt = lanes, scenario, 1 / p.simulation_hz
+        self.last_frame = round(p.time_limit_s * p.simulation_hz)
+        self.worlds = list(worlds)
+        most = max(len(world.vehicles) for world in worlds)
+        shape = len(worlds), most
+        ways = [lanes.number[scenario.road().paths[key].lanes[0]] for key in scenario.road().ways]
+        self.ways = np.array(ways, dtype=int)
+        self.frame = np.array([world.frame for world in worlds])
+        self.there = np.zeros(shape, dtype=bool)
+        self.approach = np.full(shape, "", dtype="U32")
+        self.lane = np.zeros(shape, dtype=int)
+        self.lane_now = np.tile(-1 - np.arange(most), (len(worlds), 1))  # nobody else's
+        self.xy, self.impact = np.zeros((*shape, 2)), np.zeros((*shape, 2))
+        self.pushed, self.crashed, self.stood, self.braking = (np.zeros(shape, bool) for _ in range(4))
+        self.heading, self.speed, self.target = (np.zeros(shape) for _ in range(3))
+        self.steering, self.acceleration = np.zeros(shape), np.zeros(shape)
+        self.size = np.ones((*shape, 2))
+        self.reach = np.zeros(shape)
+        self.brakes_at, self.brakes_mps2, self.brakes_to = (
+            np.full(shape, np.inf),
+            np.zeros(shape),
+            np.zeros(shape),
+        )
+        longest = max(len(v.route) for world in worlds for v in world.vehicles)
+        self.route = np.full((*shape, longest + 1), -1)
+        self.section = np.zeros(shape, dtype=int)
+        for b, world in enumerate(worlds):
+            for n, v in enumerate(world.vehicles):
+                self._read(b, n, v)
+        ego = worlds[0].vehicles[0]
+        self.limits, self.most_steering = ego.limits_mps2, ego.MAX_STEERING_ANGLE
+
+    def _read(self, b: int, n: int, v: Any) -> None:
+        at, number = (b, n), self.lanes.number
+        self.there[at], self.approach[at] = True, v.spawn.approach
+        self.lane[at], self.lane_now[at] = number[v.target_lane_index], number[v.lane_index]
+        self.xy[at], self.heading[at], self.speed[at] = v.position, v.heading, v.speed
+        self.target[at], self.crashed[at] = v.target_speed, v.crashed
+        if v.impact is not None:
+            self.impact[at], self.pushed[at] = v.impact, True
+        self.size[at], self.reach[at] = (v.LENGTH, v.WIDTH), v.diagonal / 2
+        if v.spawn.brakes_at_s is not None:
+            self.brakes_at[at], self.brakes_mps2[at] = v.spawn.brakes_at_s, v.spawn.brakes_mps2
+            self.brakes_to[at] = v.spawn.brakes_to_mps
+        self.route[b, n, : len(v.route)] = [number[lane] for lane in v.route]
+        self.section[at] = v.route.index(v.target_lane_index)
+
+    def keep(self, rows: Bools) -> None:
+        """Go on with some of the worlds."""
+        self.worlds = [world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept]
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray) and name != "ways":
+                setattr(self, name, value[rows])
+
+    def write(self, row: int, world: World) -> set[str]:
+        """Put a world where its row is; returns the ids of who had crashed before the last frame."""
+        world.frame = int(self.frame[row])
+        names = self.lanes.names
+        for n, v in enumerate(world.vehicles):
+            at = row, n
+            v.position = self.xy[at].copy()
+            v.heading, v.speed = float(self.heading[at]), float(self.speed[at])
+            v.crashed, v.braking = bool(self.crashed[at]), bool(self.braking[at])
+            v.impact = self.impact[at].copy() if self.pushed[at] else None
+            v.action = {"steering": float(self.steering[at]), "acceleration": float(self.acceleration[at])}
+            lane = names[self.lane[at]]
+            if lane != v.target_lane_index:
+                v.route = v.route[v.route.index(v.target_lane_index) + 1 :]
+                v.route = v.route[v.route.index(lane) :]
+                v.target_lane_index = lane
+            v.on_state_update()
+        return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
+
+    def step(self) -> Bools:
+        """Simulate a frame; returns in which worlds something happened that `World.judge` is to see, (B,)."""
+        self.stood = self.crashed.copy()
+        self._act()
+        self._move()
+        self.frame = self.frame + 1
+        self._collide()
+        ego_lane = self.lane_now[:, 0]
+        along, lateral = self.lanes.coordinates(self.xy[:, 0], ego_lane)
+        room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[ego_lane]
+        on_road = (
+            (np.abs(lateral) <= self.lanes.width[ego_lane] / 2)
+            & (-room_m <= along)
+            & (along < length_m + room_m)
+        )
+        xy = np.where(self.there[..., None], self.xy, np.nan)
+        cleared = self.scenario.cleared(xy, self.approach, self.scenario.parameters)
+        crashes = (self.crashed != self.stood).any(axis=1)
+        return np.asarray(~on_road | cleared | crashes | self.crashed[:, 0] | (self.frame >= self.last_frame))
+
+    def _act(self) -> None:
+        """`_OnRoute.act`: steer, and keep the target speed."""
+        lanes = self.lanes
+        along, lateral = lanes.coordinates(self.xy, self.lane)
+        ends = along > lanes.length[self.lane] - AbstractLane.VEHICLE_LENGTH / 2
+        if ends.any():
+            b, n = np.nonzero(ends)
+            following = self.route[b, n, self.section[b, n] + 1]
+            b, n, following = b[following >= 0], n[following >= 0], following[following >= 0]
+            self.section[b, n] += 1
+            self.lane[b, n] = following
+            along[b, n], lateral[b, n] = lanes.coordinates(self.xy[b, n], following)
+        self.steering = self._steering(along, lateral)
+        self.acceleration = self._acceleration()
+        self.braking = self.acceleration < -LAMPS_MPS2
+
+    def _steering(self, along: Floats, lateral: Floats) -> Floats:
+        least = np.where(self.speed >= 0, SLOW_MPS, -SLOW_MPS)
+        speed = np.where(np.abs(self.speed) > SLOW_MPS, self.speed, least)
+        of = ControlledVehicle
+        heading = self.lanes.heading_at(along + self.speed * of.TAU_PURSUIT, self.lane)
+        turn: Floats = np.clip(-of.KP_LATERAL * lateral / speed, -1.0, 1.0)
+        turn = np.clip(np.arcsin(turn), -np.pi / 4, np.pi / 4)
+        rate: Floats = of.KP_HEADING * _wrapped(heading + turn - self.heading)
+        slip = np.clip(self.size[..., 0] / 2 / speed * rate, -1.0, 1.0)
+        steering: Floats = np.arctan(2 * np.tan(np.arcsin(slip)))
+        return np.clip(steering, -self.most_steering, self.most_steering)
+
+    def _acceleration(self) -> Floats:
+        """`speed_control` of the traffic, and of the ego."""
+        found = np.zeros_like(self.speed)
+        faster = (self.lane_now[:, :, None] == self.lane_now[:, None]) & (
+            self.speed[:, :, None] > self.speed[:, None]
+        )
+        if faster.any():
+            b, n, other = np.nonzero(faster)
+            ways = np.stack([np.cos(self.heading[b, n]), np.sin(self.heading[b, n])], axis=-1)
+            ahead = np.vecdot(self.xy[b, other] - self.xy[b, n], ways)
+            room = ahead - (self.size[b, n, 0] + self.size[b, other, 0]) / 2 - Traffic.standoff_m
+            closing = self.speed[b, n] - self.speed[b, other]
+            brakes = (ahead > 0) & (closing**2 > 2 * Traffic.braking_mps2 * room)
+            found[b[brakes], n[brakes]] = -2 * Traffic.braking_mps2
+        by_itself = self.frame[:, None] / self.scenario.parameters.simulation_hz >= self.brakes_at
+        if by_itself.any():
+            above = np.maximum(self.speed - self.brakes_to, 0.0)
+            by_itself &= above > 0
+            found = np.where(by_itself, -np.minimum(self.brakes_mps2, above * BRAKES_OFF_HZ), found)
+        ego = ControlledVehicle.KP_A * (self.target[:, 0] - self.speed[:, 0])
+        found[:, 0] = np.clip(ego, *self.limits)
+        return found
+
+    def _move(self) -> None:
+        """`Vehicle.step`."""
+        steering, acceleration = self.steering, self.acceleration
+        if self.crashed.any():
+            steering = np.where(self.crashed, 0.0, steering)
+            acceleration = np.where(self.crashed, -1.0 * self.speed, acceleration)
+        if (np.abs(self.speed) > FAST_MPS).any():
+            of = ControlledVehicle
+            most = np.minimum(acceleration, 1.0 * (of.MAX_SPEED - self.speed))
+            least = np.maximum(acceleration, 1.0 * (of.MIN_SPEED - self.speed))
+            acceleration = np.where(self.speed > of.MAX_SPEED, most, acceleration)
+            acceleration = np.where(self.speed < of.MIN_SPEED, least, acceleration)
+        self.steering, self.acceleration = steering, acceleration
+        slip = np.arctan(1 / 2 * np.tan(steering))
+        way = self.heading + slip
+        velocity = self.speed[..., None] * np.stack([np.cos(way), np.sin(way)], axis=-1)
+        self.xy = self.xy + velocity * self.dt
+        if self.pushed.any():
+            self.xy[self.pushed] += self.impact[self.pushed]
+            self.crashed = self.crashed | self.pushed
+            self.pushed = np.zeros_like(self.pushed)
+        self.heading = self.heading + self.speed * np.sin(slip) / (self.size[..., 0] / 2) * self.dt
+        self.speed = self.speed + acceleration * self.dt
+        self.lane_now = np.where(self.there, self.lane, self.lane_now)
+        if self.ways.size:
+            places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
+            _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
+            self.lane_now[:, 0] = self.ways[np.abs(off_m).argmin(axis=1)]
+
+    def _collide(self) -> None:
+        """`_Road.step`: who is near enough to touch within the frame is looked at by highway-env."""
+        x, y = self.xy[..., 0], self.xy[..., 1]
+        dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
+        within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M
+        near = np.triu(dx * dx + dy * dy < within * within, 1)
+        near &= self.there[:, :, None] & self.there[:, None]
+        if not near.any():
+            return
+        b, n, other = np.nonzero(near)
+        touching = ~self._apart(b, n, other, dx[near], dy[near])
+        for row, one, two in np.stack([b, n, other], axis=-1)[touching].tolist():
+            vehicles = self.worlds[row].vehicles
+            for k in (one, two):
+                v, at = vehicles[k], (row, k)
+                v.position, v.heading, v.speed = self.xy[at], float(self.heading[at]), float(self.speed[at])
+                v.impact, v.crashed = None, False
+            vehicles[one].handle_collisions(vehicles[two], self.dt)
+            for k in (one, two):
+                v, at = vehicles[k], (row, k)
+                self.crashed[at] |= v.crashed
+                if v.impact is not None:
+                    self.impact[at], self.pushed[at] = v.impact, True
+
+    def _apart(self, b: Ints, n: Ints, other: Ints, dx: Floats, dy: Floats) -> Bools:
+        """`simulator._apart`, of pairs."""
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        dot = np.abs(cos[b, n] * cos[b, other] + sin[b, n] * sin[b, other])
+        cross = np.abs(cos[b, n] * sin[b, other] - sin[b, n] * cos[b, other])
+        moves = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
+        apart = np.zeros(len(b), dtype=bool)
+        for one, two in ((n, other), (other, n)):
+            c, s, (length, width) = cos[b, one], sin[b, one], self.size[b, one].T
+            its_length, its_width = self.size[b, two].T
+            along = np.abs(dx * c + dy * s) - (length + its_length * dot + its_width * cross) / 2
+            across = np.abs(dy * c - dx * s) - (width + its_length * cross + its_width * dot) / 2
+            apart |= (along > moves) | (across > moves)
+        return apart
+
+
+def _wrapped(angle: Floats) -> Floats:
+    """`utils.wrap_to_pi`."""
+    turned: Floats = ((angle + np.pi) % (2 * np.pi)) - np.pi
+    return turned
