@@ -22,7 +22,8 @@ from highway_env.vehicle.controller import ControlledVehicle
 from harness.core.arrays import Bools, Floats, Ints
 from harness.world.road import Lane, Road
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
-from harness.world.world import World
+from harness.world.state import separation_m
+from harness.world.world import World, least_gaps_m
 
 ALONE = 2  # so many worlds are as fast one by one
 SLOW_MPS = 1e-2  # where one divides by a slower speed, it is taken to be this: highway-env's `not_zero`
@@ -54,7 +55,8 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
     until = np.array(until_frames)
     speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
     fleet = _Fleet(lanes, worlds)
-    poses = np.empty((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4))
+    sizes_m, there = fleet.size, fleet.there
+    poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
     passed = 0
     while going.size:
@@ -73,8 +75,13 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
         if over.any():
             going = going[~over]
             fleet.keep(~over)
-    for world, frames, first, speed_mps in zip(worlds, poses, begun.tolist(), speeds_mps, strict=True):
-        world.passed(frames[: world.frame - first, : len(world.vehicles)].copy(), speed_mps)
+    poses[..., :2] -= worlds[0].scenario.road().origin_m
+    np.copyto(poses, np.nan, where=~there[:, None, :, None])
+    before_m = np.array([world.outcome.least_gap_m for world in worlds])
+    gaps_m = least_gaps_m(poses, sizes_m, before_m).tolist()
+    rows = zip(worlds, poses, begun.tolist(), speeds_mps, gaps_m, strict=True)
+    for world, frames, first, speed_mps, gap_m in rows:
+        world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m)
 
 
 @dataclass(frozen=True)
@@ -352,7 +359,10 @@ class _Fleet:
         if not near.any():
             return
         b, n, other = np.nonzero(near)
-        touching = ~self._apart(b, n, other, dx[near], dy[near])
+        poses = np.concatenate([self.xy, self.heading[..., None]], axis=-1)
+        apart_m = separation_m(poses[b, n], self.size[b, n], poses[b, other], self.size[b, other])
+        moves_m = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
+        touching = apart_m <= moves_m
         for row, one, two in np.stack([b, n, other], axis=-1)[touching].tolist():
             vehicles = self.worlds[row].vehicles
             for k in (one, two):
@@ -365,21 +375,6 @@ class _Fleet:
                 self.crashed[at] |= v.crashed
                 if v.impact is not None:
                     self.impact[at], self.pushed[at] = v.impact, True
-
-    def _apart(self, b: Ints, n: Ints, other: Ints, dx: Floats, dy: Floats) -> Bools:
-        """`simulator._apart`, of pairs."""
-        cos, sin = np.cos(self.heading), np.sin(self.heading)
-        dot = np.abs(cos[b, n] * cos[b, other] + sin[b, n] * sin[b, other])
-        cross = np.abs(cos[b, n] * sin[b, other] - sin[b, n] * cos[b, other])
-        moves = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
-        apart = np.zeros(len(b), dtype=bool)
-        for one, two in ((n, other), (other, n)):
-            c, s, (length, width) = cos[b, one], sin[b, one], self.size[b, one].T
-            its_length, its_width = self.size[b, two].T
-            along = np.abs(dx * c + dy * s) - (length + its_length * dot + its_width * cross) / 2
-            across = np.abs(dy * c - dx * s) - (width + its_length * cross + its_width * dot) / 2
-            apart |= (along > moves) | (across > moves)
-        return apart
 
 
 def _wrapped(angle: Floats) -> Floats:

@@ -93,6 +93,28 @@ def rectangle(
     return np.stack([x + along * cos - right * sin, y + along * sin + right * cos], axis=-1)
 
 
+def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
+    """How far an axis of either keeps two rectangles apart (n,): no more than their gap, m.
+
+    Args:
+        poses: x, y and heading of the one, (n, 3).
+        sizes_m: its length and width, (n, 2).
+        others: x, y and heading of the other, (n, 3).
+        their_sizes_m: its length and width, (n, 2).
+    """
+    (dx, dy), apart = (others - poses)[:, :2].T, np.full(len(poses), -np.inf)
+    cos, sin, its_cos, its_sin = (turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin))
+    dot, cross = np.abs(cos * its_cos + sin * its_sin), np.abs(cos * its_sin - sin * its_cos)
+    for c, s, (length, width), (its_length, its_width) in (
+        (cos, sin, sizes_m.T, their_sizes_m.T),
+        (its_cos, its_sin, their_sizes_m.T, sizes_m.T),
+    ):
+        along = np.abs(dx * c + dy * s) - (length + its_length * dot + its_width * cross) / 2
+        across = np.abs(dy * c - dx * s) - (width + its_length * cross + its_width * dot) / 2
+        apart = np.maximum(apart, np.maximum(along, across))
+    return apart
+
+
 @dataclass(frozen=True)
 class Building:
     """An axis-parallel box that blocks sight; its walls in metres."""

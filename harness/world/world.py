@@ -7,17 +7,18 @@ it is decided.
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import shapely
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.world import beacons
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
 from harness.world.simulator import copied, new_road, populated, spawn_of, state_of, vehicle_on
-from harness.world.state import Beacon, VehicleState, WorldState, rectangle
+from harness.world.state import Beacon, VehicleState, WorldState, rectangle, separation_m
 
 Snapshot = Mapping[str, Any]
 Target = tuple[str, int]  # route, and index of the scenario's target speeds
@@ -183,26 +184,27 @@ class World:
             self._step()
             frames.append(self._poses())
         if frames:
-            self.passed(np.array(frames), speed_mps)
+            poses = self._in_road_frame(frames)
+            sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
+            [gap_m] = least_gaps_m(poses[None], sizes_m, np.array([self.outcome.least_gap_m])).tolist()
+            self.passed(poses, speed_mps, gap_m)
 
-    def passed(self, poses: Floats, speed_mps: float) -> None:
+    def passed(self, poses: Floats, speed_mps: float, gap_m: float) -> None:
         """Take down what the last frames showed.
 
         Args:
-            poses: x, y, heading and speed of each vehicle in each of them, in highway-env's own frame,
-                (F, V, 4).
+            poses: x, y, heading and speed of each vehicle in each of them, from the origin of the scenario's
+                road, (F, V, 4).
             speed_mps: of the ego before them.
+            gap_m: least gap between the ego and others so far.
         """
-        poses[..., :2] -= self.scenario.road().origin_m
         self._broadcast(poses, self.frame + 1 - len(poses))
-        least_m = least_gap_m(poses[..., :3], self.vehicles, self.outcome.least_gap_m)
-        self.outcome = replace(self.outcome, least_gap_m=least_m)
-        hard = (
-            -np.diff(poses[:, 0, 3], prepend=speed_mps) * self.scenario.parameters.simulation_hz
-            > HARD_BRAKING_MPS2
-        )
-        self.hard_brakings += int(np.sum(hard & ~np.append(self.braking_hard, hard[:-1])))
-        self.braking_hard = bool(hard[-1])
+        self.outcome = replace(self.outcome, least_gap_m=gap_m)
+        speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
+        slows_mps2 = (speeds_mps[:-1] - speeds_mps[1:]) * self.scenario.parameters.simulation_hz
+        hard = [self.braking_hard, *(slows_mps2 > HARD_BRAKING_MPS2).tolist()]
+        self.hard_brakings += sum(now and not before for before, now in pairwise(hard))
+        self.braking_hard = hard[-1]
 
     def _poses(self) -> list[tuple[float, ...]]:
         """x, y, heading and speed of each vehicle, in highway-env's own frame."""
@@ -277,24 +279,35 @@ class World:
             self.outcome = replace(self.outcome, other_crashes=self.outcome.other_crashes + len(crashed))
 
 
-def least_gap_m(poses: Floats, vehicles: Sequence[Any], least_m: float) -> float:
-    """The smaller of `least_m` and the least gap between the ego's outline and another's.
+def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
+    """The smaller of `least_m` and the least gap between an ego's outline and another's, in each world (W,).
 
     Args:
-        poses: (frames, vehicles, 3), x, y and heading; the ego first.
-        vehicles: whose poses they are.
-        least_m: the least gap before these frames.
+        poses: (W, frames, vehicles, 3 or more), x, y and heading; the ego first; NaN where nobody is.
+        sizes_m: (W, vehicles, 2), length and width.
+        least_m: (W,), the least gap before these frames.
     """
-    sizes = np.array([(v.LENGTH, v.WIDTH) for v in vehicles])
-    centres_m = np.hypot(*np.moveaxis(poses[:, 1:, :2] - poses[:, :1, :2], -1, 0))
+    centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
     # Two centres are at least both half widths apart from touching, and at most both half diagonals.
-    farthest_m = np.hypot(*sizes.T)
-    most_m = centres_m - (sizes[0, 1] + sizes[1:, 1]) / 2
-    close = centres_m - (farthest_m[0] + farthest_m[1:]) / 2 <= min(
-        least_m, float(most_m.min(initial=np.inf))
-    )
-    frames, others = np.nonzero(close)
-    mine = rectangle(*poses[frames, 0].T, *sizes[:1].T)
-    its = rectangle(*poses[frames, 1 + others].T, *sizes[1 + others].T)
-    gaps_m = shapely.distance(shapely.polygons(mine), shapely.polygons(its))
-    return min(least_m, float(gaps_m.min(initial=np.inf)))
+    farthest_m = np.hypot(*np.moveaxis(sizes_m, -1, 0))[:, None]
+    most_m = centres_m - (sizes_m[:, None, :1, 1] + sizes_m[:, None, 1:, 1]) / 2
+    bound_m = np.fmin(least_m, np.fmin.reduce(most_m, axis=(1, 2), initial=np.inf))
+    close = centres_m - (farthest_m[..., :1] + farthest_m[..., 1:]) / 2 <= bound_m[:, None, None]
+    worlds, frames, others = np.nonzero(close)
+    mine, its = poses[worlds, frames, 0, :3], poses[worlds, frames, 1 + others, :3]
+    sizes, its_sizes = sizes_m[worlds, 0], sizes_m[worlds, 1 + others]
+    at_least_m = separation_m(mine, sizes, its, its_sizes)
+    gaps_m = least_m.copy()
+
+    def measure(pairs: Ints) -> None:
+        outlines = (
+            shapely.polygons(rectangle(*pose[pairs].T, *size[pairs].T))
+            for pose, size in ((mine, sizes), (its, its_sizes))
+        )
+        np.minimum.at(gaps_m, worlds[pairs], shapely.distance(*outlines))
+
+    # The likeliest pair of each world first: few others can be nearer than that.
+    likely = np.lexsort((at_least_m, worlds))
+    measure(likely[np.diff(worlds[likely], prepend=-1) > 0])
+    measure(np.flatnonzero(at_least_m < gaps_m[worlds]))
+    return gaps_m

