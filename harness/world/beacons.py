@@ -137,14 +137,20 @@ def _sent(
     phase, errors, uniforms = _draws(p, seed, sender, receivers)
     every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
 
-    def said(number: int, frame: int) -> Beacon:
-        """All but who hears it."""
+    def said(number: int, frame: int, heard_by: tuple[str, ...] = ()) -> Beacon:
         x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
         time_s = frame / p.simulation_hz
         return Beacon(
             sender, time_s, time_s + p.beacon_delay_s, round(x, 2), round(y, 2), round(heading, 3),
-            max(round(speed, 2), 0.0), target_mps, (),
+            max(round(speed, 2), 0.0), target_mps, heard_by,
         )  # fmt: skip
+
+    def hear(number: int, frame: int) -> tuple[str, ...]:
+        """To whom it gets through."""
+        if not number:
+            return receivers
+        crosses = uniforms[:, number] >= loss(frame - first_frame)[links]
+        return tuple(r for r, there in zip(receivers, crosses.tolist(), strict=True) if there)
 
     checks = list[tuple[int, int]]()  # number and frame, the last first
     number = math.ceil((first_frame + len(poses) + lead) / every - phase)
@@ -152,19 +158,16 @@ def _sent(
         if frame < first_frame + len(poses):
             checks.append((number, frame))
         number -= 1
-    sent: Iterable[tuple[int, Beacon]] = ((number, said(number, frame)) for number, frame in checks)
-    if p.beacon_rule == "cam":
-        last, due = before[-1] if before else None, list[tuple[int, Beacon]]()
-        for number, frame in reversed(checks):
-            cam = _cam(said(number, frame), poses[frame - first_frame].tolist(), last)
-            if cam:
-                due.insert(0, (number, cam))
-                last = cam
-        sent = due
-    for number, beacon in sent:
-        frame = round(beacon.time_s * p.simulation_hz) - first_frame
-        crosses = uniforms[:, number] >= loss(frame)[links] if number else [True] * len(receivers)
-        yield replace(beacon, heard_by=tuple(r for r, there in zip(receivers, crosses, strict=True) if there))
+    if p.beacon_rule == "fixed":
+        yield from (said(number, frame, hear(number, frame)) for number, frame in checks)
+        return
+    last, due = before[-1] if before else None, list[tuple[int, int, Beacon]]()
+    for number, frame in reversed(checks):
+        if cam := _cam(said(number, frame), poses[frame - first_frame].tolist(), last):
+            due.append((number, frame, cam))
+            last = cam
+    for number, frame, cam in reversed(due):
+        yield replace(cam, heard_by=hear(number, frame))
 
 
 def _cam(said: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:

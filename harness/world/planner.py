@@ -35,7 +35,7 @@ LANE_M = 4.0  # between two ways
 Point = tuple[Floats, Floats]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rollouts:
     """Sequences of actions, played through.
 
@@ -213,16 +213,21 @@ def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
 def least_gap(tried: Rollouts, motion: Motion, under_way: Bools | bool = True) -> Floats:
     """Smallest gap (m) to another vehicle while the ego is under way, per sequence; below zero they meet."""
     away, reach = cover(*motion.size_m)
-    own, own_reach = cover(*SIZES_M["car"])
-    ego = _discs(motion.way, motion.begin_m + tried.travelled_m, own, tried.right_m)
+    (x, y), own_reach = _ego_discs(tried, motion.way, motion.begin_m)
     squared = np.full(tried.travelled_m.shape, np.inf)
     # The nearest pair is kept as it goes: arrays of all pairs would not fit into the processor's cache.
-    for its_x, its_y in _discs(motion.path, motion.arc_m, away):
-        for x, y in ego:
-            np.minimum(squared, (x - its_x) ** 2 + (y - its_y) ** 2, out=squared)
+    for its_x, its_y in zip(*_discs(motion.path, motion.arc_m, away), strict=True):
+        np.minimum(squared, ((x - its_x) ** 2 + (y - its_y) ** 2).min(axis=0), out=squared)
     return np.asarray(
         np.sqrt(squared.min(axis=1, where=under_way, initial=np.inf)) - reach - own_reach - MARGIN_M
     )
+
+
+@lru_cache(maxsize=8)  # whom the ego may meet, it meets on few ways
+def _ego_discs(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
+    """The ego's discs along a way, (discs, n, steps), and their radius. Shared: not to be written to."""
+    own, reach = cover(*SIZES_M["car"])
+    return _discs(way, begin_m + tried.travelled_m, own, tried.right_m), reach
 
 
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
@@ -232,11 +237,11 @@ def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
     return places, float(np.hypot(length_m / count / 2, width_m / 2))
 
 
-def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> list[Point]:
-    """X and y of a vehicle's discs at arc lengths along a path, or to the right of it."""
+def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> Point:
+    """X and y (discs, ...) of a vehicle's discs at arc lengths (...) along a path, or to the right of it."""
     heading = path.headings_rad[np.searchsorted(path.arc_m, arc_m).clip(0, len(path.arc_m) - 1)]
-    x, y = (np.interp(arc_m, path.arc_m, along) for along in path.points.T)
+    x, y = (np.interp(arc_m, path.arc_m, along) for along in path.columns)
     cos, sin = np.cos(heading), np.sin(heading)
     if right_m is not None:
         x, y = x - sin * right_m, y + cos * right_m
-    return [(x + cos * away, y + sin * away) for away in away_m]
+    return x + np.multiply.outer(away_m, cos), y + np.multiply.outer(away_m, sin)

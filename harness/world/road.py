@@ -70,6 +70,11 @@ class Path:
         return cls(approach, route, points, even, tuple(ends.tolist()), tuple(roles), tuple(lanes), priority)
 
     @cached_property
+    def columns(self) -> Floats:
+        """(2, n) m, the points' coordinates, each in one piece."""
+        return np.ascontiguousarray(self.points.T)
+
+    @cached_property
     def headings_rad(self) -> Floats:
         """(n,) direction of travel."""
         along = np.gradient(self.points, axis=0)
@@ -88,10 +93,11 @@ class Path:
     @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is for good
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
-        gap = np.hypot(self.points[:, 0] - x_m, self.points[:, 1] - y_m)
+        x, y = self.columns
+        gap = np.hypot(x - x_m, y - y_m)
         i = int(gap.argmin())
         heading = float(self.headings_rad[i])
-        dx, dy = x_m - self.points[i, 0], y_m - self.points[i, 1]
+        dx, dy = x_m - x[i], y_m - y[i]
         along = dx * np.cos(heading) + dy * np.sin(heading)
         lateral = float(np.sqrt(max(gap[i] ** 2 - along**2, 0.0)))
         return float(self.arc_m[i] + along), lateral, heading
@@ -99,8 +105,7 @@ class Path:
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
         """Position (m, m) and heading (rad) at an arc length."""
-        x = float(np.interp(arc_m, self.arc_m, self.points[:, 0]))
-        y = float(np.interp(arc_m, self.arc_m, self.points[:, 1]))
+        x, y = (float(np.interp(arc_m, self.arc_m, along)) for along in self.columns)
         nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
         return x, y, float(self.headings_rad[nearest])
 
