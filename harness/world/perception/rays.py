@@ -51,13 +51,24 @@ def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, 
     Returns:
         Ray parameter (r, 4n), inf where a wall is not met, and where along the wall from 0 to 1, (r, 4n).
     """
-    start = corners.reshape(-1, 2) - origin
-    along = np.roll(corners, -1, axis=1).reshape(-1, 2) - origin - start
+    start, along = (part.reshape(-1, 2) for part in _walls(origin, corners))
+    return _met(start, along, targets[:, None])
+
+
+def _walls(origin: Floats, corners: Floats) -> tuple[Floats, Floats]:
+    """Where each wall of surfaces (n, 4, 2) begins, seen from the origin, and how it goes on, both alike."""
+    start = corners - origin
+    return start, np.roll(corners, -1, axis=1) - origin - start
+
+
+def _met(start: Floats, along: Floats, targets: Floats) -> tuple[Floats, Floats]:
+    """`meetings` of walls (..., 2) and rays (..., 2) that fit each other."""
+    (x, y), (dx, dy), (ray_x, ray_y) = (np.moveaxis(part, -1, 0) for part in (start, along, targets))
     # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
-    determinant = targets[:, :1] * along[:, 1] - targets[:, 1:] * along[:, 0]
+    determinant = ray_x * dy - ray_y * dx
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / determinant
-        u = (start[:, 0] * targets[:, 1:] - start[:, 1] * targets[:, :1]) / determinant
+        t = (x * dy - y * dx) / determinant
+        u = (x * ray_y - y * ray_x) / determinant
     return np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf), u
 
 
@@ -81,10 +92,37 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     """Cast rays all round a vehicle."""
     bearing, rays = _all_round()
     ids, corners = surfaces(state, viewer)
-    distance, met = first_hits(np.array([viewer.x_m, viewer.y_m]), rays, corners)
+    origin = np.array([viewer.x_m, viewer.y_m])
+    distance, met = np.full(RAYS, np.inf), np.zeros(RAYS, dtype=int)
+    towards = _towards(origin, corners)
+    surface = np.repeat(np.arange(len(ids)), [len(some) for some in towards])
+    start, along = (np.swapaxes(part, 0, 1)[:, surface] for part in _walls(origin, corners))
+    t, _ = _met(start, along, rays[np.concatenate(towards)])
+    nearest, begin = t.min(axis=0), 0
+    for n, some in enumerate(towards):
+        there = nearest[begin : begin + len(some)]
+        nearer = there < distance[some]
+        distance[some[nearer]], met[some[nearer]] = there[nearer], n
+        begin += len(some)
     reached = np.isfinite(distance)
     hits = {name: np.flatnonzero(reached & (met == n)) for n, name in enumerate(ids)}
     return Sweep(bearing, distance, {name: rays for name, rays in hits.items() if len(rays)})
+
+
+def _towards(origin: Floats, corners: Floats) -> list[NDArray[np.intp]]:
+    """Indices of the rays that may meet each surface: from one side of its corners to the other."""
+    to = corners - origin
+    bearing = np.arctan2(to[..., 1], to[..., 0])
+    aside = turned(bearing - bearing[:, :1])
+    step = 2 * np.pi / RAYS
+    first = np.floor((bearing[:, 0] + aside.min(axis=1)) / step).astype(int).tolist()
+    last = np.ceil((bearing[:, 0] + aside.max(axis=1)) / step).astype(int).tolist()
+    # Who stands in it, or right at it, may meet it all round.
+    all_round = (np.ptp(aside, axis=1) >= np.pi - step).tolist()
+    return [
+        np.arange(RAYS) if everywhere else np.arange(begin - 1, end + 2) % RAYS
+        for begin, end, everywhere in zip(first, last, all_round, strict=True)
+    ]
 
 
 @lru_cache(maxsize=1)
