@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # the simulator is loaded by who drives
 
 Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
-EPISODES_AT_ONCE = 8  # of the closed loop that are driven in step and kept together, at least
+EPISODES_AT_ONCE = 16  # of the closed loop that are driven in step and kept together, at least
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
 
 
