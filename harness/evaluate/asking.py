@@ -162,7 +162,8 @@ class Asker:
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # whose batches are whole, as the others' are
         owed = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        self._progress(len(asked) - sum(map(len, owed)))
+        if len(owed) < len(chunks):
+            self._progress(len(asked) - sum(map(len, owed)))
         found: dict[str, Answer] = {}
         for answers in _each(partial(self._answered, backend), owed, 1 + math.ceil(window(backend) / size)):
             found |= {answer.id: answer for answer in answers}

@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from threading import Thread, current_thread
 from typing import Any, TypeVar
 
@@ -123,11 +124,11 @@ class OpenAIBackend:
 
     async def _asked(self, request: Request, streamed: bool) -> Reply:
         """The server's reply; a server that will not stream is asked again, and never to stream again."""
-        asked = body(self._card, self._server, request)
+        asked = partial(body, self._card, self._server, request)
         decision = request.id.partition("/")[0]
         if not streamed or not self._streams or request.answer == "readout":
             return await self._farm.post(decision, asked)
-        reply = await self._farm.post(decision, {**asked, **ASKED})
+        reply = await self._farm.post(decision, lambda: {**asked(), **ASKED})
         if reply.status in (None, 200) or "stream" not in (reply.fault or "").lower():
             return reply
         self._streams = False

@@ -9,7 +9,7 @@ import asyncio
 import json
 import sys
 from collections import Counter, deque
-from collections.abc import Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -74,10 +74,10 @@ class _Place:
 
 @dataclass(eq=False)
 class _Owed:
-    """A request, where its reply is awaited, and how often it failed at which server."""
+    """A request, made once it is asked; where its reply is awaited; how often it failed at which server."""
 
     key: str
-    content: bytes
+    body: Callable[[], Mapping[str, Any]]
     reply: "asyncio.Future[Reply]"
     failed: Counter[_Place] = field(default_factory=Counter)
     begun_s: float | None = None
@@ -130,7 +130,7 @@ class Farm:
             if place not in there:
                 self._set_aside(place)
 
-    async def post(self, key: str, body: Mapping[str, Any]) -> Reply:
+    async def post(self, key: str, body: Callable[[], Mapping[str, Any]]) -> Reply:
         """What a server answers, once there is an answer, or the retries are used up.
 
         A server that is busy (429), breaks down (5xx), is not reached or takes too long may be asked again:
@@ -141,7 +141,7 @@ class Farm:
         """
         if self._refused:
             raise self._refused
-        owed = _Owed(key, json.dumps(body).encode(), asyncio.get_running_loop().create_future())
+        owed = _Owed(key, body, asyncio.get_running_loop().create_future())
         self._owed.add(owed)
         try:
             self._queue(owed)
@@ -211,7 +211,7 @@ class Farm:
             place.begun += 1
             nth, first = place.begun, place.busy == 1
             owed.begun_s = perf_counter() if owed.begun_s is None else owed.begun_s
-            reply = await self._client.post(place.url, _PATH, owed.content)
+            reply = await self._client.post(place.url, _PATH, json.dumps(owed.body()).encode())
             alone = first and place.begun == nth
             reply = replace(reply, retries=owed.failed[place], begun_s=owed.begun_s, alone=alone)
             if not reply.again:
