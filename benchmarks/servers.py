@@ -6,6 +6,7 @@ prompts: by `complete` alone, and by all that `harness eval` does to get, read a
 sockets alone: the same bytes are written, and answers read, on connections that stay open.
 
     python benchmarks/servers.py [--servers 1] [--requests 4000] [--repeats 5] [--seconds 0.05] [--at-once 20]
+        [--batch-size 20]
 """
 
 import argparse
@@ -52,12 +53,13 @@ def main() -> None:
     arguments.add_argument("--repeats", type=int, default=5)
     arguments.add_argument("--seconds", type=float, default=0.05)
     arguments.add_argument("--at-once", type=int, default=20)
+    arguments.add_argument("--batch-size", type=int, help="default: as many as a server takes")
     arguments.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = arguments.parse_args()
     if given.serve:
         asyncio.run(serve(given.seconds, given.at_once))
         return
-    asked = questions(given.requests)
+    asked, batch_size = questions(given.requests), given.batch_size or given.at_once
     ideal_s = given.requests * given.seconds / (given.at_once * given.servers)
     found: dict[str, list[tuple[float, float]]] = {}
     answered: list[int] = []
@@ -68,11 +70,11 @@ def main() -> None:
         card = replace(base, server=Server(urls_of_card), thinking="none", weights="m")
         spec = Spec(
             Agent(card, prompts.load("v2")), FrozenSource(load.load(load.find(DATASET), limit=1)),
-            tuple(POINTS.values()), (0,), batch_size=given.at_once,
+            tuple(POINTS.values()), (0,), batch_size=batch_size,
         )  # fmt: skip
         assert card.server
         bodies = [json.dumps(body(card, card.server, request)).encode() for request in asked]
-        backend = open_backend(card, batch_size=given.at_once)
+        backend = open_backend(card, batch_size=batch_size)
         backend.complete(asked[: 4 * given.at_once])  # pays for imports and connections
         for _ in range(given.repeats):
             ways: dict[str, Callable[[], object]] = {
@@ -86,12 +88,14 @@ def main() -> None:
         connections = [stats(url)["connections"] for url in urls]
     result: dict[str, object] = {
         "servers": given.servers, "requests": given.requests, "repeats": given.repeats,
-        "seconds": given.seconds, "at_once": given.at_once, "ideal_per_s": given.requests / ideal_s,
+        "seconds": given.seconds, "at_once": given.at_once, "batch_size": batch_size,
+        "ideal_per_s": given.requests / ideal_s,
         "answered": answered, "connections": connections,
     }  # fmt: skip
     print(
         f"{given.requests} requests, {given.servers} servers of {given.seconds * 1000:g} ms x "
-        f"{given.at_once}: ideal {given.requests / ideal_s:.0f}/s; medians of {given.repeats}"
+        f"{given.at_once}, batch size {batch_size}: ideal {given.requests / ideal_s:.0f}/s; medians of "
+        f"{given.repeats}"
     )
     for name, times in found.items():
         wall_s, cpu_s = (statistics.median(values) for values in zip(*times, strict=True))
