@@ -2,6 +2,9 @@
 
 import gc
 import json
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from evaluating import same_files, spec_of, with_ego
+from evaluating import same_decisions, same_files, spec_of, with_ego
+from hypothesis import given
+from hypothesis import strategies as st
 from misbehaving import Asked, Play, Server, completion, serving
 from served import served
 
@@ -19,6 +24,7 @@ from harness.backends.base import Request
 from harness.backends.cards import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import farm as openai_farm
+from harness.backends.openai.http import Client
 from harness.backends.servers import Kind
 from harness.backends.servers import Server as Where
 from harness.core import resources
@@ -161,6 +167,21 @@ def test_an_answer_that_had_company_has_no_time() -> None:
         for call in calls:
             call.join()
     assert [(c.seconds, c.batch_size) for c in done] == [(None, 4), (None, 4)]
+
+
+@given(st.sets(st.integers(1, 65535), min_size=2, max_size=8), st.text(), st.data())
+def test_a_server_that_is_gone_moves_no_decision_but_its_own(
+    ports: set[int], decision: str, data: st.DataObject
+) -> None:
+    def ranked(urls: list[str]) -> list[str]:
+        where = Where(tuple(urls))
+        farm = openai_farm.Farm(Client(where), where, "mine", "m", 4)
+        return [place.url for place in farm._rank(decision)]
+
+    urls = [f"http://127.0.0.1:{port}/v1" for port in ports]
+    gone = data.draw(st.sampled_from(urls))
+    left = [url for url in urls if url != gone]
+    assert ranked(left) == ranked(left[::-1]) == [url for url in ranked(urls) if url != gone]
 
 
 # -- who is set aside ---------------------------------------------------------------------------------------
@@ -343,6 +364,38 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
+
+
+def test_an_answer_of_one_server_is_kept_for_all(
+    small: Dataset, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second run has other servers, of which none is asked anything."""
+    for name in ("one", "other"):
+        with served(None if name == "one" else 0) as url, served(None if name == "one" else 0) as beside:
+            done = evaluate(
+                served_spec(small, url, beside), tmp_path / name, lambda done: None, tmp_path / "kept"
+            )
+    assert done.manifest.cached_answers == len(folder.read(whole).answers)
+    assert same_decisions(done.out, whole)
+
+
+def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: Path) -> None:
+    """Each answer takes a minute."""
+
+    def play(asked: Asked) -> None:
+        came.set()
+        time.sleep(60)
+
+    came = threading.Event()
+    with serving(play) as there:
+        command = [sys.executable, "-m", "harness", "eval", "--model", "mine", "--server", there.url]
+        command += ["--dataset", str(small_path), "--no-cache", "--out", "run"]
+        with subprocess.Popen(command, cwd=project, stderr=subprocess.PIPE, text=True) as process:
+            assert came.wait(60)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert f"goes on: harness eval --model mine --server {there.url}" in err
 
 
 # -- what is typed ------------------------------------------------------------------------------------------
