@@ -271,6 +271,47 @@ def test_a_server_that_is_not_there_yet_is_waited_for(capfd: pytest.CaptureFixtu
     assert f"server {url} is set aside (ClientConnectorError" in capfd.readouterr().err
 
 
+def test_a_server_is_looked_for_as_long_as_the_run_lasts() -> None:
+    pauses_s = [openai_farm.pause_s(times) for times in (0, 1, 2, 10, 5000)]
+    assert pauses_s == [0.02, 0.04, 0.08, 20.48, openai_farm.LONGEST_WAIT_S]
+
+
+def test_a_bug_is_a_crash_and_no_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bug(*_: Any) -> Any:
+        raise ZeroDivisionError
+
+    with serving(said_back) as there:
+        backend = opened(there)
+        monkeypatch.setattr(openai_backend, "body", bug)
+        with pytest.raises(ZeroDivisionError):
+            backend.complete(decisions(2))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Set-Cookie: \x1b[31m=;;=",
+        "Content-Type: ;;;",
+        "Content-Type: text/event-stream;=",
+        "X: " + "y" * 9000,
+    ],
+)
+def test_a_header_that_is_none_says_nothing_on_the_terminal(
+    header: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = json.dumps(completion("a")).encode()
+
+    def play(asked: Asked) -> None:
+        asked.raw(
+            b"HTTP/1.1 200 OK\r\n%b\r\nContent-Length: %d\r\n\r\n%b" % (header.encode(), len(data), data)
+        )
+
+    with serving(play) as there:
+        [done] = opened(there).complete(decisions(1, 1))
+    assert done.text == "a" or done.error
+    assert caplog.records == []
+
+
 # -- the same model -----------------------------------------------------------------------------------------
 
 
@@ -366,15 +407,12 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
 
 
-def test_an_answer_of_one_server_is_kept_for_all(
-    small: Dataset, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tmp_path: Path) -> None:
     """The second run has other servers, of which none is asked anything."""
-    for name in ("one", "other"):
-        with served(None if name == "one" else 0) as url, served(None if name == "one" else 0) as beside:
-            done = evaluate(
-                served_spec(small, url, beside), tmp_path / name, lambda done: None, tmp_path / "kept"
-            )
+    for answers in (None, 0):
+        with served(answers) as url, served(answers) as beside:
+            spec, out = served_spec(small, url, beside), tmp_path / f"run-{answers}"
+            done = evaluate(spec, out, lambda done: None, tmp_path / "kept")
     assert done.manifest.cached_answers == len(folder.read(whole).answers)
     assert same_decisions(done.out, whole)
 

@@ -83,6 +83,11 @@ class _Owed:
     begun_s: float | None = None
 
 
+def pause_s(times: int) -> float:
+    """Seconds to wait after so many waits in a row."""
+    return float(min(FIRST_WAIT_S * 2 ** min(times, 32), LONGEST_WAIT_S))
+
+
 class Farm:
     """The servers of a model. All of it runs in one event loop, inside `async with` of the client.
 
@@ -106,7 +111,7 @@ class Farm:
         self._owed: set[_Owed] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._woken = False
-        self._refused: UserError | None = None
+        self._refused: Exception | None = None
         self._first = self._places[0]
         self._ranked = lru_cache(maxsize=1 << 12)(self._rank)
         self.model = Model()
@@ -196,7 +201,11 @@ class Farm:
     async def _work(self, place: _Place, owed: _Owed | None) -> None:
         """Ask a server for one request after the other."""
         while owed:
-            await self._ask(place, owed)
+            try:
+                await self._ask(place, owed)
+            except Exception as error:  # a bug, of which whoever asked has to hear
+                if not owed.reply.done():
+                    owed.reply.set_exception(error)
             owed = self._take(place)
         place.busy -= 1
 
@@ -226,7 +235,7 @@ class Farm:
             attempts = owed.failed.total()
             if attempts > self._server.retries:
                 break
-            wait_s = FIRST_WAIT_S * 2 ** (attempts - 1) if reply.after_s is None else reply.after_s
+            wait_s = pause_s(attempts - 1) if reply.after_s is None else reply.after_s
             await asyncio.sleep(min(wait_s, LONGEST_WAIT_S))
             if place.aside:
                 self._queue(owed)
@@ -261,7 +270,7 @@ class Farm:
         """Look for a server that was set aside after longer and longer pauses, until it is there again."""
         try:
             while True:
-                await asyncio.sleep(min(FIRST_WAIT_S * 2**place.pauses, LONGEST_WAIT_S))
+                await asyncio.sleep(pause_s(place.pauses))
                 place.pauses += 1
                 model = await self._look(place)
                 if model and all(now is not None for now, was in zip(model, self.model, strict=True) if was):
@@ -275,7 +284,7 @@ class Farm:
                         )
                     )
             self._agree(place, model)
-        except UserError as error:
+        except Exception as error:  # a bug ends the run as well; nobody else awaits this
             self._refused = error
             self._end(error)
             return
@@ -285,7 +294,7 @@ class Farm:
         self._queue_again(*(p for p in self._places if p.aside))
         self._wake()
 
-    def _end(self, error: UserError) -> None:
+    def _end(self, error: Exception) -> None:
         for owed in list(self._owed):
             if not owed.reply.done():
                 owed.reply.set_exception(error)
