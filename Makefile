@@ -49,6 +49,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/drive.py
 	$(BIN)/python benchmarks/report.py
 	$(BIN)/python benchmarks/load.py
+	$(BIN)/python benchmarks/servers.py
 	$(BIN)/python benchmarks/camera.py
 	$(BIN)/python benchmarks/pictures.py
 	$(BIN)/python benchmarks/coverage.py

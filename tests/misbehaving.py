@@ -66,6 +66,7 @@ class Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # a connection that stays open would wait 40 ms for each answer
     server: Server
 
     def do_GET(self) -> None:

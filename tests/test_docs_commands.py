@@ -60,6 +60,8 @@ NOT_RUN = {
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
+    "harness eval --model my-served --server http://gpu-1:8000/v1 --server http://gpu-2:8000/v1"
+    " --batch-size 256": "needs servers; tests/test_servers.py has some",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
     "harness export reports/proxy-v2-occluded-intersection-v2 --inspect logs/run.eval": "needs inspect-ai",

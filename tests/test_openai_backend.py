@@ -24,7 +24,7 @@ from harness import cli
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.cards import Card, Latency, Thinking
 from harness.backends.openai import backend as openai_backend
-from harness.backends.openai import http as openai_http
+from harness.backends.openai import farm as openai_farm
 from harness.backends.openai.shapes import body, read
 from harness.backends.servers import KINDS, Kind, Server
 from harness.core import resources
@@ -41,7 +41,7 @@ GOOD = '{"action_distribution":{"SLOWER":0.10,"IDLE":0.80,"FASTER":0.10}}'
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Retries come soon, and no key of whoever runs the tests is sent anywhere."""
-    monkeypatch.setattr(openai_http, "FIRST_WAIT_S", 0.01)
+    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.01)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
 
@@ -203,7 +203,7 @@ def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() 
 
 
 def test_a_wait_that_would_never_end_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(openai_http, "LONGEST_WAIT_S", 0.02)
+    monkeypatch.setattr(openai_farm, "LONGEST_WAIT_S", 0.02)
     done = ask_one(lambda asked: asked.reply({"error": "busy"}, 429, retry_after="86400"))
     assert (done.retries, done.error) == (2, "HTTP 429: busy")
 
@@ -250,7 +250,7 @@ def test_a_server_that_hangs_up_halfway_is_asked_again() -> None:
     done = ask_one(lambda asked: asked.raw(b"no HTTP at all\r\n\r\n"), retries=1)
     assert (done.retries, done.finish_reason) == (1, "error")
     assert done.error is not None
-    assert done.error.startswith("RemoteProtocolError: ")
+    assert done.error.startswith("ClientResponseError: 400")
 
 
 @pytest.mark.parametrize(
@@ -467,7 +467,7 @@ def test_a_server_that_nobody_listens_at_is_one_line() -> None:
         url = f"http://127.0.0.1:{free.getsockname()[1]}/v1"
     with pytest.raises(UserError) as caught:
         openai_backend.open(card(url), batch_size=1)
-    assert f"nobody answers at {url} (ConnectError" in str(caught.value)
+    assert f"nobody answers at {url} (ClientConnectorError" in str(caught.value)
     assert "start the server" in str(caught.value)
     with pytest.raises(UserError, match="nobody answers at"):
         openai_backend.open(card("http://a..b/v1"), batch_size=1)

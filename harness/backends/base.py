@@ -145,6 +145,14 @@ class Rendering(Backend, Protocol):
         ...
 
 
+def window(backend: Backend) -> int:
+    """Requests that a backend has under way at most, if several threads may call `complete` at once.
+
+    0 for one that takes one call after the other, which has no `window`.
+    """
+    return getattr(backend, "window", 0)
+
+
 class Timed(Backend, Protocol):
     """A backend whose answers were timed before, so that they are not timed again."""
 

@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from harness.backends.base import Backend, Completion, Rendering, Request
+from harness.backends.base import Backend, Completion, Rendering, Request, window
 from harness.backends.cards import Card
 from harness.backends.registry import capabilities
 from harness.core import kept
@@ -122,6 +122,7 @@ class Cached:
         self.backend = backend
         self._identity = backend.identity()
         self._file: CompletionFile | None = CompletionFile(file)
+        self.window = window(backend)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """One completion per request, in the same order; the backend answers those that are not kept."""

@@ -1,6 +1,6 @@
 """A model card: what a model is, what it may see and where its latency comes from; and its file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -89,6 +89,14 @@ class Card:
     failures: Failures | None = None
     vision: Vision | None = None
     projector: str | None = None
+
+    def at(self, urls: tuple[str, ...]) -> "Card":
+        """The same of a served model, behind any of these servers; itself where none is given.
+
+        Raises:
+            ValueError: one is no base URL, or is named twice.
+        """
+        return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,16 @@ class Server:
     """A server that speaks OpenAI's chat completions.
 
     Attributes:
-        base_url: up to and with `/v1`; http or https, without credentials, query or fragment.
+        base_url: up to and with `/v1`; http or https, without credentials, query or fragment. A list is of
+            servers that each have the model, any of which may answer; each has to list it then.
         kind: decides how a constrained answer is asked for; `generic` is OpenAI's own way.
         key_env: environment variable with the key. It need not be set for a server that asks for none.
         timeout_s: longest that one attempt may take, from connecting to the last byte, in seconds.
-        retries: attempts after the first, where the server was busy, broke down or was not reached.
+        retries: attempts after the first, where a server was busy, broke down or was not reached; at least
+            one at each of several.
     """
 
-    base_url: str
+    base_url: str | tuple[str, ...]
     kind: Kind = "generic"
     key_env: str = "OPENAI_API_KEY"
     timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0
@@ -33,13 +35,26 @@ class Server:
 
     def __post_init__(self) -> None:
         # What is refused is not shown: it may hold a password.
-        if fault := _fault(self.base_url):
+        if fault := next(filter(None, map(_fault, self.urls)), None if self.urls else "is an empty list"):
             raise ValueError(f"base_url {fault}; give one such as http://127.0.0.1:8080/v1")
+        if len(set(self.urls)) < len(self.urls):
+            raise ValueError("base_url names a server twice; name each once")
         if not _VARIABLE.fullmatch(self.key_env):
             raise ValueError(
                 "key_env is no name of an environment variable (capitals, digits, _); "
                 "set the key in the environment, never in a card"
             )
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """The base URL of each server, without a slash at its end."""
+        given = (self.base_url,) if isinstance(self.base_url, str) else self.base_url
+        return tuple(url.rstrip("/") for url in given)
+
+    @property
+    def any_may_answer(self) -> bool:
+        """Whether the model is what its servers list, wherever they are."""
+        return not isinstance(self.base_url, str)
 
     @property
     def tells_thinking(self) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import Backend, Completion, Request
+from harness.backends.base import Backend, Completion, Request, window
 from harness.backends.cache import cached
 from harness.backends.cards import Card
 
@@ -14,6 +14,8 @@ class Swarm:
 
     def __init__(self, backends: Sequence[Backend]) -> None:
         self._backends = backends
+        windows = [window(backend) for backend in backends]
+        self.window = sum(windows) if all(windows) else 0
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         done: dict[int, Completion] = {}

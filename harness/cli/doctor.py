@@ -103,7 +103,7 @@ def _model(card: "Card") -> dict[str, Any]:
 def _remedy(card: "Card", lack: str | None) -> str | None:
     """What to do about what is missing; what else the card needs, which was not tried."""
     if card.server:
-        return f"needs a server at {printable(card.server.base_url)} (not tried)"
+        return f"needs a server at {printable(' or '.join(card.server.urls))} (not tried)"
     if lack is None:
         return None
     if lack != "weights":

@@ -60,6 +60,7 @@ def command(
         None, "--repeats", help="Evaluate so many times, with sampling seeds one after the other."
     ),
     batch_size: options.BatchSize = 8,
+    server: options.Servers = None,
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
@@ -108,6 +109,7 @@ def command(
             points=options.points(condition or tuple(POINTS), control, attack),
             seeds=channel_seeds,
             batch_size=batch_size,
+            servers=tuple(server or ()),
             device=device,
             dtype=dtype,
             temperature=temperature,

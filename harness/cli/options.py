@@ -75,6 +75,12 @@ HelperThinking = Annotated[
 BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
 Workers = Annotated[int, Option(help="Processes.")]
 ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded.")]
+Servers = Annotated[
+    list[str] | None,
+    Option(
+        "--server", help="Base URL of a served model, in place of its card's. Repeatable: any may answer."
+    ),
+]
 Device = Annotated[str | None, Option(help="cpu or cuda.")]
 Dtype = Annotated[str | None, Option(help="float32, bfloat16 or auto, in place of the card's.")]
 Latency = Annotated[

@@ -3,6 +3,8 @@
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from harness.backends.base import Backend, Completion, Request, Role
+from harness.backends.base import Backend, Completion, Request, Role, window
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.core.arrays import Ints
@@ -149,21 +151,30 @@ class Asker:
 
     def ask(self, asked: Sequence[Request]) -> None:
         """Get the answers that are missing, and keep each at once."""
+        if all(request.id in self.answers for request in asked):
+            self._progress(len(asked))
+            return
         # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
         # depend on the other requests in its batch.
-        size = self.spec.batch_size * math.ceil(CHUNK / self.spec.batch_size)
-        for start in range(0, len(asked), size):
-            chunk = asked[start : start + size]
-            if any(request.id not in self.answers for request in chunk):
-                answers = self._answered(chunk)
-                self.answers |= {answer.id: answer for answer in answers}
-                if self._kept:
-                    _keep(self._kept, answers)
-            self._progress(len(chunk))
+        backend, batch = self._backend(), self.spec.batch_size
+        size = batch * math.ceil(CHUNK / batch)
+        chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
+        if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
+            chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # whose batches are whole, as the others' are
+        owed = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
+        if len(owed) < len(chunks):
+            self._progress(len(asked) - sum(map(len, owed)))
+        found: dict[str, Answer] = {}
+        for answers in _each(partial(self._answered, backend), owed, 1 + math.ceil(window(backend) / size)):
+            found |= {answer.id: answer for answer in answers}
+            if self._kept:
+                _keep(self._kept, answers)
+            self._progress(len(answers))
+        self.answers |= {request.id: found[request.id] for chunk in owed for request in chunk}
 
-    def _answered(self, chunk: Sequence[Request]) -> list[Answer]:
+    def _answered(self, backend: Backend, chunk: Sequence[Request]) -> list[Answer]:
         """An answer each, those that cannot be read after a repair turn if the prompt has one."""
-        backend, words = self._backend(), self.spec.scenario.prompt_words
+        words = self.spec.scenario.prompt_words
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
         owed = {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
@@ -244,6 +255,17 @@ class Asker:
         asked = [request for request in requests if request.id not in self._given]
         self._more(len(asked))
         self.ask(asked)
+
+
+def _each(
+    work: Callable[[Sequence[Request]], list[Answer]], chunks: Sequence[Sequence[Request]], calls: int
+) -> Iterator[list[Answer]]:
+    """The answers to each chunk as they come; so many are at work, so that none waits for another's last."""
+    if calls == 1 or len(chunks) == 1:
+        yield from map(work, chunks)
+        return
+    with ThreadPool(min(calls, len(chunks))) as pool:  # whose threads end with the program
+        yield from pool.imap_unordered(work, chunks)
 
 
 def _heard(

@@ -86,6 +86,7 @@ class Spec:
         helpers: who answers for the helpers, who take them in turn in the order they were spawned; empty if
             the ego's agent does.
         batch_size: most requests that go through an engine together.
+        servers: base URLs of the served model, in place of its card's; any of them may answer.
         device: engines' device, or None for their choice.
         dtype: number format, or None for the cards'.
         temperature: of the models' answers; 0 takes the likeliest token each time.
@@ -104,6 +105,7 @@ class Spec:
     seeds: tuple[int, ...]
     helpers: tuple[Agent, ...] = ()
     batch_size: int = 8
+    servers: tuple[str, ...] = ()
     device: str | None = None
     dtype: str | None = None
     temperature: float = 0.0
@@ -128,6 +130,7 @@ class Spec:
                 )
         if self.batch_size < 1:
             raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
+        self._check_servers()
         self._check_sampling()
         for agent in self.agents:
             self._check(agent)
@@ -167,6 +170,18 @@ class Spec:
                 f"--latency {printable(self.latency)} does; give one of the two"
             )
         rows_of(self.device_profile, self.device_model, self.agents)
+
+    def _check_servers(self) -> None:
+        served = {agent.card for agent in self.agents if agent.card.server}
+        if self.servers and len(served) != 1:
+            models = " and ".join(sorted(printable(card.name) for card in served or {self.ego.card}))
+            reason = "are asked at servers of their own" if served else "is asked at none"
+            raise UserError(f"--server: {models} {reason}; leave it out, and give base_url in a card")
+        try:
+            for card in served:
+                card.at(self.servers)
+        except ValueError as error:
+            raise UserError(f"--server: {error}") from None
 
     def _check_sampling(self) -> None:
         shown = f"--temperature {self.temperature:g}"
@@ -253,8 +268,8 @@ class Spec:
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """Of the agents."""
-        return tuple(agent.card for agent in self.agents)
+        """Of the agents, as they are opened: the served model at the servers that are given."""
+        return tuple(agent.card.at(self.servers) for agent in self.agents)
 
     def agent(self, place: int) -> int:
         """Which of the agents answers for a scene's viewer at this place; the ego is at 0."""
@@ -313,7 +328,8 @@ class Spec:
             *self._helper_options(), *self.source.options(), ("--seeds", seeds),
             *(("--condition", point.name) for point in self.points), ("--answer", self.ego.answer),
             ("--image", None if self.ego.image == "own" else self.ego.image),
-            ("--batch-size", self.batch_size), ("--device", self.device), ("--dtype", self.dtype),
+            ("--batch-size", self.batch_size), *(("--server", url) for url in self.servers),
+            ("--device", self.device), ("--dtype", self.dtype),
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
             ("--latency", self.latency),
             ("--device-profile", self.device_profile and self.device_profile.name),

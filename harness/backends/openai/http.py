@@ -1,4 +1,4 @@
-"""Asking a server for JSON: deadlines, retries, bounds, and a key that gets out nowhere.
+"""Asking a server for JSON once: deadlines, bounds, and a key that gets out nowhere.
 
 Nothing that a server does raises: what it answers, and how it fails, is data.
 """
@@ -8,21 +8,26 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
-from typing import Any, Self
+from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import getproxies, proxy_bypass
 
-import httpx
+import aiohttp
+from yarl import URL
 
 from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
 CONNECT_S = 10.0  # a machine that is there answers sooner
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # before the first retry, doubled with each; at most
+KEPT_S = 4.0  # that an idle connection stays open: uvicorn, and so vLLM, hangs up after 5
 MOST_BYTES = 4 * 2**20  # an answer has a few thousand
 SHORTEST_SECRET = 8  # `EMPTY` is what many local servers are given, and may stand in any text
+_HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
+# What keeps a connection from coming about.
+_UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aiohttp.InvalidURL, UnicodeError)
 
 
 @dataclass(frozen=True)
@@ -31,101 +36,91 @@ class Reply:
 
     Attributes:
         payload: the JSON value; None on a fault.
-        retries: attempts that failed before the last.
         fault: why there is no payload, printable and bounded.
         status: of HTTP; None where none came.
+        unreached: whether there was no connection at all.
         again: whether another attempt may do better.
         after_s: seconds that the server asks to wait before it.
         first_at_s: when the first text of a stream came, by `time.perf_counter`; None where none was seen.
+        retries: attempts that failed before, at the server that gave this.
+        begun_s: when the first attempt began, by `time.perf_counter`.
+        alone: whether the server had no other request of ours meanwhile.
     """
 
     payload: Any = None
-    retries: int = 0
     fault: str | None = None
     status: int | None = None
+    unreached: bool = False
     again: bool = False
     after_s: float | None = None
     first_at_s: float | None = None
+    retries: int = 0
+    begun_s: float = 0.0
+    alone: bool = False
 
 
 class Client:
-    """Asks one server, inside `async with`. Redirects are not followed, since the key would go with them."""
+    """Asks servers, all with one key. Redirects are not followed, since the key would go with them.
 
-    def __init__(self, server: Server, concurrency: int) -> None:
+    Inside `async with` its connections stay open. It sets no bound to how many there are.
+    """
+
+    def __init__(self, server: Server) -> None:
         self._server = server
-        self._concurrency = concurrency
         self._key = _key(server)
-        self._certificates = httpx.create_ssl_context()  # takes longer than many an answer
-        self._http: httpx.AsyncClient
+        self._proxies = {url: _proxy(url) for url in server.urls}
+        self._session: aiohttp.ClientSession
 
-    async def __aenter__(self) -> Self:
-        headers = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
-        if self._key:
-            headers["Authorization"] = f"Bearer {self._key}"
-        self._http = httpx.AsyncClient(
-            headers=headers,
-            verify=self._certificates,
-            timeout=httpx.Timeout(None, connect=CONNECT_S),
-            limits=httpx.Limits(max_connections=self._concurrency),
+    async def __aenter__(self) -> "Client":
+        key = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        self._session = aiohttp.ClientSession(
+            connector=aiohttp.TCPConnector(limit=0, keepalive_timeout=KEPT_S),
+            headers={**_HEADERS, **key},
+            timeout=aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S),
+            cookie_jar=aiohttp.DummyCookieJar(),
+            auto_decompress=False,
         )
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._http.aclose()
+        await self._session.close()
 
-    async def get(self, path: str) -> Reply:
-        """One attempt. Raises UserError if there is nobody to be asked."""
+    async def get(self, base: str, url: str) -> Reply:
+        """What is at a URL of a server."""
+        return await self._once("GET", base, url, None, min(CONNECT_S, self._server.timeout_s))
+
+    async def post(self, base: str, path: str, content: bytes) -> Reply:
+        """What a server answers to some JSON."""
+        return await self._once("POST", base, base + path, content, self._server.timeout_s)
+
+    async def _once(
+        self, method: str, base: str, url: str, content: bytes | None, within_s: float
+    ) -> Reply:  # fmt: skip
         try:
-            return await self._once("GET", path, None, min(CONNECT_S, self._server.timeout_s))
-        except (httpx.ConnectError, httpx.ConnectTimeout, httpx.InvalidURL, UnicodeError) as error:
-            raise UserError(
-                f"nobody answers at {printable(self._server.base_url)} ({self._shown(_said(error))}); "
-                "start the server, or mend base_url in the model's card"
-            ) from None
-        except (httpx.RequestError, TimeoutError) as error:
-            return Reply(fault=self._shown(_said(error)))
+            async with asyncio.timeout(within_s):  # of the whole attempt: a server may drip for ever
+                return await self._read(method, base, url, content)
+        except (aiohttp.ClientError, UnicodeError) as error:
+            return Reply(fault=self._shown(_said(error)), unreached=isinstance(error, _UNREACHED), again=True)
+        except TimeoutError:
+            return Reply(fault=f"no whole answer within {within_s:g} s", again=True)
 
-    async def post(self, path: str, body: Mapping[str, Any]) -> Reply:
-        """Ask until there is an answer, or the server's retries are used up.
-
-        A server that is busy (429), breaks down (5xx), is not reached or takes too long is asked again, after
-        the time that it asks for or one that doubles.
-        """
-        content = json.dumps(body).encode()
-        retries = 0
-        while True:
-            try:
-                reply = await self._once("POST", path, content, self._server.timeout_s)
-            except TimeoutError:
-                reply = Reply(fault=f"no whole answer within {self._server.timeout_s:g} s", again=True)
-            except (
-                httpx.InvalidURL,
-                UnicodeError,
-            ):  # httpx reads where a redirect leads though none is followed
-                reply = Reply(fault="a redirect to what is no address, which is not followed")
-            except httpx.RequestError as error:
-                reply = Reply(fault=self._shown(_said(error)), again=True)
-            if not reply.again or retries == self._server.retries:
-                return replace(reply, retries=retries)
-            wait_s = FIRST_WAIT_S * 2**retries if reply.after_s is None else reply.after_s
-            await asyncio.sleep(min(wait_s, LONGEST_WAIT_S))
-            retries += 1
-
-    async def _once(self, method: str, path: str, content: bytes | None, within_s: float) -> Reply:
-        url = self._server.base_url.rstrip("/") + path
+    async def _read(self, method: str, base: str, url: str, content: bytes | None) -> Reply:
         data, stream = bytearray(), Stream()
-        async with (
-            asyncio.timeout(within_s),  # of the whole attempt: a server may drip for ever
-            self._http.stream(method, url, content=content) as response,
-        ):
-            streamed = response.headers.get("content-type", "").startswith("text/event-stream")
-            async for chunk in response.aiter_raw():
+        async with self._session.request(
+            method,
+            URL(url, encoded=True),
+            data=content,
+            proxy=self._proxies[base],
+            allow_redirects=False,
+        ) as response:
+            streamed = response.content_type == "text/event-stream"
+            async for chunk in response.content.iter_any():
                 data += chunk
                 if len(data) > MOST_BYTES:
                     return Reply(fault=f"the answer is longer than {MOST_BYTES} bytes")
                 if streamed:
                     stream.take(chunk, time.perf_counter())
-        status = response.status_code
+        status = response.status
         if streamed and status == 200:
             if stream.fault:
                 return Reply(fault=self._shown(stream.fault), status=status, again=stream.again)
@@ -171,6 +166,14 @@ def _key(server: Server) -> str | None:
     if not (key.isascii() and key.isprintable()) or " " in key:
         raise UserError(f"the key in {server.key_env} holds characters that no key has; set it again")
     return key or None
+
+
+def _proxy(url: str) -> str | None:
+    """The HTTP proxy that the environment names for a URL, if any."""
+    parts, proxies = urlsplit(url), getproxies()
+    if proxy_bypass(parts.hostname or ""):
+        return None
+    return proxies.get(parts.scheme) or proxies.get("all")
 
 
 def _said(error: Exception) -> str:

@@ -1,0 +1,489 @@
+"""One model behind several servers: who is asked, who is set aside, and that no row depends on it."""
+
+import gc
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from evaluating import same_decisions, same_files, spec_of, with_ego
+from hypothesis import given
+from hypothesis import strategies as st
+from misbehaving import Asked, Play, Server, completion, serving
+from served import served
+
+from harness.backends.base import Request
+from harness.backends.cards import Card, Latency
+from harness.backends.openai import backend as openai_backend
+from harness.backends.openai import farm as openai_farm
+from harness.backends.openai.http import Client
+from harness.backends.servers import Kind
+from harness.backends.servers import Server as Where
+from harness.core import resources
+from harness.core.errors import UserError
+from harness.core.work import tidy
+from harness.dataset.load import Dataset
+from harness.evaluate.asking import Asker
+from harness.evaluate.latency import PAPER
+from harness.evaluate.run import evaluate
+from harness.evaluate.spec import Spec
+from harness.runs import folder
+
+ACTIONS = ("SLOWER", "IDLE", "FASTER")
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(openai_farm, "FIRST_WAIT_S", 0.02)
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+
+
+def card(*urls: str, kind: Kind = "generic", **server: Any) -> Card:
+    where = Where(urls, kind, **{"timeout_s": 20.0, "retries": 2, **server})
+    return Card("mine", "openai", "d", Latency("paper", None, "b"), "m", server=where)
+
+
+def request(name: str) -> Request:
+    return Request(name, "ego", ({"role": "user", "content": name},), ACTIONS, 64)
+
+
+def decisions(count: int, viewers: int = 4) -> list[Request]:
+    return [request(f"s{n}/v{v}") for n in range(count) for v in range(viewers)]
+
+
+def said_back(asked: Asked) -> None:
+    asked.reply(completion(asked.body["messages"][0]["content"]))
+
+
+def names(server: Server) -> list[str]:
+    return [asked.body["messages"][0]["content"] for asked in server.asked]
+
+
+def opened(*servers: Server, batch_size: int = 4, **options: Any) -> openai_backend.OpenAIBackend:
+    return openai_backend.open(card(*(there.url for there in servers), **options), batch_size=batch_size)
+
+
+# -- who is asked -------------------------------------------------------------------------------------------
+
+
+def test_requests_of_a_decision_go_to_one_server_and_each_server_has_some_decisions() -> None:
+    with serving(said_back) as one, serving(said_back) as other:
+        backend, asked = opened(one, other), decisions(24)
+        for start in range(0, len(asked), 4):  # so few at a time that no server lacks work for the other
+            done = backend.complete(asked[start : start + 4])
+            assert [c.text for c in done] == [r.id for r in asked[start : start + 4]]
+        again = [c.text for r in asked for c in backend.complete([r])]
+    assert again == [r.id for r in asked]
+    of_one, of_other = ({name.partition("/")[0] for name in names(there)} for there in (one, other))
+    assert not of_one & of_other
+    assert min(len(of_one), len(of_other)) >= 4
+    assert len(one.asked) + len(other.asked) == 2 * len(asked)
+
+
+def test_a_server_without_work_of_its_own_takes_from_the_other() -> None:
+    """All are of one decision; no answer comes before both servers have two."""
+    four = threading.Barrier(4)
+
+    def play(asked: Asked) -> None:
+        four.wait(timeout=20)
+        said_back(asked)
+
+    asked = [request(f"s/v{n}") for n in range(16)]
+    with serving(play) as one, serving(play) as other:
+        done = opened(one, other, batch_size=2).complete(asked)
+    assert [c.text for c in done] == [r.id for r in asked]
+    assert len(one.asked) == len(other.asked) == 8
+    assert {(c.batch_size, c.seconds, c.retries) for c in done} == {(2, None, 0)}
+
+
+def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -> None:
+    ports = set()
+
+    def play(asked: Asked) -> None:
+        ports.add(asked.handler.client_address)
+        said_back(asked)
+
+    before = threading.active_count()
+    with serving(play) as there:
+        backend = opened(there)
+        for _ in range(5):
+            backend.complete(decisions(4))
+        assert len(there.asked) == 80
+        assert len(ports) <= 4
+        del backend
+        gc.collect()
+    until_s = time.monotonic() + 20
+    while threading.active_count() > before and time.monotonic() < until_s:  # the server's end as these do
+        time.sleep(0.01)
+    assert threading.active_count() == before
+
+
+def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Dataset, tmp_path: Path) -> None:
+    """The first request is answered only when one of the second chunk has come."""
+    second = threading.Event()
+
+    def play(asked: Asked) -> None:
+        if asked.number == 0:
+            assert second.wait(20)
+        if asked.number >= 64:
+            second.set()
+        said_back(asked)
+
+    with serving(play) as there:
+        spec = replace(with_ego(spec_of(small), card=card(there.url)), batch_size=4)
+        backend, asked, counts = opened(there), decisions(32), []
+        asker = Asker(spec, lambda: backend, PAPER, tmp_path / "answers.jsonl", progress=counts.append)
+        asked += [request(f"t/v{v}") for v in range(3)]
+        asker.ask(asked)
+    assert list(asker.answers) == [r.id for r in asked]
+    assert sorted(counts) == [64, 67], "the last is too few to fill a batch, and goes with the others"
+    assert {a.batch_size for a in asker.answers.values()} == {4}
+
+
+def test_an_answer_that_had_company_has_no_time() -> None:
+    two = threading.Barrier(2)
+
+    def play(asked: Asked) -> None:
+        two.wait(timeout=20)
+        said_back(asked)
+
+    with serving(play) as there:
+        backend, done = opened(there), []
+        calls = [
+            threading.Thread(target=lambda name=name: done.extend(backend.complete([request(name)])))
+            for name in "ab"
+        ]
+        for call in calls:
+            call.start()
+        for call in calls:
+            call.join()
+    assert [(c.seconds, c.batch_size) for c in done] == [(None, 4), (None, 4)]
+
+
+@given(st.sets(st.integers(1, 65535), min_size=2, max_size=8), st.text(), st.data())
+def test_a_server_that_is_gone_moves_no_decision_but_its_own(
+    ports: set[int], decision: str, data: st.DataObject
+) -> None:
+    def ranked(urls: list[str]) -> list[str]:
+        where = Where(tuple(urls))
+        farm = openai_farm.Farm(Client(where), where, "mine", "m", 4)
+        return [place.url for place in farm._rank(decision)]
+
+    urls = [f"http://127.0.0.1:{port}/v1" for port in ports]
+    gone = data.draw(st.sampled_from(urls))
+    left = [url for url in urls if url != gone]
+    assert ranked(left) == ranked(left[::-1]) == [url for url in ranked(urls) if url != gone]
+
+
+# -- who is set aside ---------------------------------------------------------------------------------------
+
+
+def broken(asked: Asked) -> None:
+    asked.reply({"error": "out of memory"}, 503)
+
+
+def test_what_one_server_cannot_answer_another_does_at_once(capfd: pytest.CaptureFixture[str]) -> None:
+    """Three failures set it aside, so that it is asked no more."""
+    with serving(broken) as one, serving(said_back) as other:
+        asked = decisions(40)
+        done = opened(one, other, batch_size=1, retries=0).complete(asked)
+        url = one.url
+    assert [(c.text, c.retries, c.error) for c in done] == [(r.id, 0, None) for r in asked]
+    assert 3 <= len(one.asked) < 40, "three, and one each time that it is there again"
+    said = capfd.readouterr().err
+    assert f"harness: model 'mine': server {url} is set aside (HTTP 503: out of memory)\n" in said
+    assert f"server {url} is there again" in said or len(one.asked) == 3
+
+
+def test_a_server_that_recovers_is_asked_again() -> None:
+    down = threading.Event()
+    down.set()
+
+    def play(asked: Asked) -> None:
+        (broken if down.is_set() else said_back)(asked)
+
+    def listed(asked: Asked) -> None:
+        broken(asked) if down.is_set() and recovering.asked else asked.reply({"data": [{"id": "m"}]})
+
+    with serving(play, listed) as recovering, serving(
+        said_back, lambda asked: asked.reply({"data": [{"id": "m"}]})
+    ) as other:  # fmt: skip
+        backend = opened(recovering, other, batch_size=1)
+        backend.complete(decisions(10))
+        assert len(recovering.asked) == 3
+        down.clear()
+        until_s = time.monotonic() + 20
+        while len(recovering.asked) < 10 and time.monotonic() < until_s:
+            assert {c.error for c in backend.complete(decisions(10))} == {None}
+    assert len(recovering.asked) >= 10
+
+
+@pytest.mark.parametrize("entry", [{"id": "m", "root": "/other"}, None])
+def test_a_server_that_comes_back_with_another_model_ends_the_run(entry: Any) -> None:
+    def play(asked: Asked) -> None:
+        (broken if asked.number < 3 else said_back)(asked)
+
+    def listed(asked: Asked) -> None:
+        now = entry if there.asked else {"id": "m"}
+        asked.reply({"data": [now]} if now else b"no list")
+
+    with serving(play, listed) as there:
+        backend = opened(there, batch_size=1)
+        if entry is None:
+            match = (
+                r"no server is left: http://127\.0\.0\.1:\d+/v1 \(the answer is no JSON\); start one again"
+            )
+        else:
+            match = r"server http\S+ has id=m, and server http\S+ id=m root=/other; serve the same model"
+        with pytest.raises(UserError, match=match):
+            backend.complete(decisions(10))
+
+
+def test_a_request_that_no_server_can_answer_is_an_error_and_the_others_are_answered() -> None:
+    def play(asked: Asked) -> None:
+        (broken if names_of(asked) == "s3/v1" else said_back)(asked)
+
+    def names_of(asked: Asked) -> str:
+        return str(asked.body["messages"][0]["content"])
+
+    with serving(play) as one, serving(play) as other:
+        done = opened(one, other).complete(decisions(10))
+    errors = {c.request_id: c.error for c in done if c.error}
+    assert errors == {"s3/v1": "HTTP 503: out of memory"}
+    assert sum(name == "s3/v1" for there in (one, other) for name in names(there)) == 3
+
+
+def test_a_server_that_is_not_there_yet_is_waited_for(capfd: pytest.CaptureFixture[str]) -> None:
+    with serving(said_back) as gone:
+        url = gone.url
+    with serving(said_back) as there:
+        done = openai_backend.open(card(url, there.url), batch_size=4).complete(decisions(5))
+    assert {c.error for c in done} == {None}
+    assert f"server {url} is set aside (ClientConnectorError" in capfd.readouterr().err
+
+
+def test_a_server_is_looked_for_as_long_as_the_run_lasts() -> None:
+    pauses_s = [openai_farm.pause_s(times) for times in (0, 1, 2, 10, 5000)]
+    assert pauses_s == [0.02, 0.04, 0.08, 20.48, openai_farm.LONGEST_WAIT_S]
+
+
+def test_a_bug_is_a_crash_and_no_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bug(*_: Any) -> Any:
+        raise ZeroDivisionError
+
+    with serving(said_back) as there:
+        backend = opened(there)
+        monkeypatch.setattr(openai_backend, "body", bug)
+        with pytest.raises(ZeroDivisionError):
+            backend.complete(decisions(2))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Set-Cookie: \x1b[31m=;;=",
+        "Content-Type: ;;;",
+        "Content-Type: text/event-stream;=",
+        "X: " + "y" * 9000,
+    ],
+)
+def test_a_header_that_is_none_says_nothing_on_the_terminal(
+    header: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = json.dumps(completion("a")).encode()
+
+    def play(asked: Asked) -> None:
+        asked.raw(
+            b"HTTP/1.1 200 OK\r\n%b\r\nContent-Length: %d\r\n\r\n%b" % (header.encode(), len(data), data)
+        )
+
+    with serving(play) as there:
+        [done] = opened(there).complete(decisions(1, 1))
+    assert done.text == "a" or done.error
+    assert caplog.records == []
+
+
+# -- the same model -----------------------------------------------------------------------------------------
+
+
+def lists(entry: Any, version: str | None = None) -> Play:
+    def listed(asked: Asked) -> None:
+        asked.reply({"version": version} if asked.path == "/version" else {"data": [entry]})
+
+    return listed
+
+
+@pytest.mark.parametrize(
+    ("entries", "versions", "said"),
+    [
+        (({"id": "m", "max_model_len": 1}, {"id": "m", "max_model_len": 2}), ("1", "1"),
+         "has id=m max_model_len=1 version=1, and server {1} id=m max_model_len=2 version=1; serve the same"),
+        (({"id": "m"}, {"id": "m"}), ("1", "2"),
+         "server {0} has id=m version=1, and server {1} id=m version=2; serve the same model, by the same"),
+        (({"id": "m"}, "m"), ("1", "1"), "server {1} lists no m at {1}/models"),
+    ],
+)  # fmt: skip
+def test_servers_with_different_models_are_one_line_that_names_two(
+    entries: Any, versions: Any, said: str
+) -> None:
+    with ExitStack() as stack:
+        there = [
+            stack.enter_context(serving(said_back, lists(*each)))
+            for each in zip(entries, versions, strict=True)
+        ]
+        with pytest.raises(UserError) as caught:
+            opened(*there, kind="vllm")
+        assert said.format(*(server.url for server in there)) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
+    with (
+        serving(said_back, lists({"id": "m"}, "1")) as one,
+        serving(said_back, lists({"id": "m"}, "1")) as other,
+    ):
+        identities = [opened(*there, kind="vllm").identity() for there in ((one,), (other, one))]
+    expected = {"engine": "openai", "server": "vllm", "model": "m", "listed": {"id": "m"}, "version": "1"}
+    assert identities == [expected, expected]
+
+
+# -- whole runs ---------------------------------------------------------------------------------------------
+
+
+def served_spec(small: Dataset, *urls: str) -> Spec:
+    """An evaluation of a card that names another server, at these."""
+    mine = replace(card("http://127.0.0.1:9/v1"), server=Where("http://127.0.0.1:9/v1", retries=2))
+    return replace(with_ego(spec_of(small), card=mine), servers=urls, batch_size=4)
+
+
+def evaluated(spec: Spec, out: Path) -> Path:
+    done = evaluate(spec, out, lambda done: None)
+    tidy(out)
+    return done.out
+
+
+@pytest.fixture(scope="module")
+def whole(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of one server that nobody kills."""
+    with served() as url:
+        return evaluated(served_spec(small, url), tmp_path_factory.mktemp("served") / "whole")
+
+
+@pytest.mark.parametrize("answers", [0, 1, 40])
+def test_a_server_killed_in_mid_run_loses_nothing(
+    whole: Path, small: Dataset, tmp_path: Path, answers: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its process ends when it is asked for one more; of what it had then, each is answered elsewhere."""
+    with served(answers) as one, served() as other:
+        out = evaluated(served_spec(small, one, other), tmp_path / "run")
+    assert f"server {one} is set aside" in capfd.readouterr().err
+    assert same_files(out, whole)
+    ids = [answer.id for answer in folder.read(out).answers]
+    assert len(ids) == len(set(ids)) > 150
+    manifest = folder.read(out).manifest
+    assert (manifest.engine_errors, manifest.retries) == (0, 0)
+    assert f"--server {one} --server {other}" in manifest.command
+
+
+def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
+    whole: Path, small: Dataset, tmp_path: Path
+) -> None:
+    with served(40) as one, served(30) as other, pytest.raises(UserError) as caught:
+        evaluated(served_spec(small, one, other), tmp_path / "run")
+    said = str(caught.value)
+    assert f"model 'mine': no server is left: {one} (" in said
+    assert "start one again, and the same command goes on" in said
+    assert "\n" not in said
+    with served() as url:
+        assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
+
+
+def test_an_answer_of_one_server_is_kept_for_all(small: Dataset, whole: Path, tmp_path: Path) -> None:
+    """The second run has other servers, of which none is asked anything."""
+    for answers in (None, 0):
+        with served(answers) as url, served(answers) as beside:
+            spec, out = served_spec(small, url, beside), tmp_path / f"run-{answers}"
+            done = evaluate(spec, out, lambda done: None, tmp_path / "kept")
+    assert done.manifest.cached_answers == len(folder.read(whole).answers)
+    assert same_decisions(done.out, whole)
+
+
+def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: Path) -> None:
+    """Each answer takes a minute."""
+
+    def play(asked: Asked) -> None:
+        came.set()
+        time.sleep(60)
+
+    came = threading.Event()
+    with serving(play) as there:
+        command = [sys.executable, "-m", "harness", "eval", "--model", "mine", "--server", there.url]
+        command += ["--dataset", str(small_path), "--no-cache", "--out", "run"]
+        with subprocess.Popen(command, cwd=project, stderr=subprocess.PIPE, text=True) as process:
+            assert came.wait(60)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert f"goes on: harness eval --model mine --server {there.url}" in err
+
+
+# -- what is typed ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / resources.MARKER).touch()
+    (tmp_path / "models").mkdir()
+    for name in ("mine", "another"):
+        (tmp_path / f"models/{name}.toml").write_text(
+            'engine = "openai"\ndescription = "d"\nweights = "m"\n[server]\nbase_url = "http://127.0.0.1:9/v1"\n'
+            f'[latency]\nsource = "paper"\nbasis = "{name}"\n'
+        )
+    return tmp_path
+
+
+Typed = Callable[..., tuple[int, str, str]]
+
+
+def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, small_path: Path) -> None:
+    with served() as one, served() as other:
+        options = ("--model", "mine", "--server", one, "--server", other + "/", "--no-cache")
+        code, _, err = harness("eval", *options, "--dataset", small_path, "--limit", "2", "--out", "run")
+        assert (code, err) == (0, "")
+        code, _, err = harness("drive", *options, "--episodes", "1", "--seeds", "0:1", "--out", "driven")
+        assert (code, err) == (0, "")
+    manifest = json.loads((project / "run/run.json").read_text())
+    assert manifest["model"]["server"]["base_url"] == "http://127.0.0.1:9/v1", "the card's own"
+    assert manifest["identity"]["listed"] == {"id": "m", "owned_by": "tests"}
+    assert manifest["engine_errors"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--model", "proxy", "--server", "http://a/v1"],
+         "--server: proxy is asked at none; leave it out, and give base_url in a card"),
+        (["--model", "mine", "--helper-model", "another", "--server", "http://a/v1"],
+         "--server: another and mine are asked at servers of their own; leave it out"),
+        (["--model", "mine", "--server", "http://me:5ecret@a/v1"], "--server: base_url holds credentials"),
+        (["--model", "mine", "--server", "http://a/v1", "--server", "http://a/v1/"],
+         "--server: base_url names a server twice"),
+    ],
+)  # fmt: skip
+def test_servers_that_cannot_be_are_one_line(
+    harness: Typed, project: Path, small_path: Path, options: list[str], said: str
+) -> None:
+    code, _, err = harness("eval", *options, "--dataset", small_path, "--out", "run")
+    assert code == 2
+    assert err.startswith(f"harness: {said}")
+    assert err.count("\n") == 1
+    assert "5ecret" not in err
