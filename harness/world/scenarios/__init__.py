@@ -5,6 +5,7 @@ Other packages add theirs by an entry point of the group `swarmdrive.scenarios`;
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pkgutil import iter_modules
@@ -99,5 +100,6 @@ def restore(name: str, parameters: Parameters) -> Scenario:
     return replace(get(name), parameters=parameters)
 
 
-def _files() -> set[str]:
-    return {module.name.replace("_", "-") for module in iter_modules(__path__)}
+@cache  # asked for every answer of the proxy
+def _files() -> frozenset[str]:
+    return frozenset(module.name.replace("_", "-") for module in iter_modules(__path__))
