@@ -69,7 +69,8 @@ def row(scenario: Scenario, layouts: int, at_once: int) -> dict[str, float]:
     """What a scenario's frames and trees cost in each way, and in how many frames any two ways differ."""
     same = [frames_of(scenario, range(n, min(n + at_once, layouts))) for n in range(0, layouts, at_once)]
     alone_s, together_s, frames, differ = np.sum(same, axis=0).tolist()
-    fleet = lockstep._Fleet(lockstep._lanes(scenario.road), started(scenario, range(at_once)))  # type: ignore[arg-type]
+    still = [World.start(scenario, FIRST_SEED + n) for n in range(at_once)]
+    fleet = lockstep._Fleet(lockstep._lanes(scenario.road), still)  # type: ignore[arg-type]
     return {
         "plain_us": plain_us(scenario), "alone_us": alone_s * 1e6 / frames,
         "together_us": together_s * 1e6 / frames, "frame_us": step_us(fleet, at_once),
