@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from harness.core import extras
 from harness.core.errors import Unfinished, UserError
 from harness.core.parallel import TRIES, Ray, each, spread, workers_of
 
@@ -91,6 +92,14 @@ def test_an_error_of_the_works_own_is_raised_and_never_tried_again(workers: int,
     with pytest.raises(UserError, match="item 1 is wrong"):
         spread(partial(fail_at, tmp_path, 1), range(9), workers, lambda done: None)
     assert len(list(tmp_path.glob("1-*"))) == 1
+
+
+def test_without_ray_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda module: None)
+    with pytest.raises(
+        UserError, match=r"^--workers ray needs ray, .*; run `pip install 'swarmdrive-harness\[ray\]'`$"
+    ):
+        spread(squared, [1], Ray(), lambda done: None)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from harness.core.shards import Shard, shard_of
 
 Typed = Callable[..., tuple[int, str, str]]
 DRIVE = ("drive", "--model", "cruise", "--episodes", "20", "--seeds", "0", "--workers", "1", "--quiet")
-BUILD = ("dataset", "build", "occluded-intersection", "--episodes", "2", "--seed", "100", "--workers", "1")
+BUILD = ("dataset", "build", "parking-exit", "--episodes", "2", "--seed", "100", "--workers", "1")
 TIMES = ("name", "created", "command")
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,6 +27,7 @@ DEAD = (
     exceptions.TaskUnschedulableError,  # on a node that is gone
 )
 AHEAD = 2  # items given for each core, so that none waits
+REACHED_S = 10.0  # by when a cluster answers
 COUNT_S = 2.0  # after which cores are counted again: nodes come and go
 
 
@@ -100,17 +102,20 @@ def _connect(address: str | None) -> None:
     """Connect this process to a cluster, once."""
     if ray.is_initialized():
         return
+    there = address or os.environ.get("RAY_ADDRESS")
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if address is None:
+    if not there:
         quiet["include_dashboard"] = False
     try:
+        if there and ":" in there:  # where nobody listens, Ray would end this process
+            host, _, port = there.rpartition("/")[2].rpartition(":")
+            socket.create_connection((host.strip("[]"), int(port)), REACHED_S).close()
         ray.init(address=address, **quiet)
     # Among them: another Ray or another Python than the cluster's.
     except (OSError, RuntimeError, ValueError, ImportError) as error:
-        where = address or os.environ.get("RAY_ADDRESS", "this machine")
         raise UserError(
-            f"--workers ray: no cluster at {printable(where)} ({printable(error)}); start one with "
-            "`ray start --head`, and give its address"
+            f"--workers ray: no cluster at {printable(there or 'this machine')} ({printable(error)}); start "
+            "one with `ray start --head`, and give its address"
         ) from None
 
 
@@ -118,12 +123,14 @@ def _got(task: Any) -> tuple[str, str, Any] | None:
     """A node's id, its name and a task's result; None where a worker or a node died."""
     try:
         found: tuple[str, str, Any] = ray.get(task)
-    except exceptions.RayTaskError as error:
-        raise error.cause from error
     except DEAD:
         return None
     except exceptions.RayError as error:
-        raise UserError(f"--workers ray: {printable(error)}; mend the cluster, or use processes") from None
+        cause = getattr(error, "cause", None)
+        if isinstance(cause, Exception) and not isinstance(cause, exceptions.RayError):
+            raise cause from error
+        said = printable(str(cause or error).partition("\n")[0])  # such as a package that a node lacks
+        raise UserError(f"--workers ray: {said}; mend the cluster's nodes, or use processes") from None
     return found
 
 
