@@ -26,7 +26,6 @@ DEAD = (
     exceptions.ObjectLostError,
     exceptions.TaskUnschedulableError,  # on a node that is gone
 )
-AHEAD = 2  # items given for each core, so that none waits
 REACHED_S = 10.0  # by when a cluster answers
 COUNT_S = 2.0  # after which cores are counted again: nodes come and go
 
@@ -55,7 +54,7 @@ class Tasks:
         if time.monotonic() >= self._counted_s + COUNT_S:
             self._cores = max(1, int(ray.cluster_resources().get("CPU", 1)))
             self._counted_s = time.monotonic()
-        return len(self._busy) < AHEAD * self._cores
+        return len(self._busy) < self._cores  # one that waits for a node could run on another by then
 
     def give(self, place: int, item: Any) -> None:
         self._busy[self._run.remote(self._work, item)] = place, item
