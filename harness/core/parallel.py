@@ -92,7 +92,7 @@ def each(
         Unfinished: some items' workers died `TRIES` times; all other items are taken.
     """
     given = list(items)
-    if workers == 1:
+    if workers == 1 or not given:
         for place, item in enumerate(given):
             took(place, work(item))
         return

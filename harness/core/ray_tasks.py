@@ -2,7 +2,9 @@
 
 import logging
 import os
+import signal
 import socket
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -54,7 +56,7 @@ class Tasks:
         if time.monotonic() >= self._counted_s + COUNT_S:
             self._cores = max(1, int(ray.cluster_resources().get("CPU", 1)))
             self._counted_s = time.monotonic()
-        return len(self._busy) < self._cores  # one that waits for a node could run on another by then
+        return len(self._busy) < 2 * self._cores  # so that a core that is free has one at once
 
     def give(self, place: int, item: Any) -> None:
         self._busy[self._run.remote(self._work, item)] = place, item
@@ -109,7 +111,10 @@ def _connect(address: str | None) -> None:
         if there and ":" in there:  # where nobody listens, Ray would end this process
             host, _, port = there.rpartition("/")[2].rpartition(":")
             socket.create_connection((host.strip("[]"), int(port)), REACHED_S).close()
+        before = signal.getsignal(signal.SIGTERM)
         ray.init(address=address, **quiet)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray takes it, and would end without a word
     # Among them: another Ray or another Python than the cluster's.
     except (OSError, RuntimeError, ValueError, ImportError) as error:
         raise UserError(

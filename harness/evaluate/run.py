@@ -163,6 +163,8 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     chunks = _chunks_of(begun[0].settings)
     of = {_part_of(chunk): chunk for chunk in chunks}
     parts = shards.owners(folders, begun, list(of), lambda part: _named(of[part]))
+    if (out / "run.json").exists() and (out / WORK).is_dir():
+        return _finished(begun[0].settings, out)
     _refuse_finished(out)
     tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
     created = min(each.created for each in begun)
@@ -384,9 +386,13 @@ def made(
 
 def finished(spec: Spec, out: Path) -> Evaluated:
     """The run that is there already. Raises UserError if it is another run, or damaged."""
+    return _finished(spec.settings(), out)
+
+
+def _finished(settings: Mapping[str, Any], out: Path) -> Evaluated:
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    work.same(out, _compared(spec.settings()), _compared({key: stored[key] for key in spec.settings()}))
+    work.same(out, _compared(settings), _compared({key: stored[key] for key in settings}))
     return Evaluated(out, run.manifest, run.scores)
 
 
