@@ -111,6 +111,9 @@ def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Type
     assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html"}
     code, _, said = harness("merge", *shards, "--out", "merged")
     assert (code, "already holds a finished run" in said) == (2, True)
+    (merged / ".work").mkdir()  # killed while it tidied up
+    assert harness("merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
+    assert not (merged / ".work").exists()
 
 
 def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed, tmp_path: Path) -> None:
