@@ -17,7 +17,7 @@ from harness.core.files import alone
 from harness.core.shards import Shard, shard_of
 
 Typed = Callable[..., tuple[int, str, str]]
-DRIVE = ("drive", "--model", "cruise", "--episodes", "20", "--seeds", "0", "--workers", "1", "--quiet")
+DRIVE = ("drive", "--model", "cruise", "--episodes", "36", "--seeds", "0", "--workers", "1", "--quiet")
 BUILD = ("dataset", "build", "parking-exit", "--episodes", "2", "--seed", "100", "--workers", "1")
 TIMES = ("name", "created", "command")
 
@@ -121,7 +121,7 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed
     code, out, _ = harness(*DRIVE[:-1], "--shard", "2/3", "--out", shard)
     assert code == 0
     assert out == (
-        f"wrote {shard}: 8 of 20 episodes, shard 2/3; put together all 3 with "
+        f"wrote {shard}: 16 of 36 episodes, shard 2/3; put together all 3 with "
         "`harness merge FOLDER... --out FOLDER`\n"
     )
     for other in (["--shard", "1/3"], []):
@@ -142,7 +142,7 @@ def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
     assert "shards 2/3 are missing; give the folders of all 3" in refused(harness, [shards[0], shards[2]])
     shutil.rmtree(next((shards[1] / ".work").glob("episodes-*")))
     said = refused(harness, shards)
-    assert re.search(r"/2, shard 2/3, lacks episodes 8 to 15 and 0 parts more; type its command again", said)
+    assert re.search(r"/2, shard 2/3, lacks episodes 16 to 31 and 0 parts more; type its command again", said)
 
 
 def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
@@ -150,11 +150,11 @@ def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
 ) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
     shutil.copytree(shards[1], tmp_path / "again")
-    file = tmp_path / "again/.work/episodes-000008/episodes.csv"
+    file = tmp_path / "again/.work/episodes-000016/episodes.csv"
     text = file.read_text()
     file.write_text(text.replace("True", "False"))
     assert re.search(
-        r"episodes 8 to 15 came out otherwise in \S*/again than in \S*/2; find out which is right",
+        r"episodes 16 to 31 came out otherwise in \S*/again than in \S*/2; find out which is right",
         refused(harness, [*shards, tmp_path / "again"]),
     )
     file.write_text(text)
