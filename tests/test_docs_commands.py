@@ -27,8 +27,12 @@ READER_HAS = {
     "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
 }
 
-# Added to what is typed, where it would take minutes; of an option given twice the last one counts.
+# Added to what is typed, where it would take minutes; of an option given twice the last one counts. A whole
+# line has its own, or its command's.
+SHARD = "--episodes 17 --seeds 0 --workers 1"  # the fewest of which there are two
 CUT = {
+    "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
+    "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
     "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
@@ -72,6 +76,7 @@ OTHER_PROGRAMS = {
     "make": "CI runs it",
     "source": "the tests are in an environment already",
     "pip": "as above",
+    "ray": "starts a cluster; tests/test_ray.py has one of its own",
     "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
@@ -112,7 +117,7 @@ def test_a_page_can_be_followed(
                 COMMANDS[path].make_context(path, rest)
             elif program == "harness":
                 path, _ = parsed(args)
-                code, _, err = harness(*args, *CUT.get(path, "").split())
+                code, _, err = harness(*args, *CUT.get(command, CUT.get(path, "")).split())
                 if lacks := re.search(r"needs (\S+), which is not installed", err):
                     pytest.skip(f"followed up to here: {line} needs {lacks[1]}")
                 # A page that shows `echo $?` says how the line before it ends.
@@ -128,7 +133,7 @@ def test_what_is_excused_is_still_in_the_documents() -> None:
     lines = {shlex.join(shlex.split(line, comments=True)) for line in all_typed()}
     assert {*NOT_RUN, *CUT_ENDS} <= lines
     assert set(OTHER_PROGRAMS) <= {line.split()[0] for line in lines}
-    assert set(CUT) <= set(COMMANDS)
+    assert set(CUT) <= {*COMMANDS, *lines}
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)

@@ -11,7 +11,6 @@ import pytest
 from harness.core import work
 from harness.core.errors import UserError
 from harness.core.files import alone, replacing, write_whole
-from harness.core.parallel import spread
 
 BEGUN = work.Begun(settings={"seed": 1})
 
@@ -139,15 +138,6 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 def _until_gone(pid: int) -> None:
     while Path(f"/proc/{pid}").exists():
         pass
-
-
-def die(number: int) -> None:
-    os._exit(number)
-
-
-def test_a_worker_that_is_killed_is_one_line() -> None:
-    with pytest.raises(UserError, match="a worker process was killed, perhaps because memory ran out"):
-        spread(die, [9, 9], 2, lambda done: None)
 
 
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:

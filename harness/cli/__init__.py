@@ -23,6 +23,7 @@ PANELS = {
     "Evaluate": (
         "eval",
         "drive",
+        "merge",
         "grid",
         "sweep",
         "schedule",
@@ -111,19 +112,15 @@ def _typed() -> None:
     try:
         sys.exit(program(standalone_mode=False))
     except UserError as error:
-        _fail(str(error))
+        _fail(_noted(str(error), error))
     except ModuleNotFoundError as error:
         if (lack := extras.OPTIONAL.get((error.name or "").partition(".")[0])) is None:
             raise
         _fail(str(extras.without("this command", *lack)))
     except shell.Stopped as stopped:
         terminated = isinstance(stopped.__cause__, _Terminated)
-        said = ["terminated" if terminated else "interrupted", *getattr(stopped.__cause__, "__notes__", ())]
-        if len(said) > 1:
-            said.append(
-                f"the same command goes on: {printable(shlex.join(['harness', *sys.argv[1:]]), 2000)}"
-            )
-        _fail("; ".join(said), 143 if terminated else 130)
+        said = _noted("terminated" if terminated else "interrupted", stopped.__cause__)
+        _fail(said, 143 if terminated else 130)
     except _UsageError as error:
         message, context = error.format_message(), error.ctx
         if message.startswith("Usage:"):  # a group without a command shows its help
@@ -132,6 +129,15 @@ def _typed() -> None:
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message, 300)} in `{typed}`; see `{path} --help`")
+
+
+def _noted(said: str, error: BaseException | None) -> str:
+    """What is said of an error, with its notes of what is kept, and how to go on from there."""
+    notes = getattr(error, "__notes__", ())
+    if not notes:
+        return said
+    typed = printable(shlex.join(["harness", *sys.argv[1:]]), 2000)
+    return "; ".join((said, *notes, f"the same command goes on: {typed}"))
 
 
 def _terminate(number: int, frame: object) -> None:

@@ -69,7 +69,7 @@ def closed_loop(
     episodes: int = typer.Option(300, help="Layouts, each driven under every grid point and seed."),
     first_seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
     seeds: options.Seeds = "0:5",
-    workers: options.ModelWorkers = 2,
+    workers: options.ModelWorkers = "2",
     batch_size: options.BatchSize = 8,
     latency: options.Latency = None,
     out: Path | None = typer.Option(None, help="Folder; a study that was stopped there continues."),
@@ -89,7 +89,7 @@ def closed_loop(
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
-    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    who = options.workers_of(workers)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(
         Agent(cards.resolve(model), versions.load(prompt), answer),
@@ -102,7 +102,7 @@ def closed_loop(
     where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
     silent = as_json or quiet
     with bar("layouts", episodes, silent) as progress:
-        summary = run_closed_loop(spec, where, workers, progress, default_file())
+        summary = run_closed_loop(spec, where, who, progress, default_file())
     if as_json:
         typer.echo(summary.to_json(orient="records"))
     if not silent:

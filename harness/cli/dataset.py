@@ -31,16 +31,17 @@ def build(
     env_config: options.EnvConfig = None,
     episodes: int = typer.Option(200, help="Episodes."),
     seed: options.FirstSeed = 0,
-    workers: options.Workers = 2,
+    workers: options.Workers = "2",
     lag: float | None = typer.Option(
         None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
     ),
     audit: bool = typer.Option(True, help="Audit 100 layouts or more for tells, on the dataset's card."),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
+    shard: options.Shard = None,
 ) -> None:
     """Freeze every course of some layouts. The same command again continues a build that was stopped."""
     name = options.scenario_name(name, env, env_config)
-    scenario = ready_to_drive(name, episodes, seed, workers)
+    scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     if lag is not None:
         period_s = scenario.parameters.decision_period_s
         if not 0 <= lag < period_s:
@@ -48,9 +49,13 @@ def build(
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
 
-    begun_s = time.monotonic()
-    with bar(f"freezing {printable(name, 30)}", episodes) as progress:
-        manifest = build_dataset(scenario, out, episodes, seed, workers, progress, audit, progress.more)
+    begun_s, part = time.monotonic(), options.shard_of(shard)
+    mine = len(part.part(range(episodes))) if part else episodes
+    with bar(f"freezing {printable(name, 30)}", mine) as progress:
+        manifest = build_dataset(scenario, out, episodes, seed, who, progress, audit, progress.more, part)
+    if part:
+        options.say_shard(part, out, f"{mine} of {episodes} layouts")
+        return
     typer.echo(
         f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points, in "
         f"{time.monotonic() - begun_s:.0f} s"
@@ -124,17 +129,17 @@ def show(
 
 
 @app.command("rank")
-def rank_drivers(dataset: Dataset, workers: options.Workers = 2, as_json: options.Json = False) -> None:
+def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
     """Compare the reference drivers' frozen and closed-loop success. Both are on the same episodes."""
     from harness.dataset import load
 
-    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    who = options.workers_of(workers)
     data = load.load(load.find(dataset))
     from harness.studies.rank import rank
 
     episodes = data.manifest.episodes
     with bar(f"driving {printable(data.name, 30)}", episodes) as progress:
-        standings = rank(data, workers, progress)
+        standings = rank(data, who, progress)
     if as_json:
         echo_json(_as_mapping(data.name, episodes, standings))
     else:

@@ -32,7 +32,7 @@ def command(
     batch: int = typer.Option(BATCH, help="Sequences a step."),
     device: str = typer.Option("cpu", help="cpu or cuda."),
     threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
-    workers: options.Workers = 2,
+    workers: options.Workers = "2",
 ) -> None:
     """Train a small Qwen3 in some scenarios. The same command again continues training that was stopped.
 
@@ -50,7 +50,7 @@ def command(
             "model that `harness distill` made"
         )
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
-    driven = [ready_to_drive(name, layouts, first_seed, workers) for name in dict.fromkeys(scenario)]
+    driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
         raise UserError(
             f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train seeds "
@@ -83,7 +83,7 @@ def command(
 
         facts = run(
             Curriculum(learnt, layouts, first_seed, base), plan, out, progress, show, device_of(device),
-            threads, workers,
+            threads, options.workers_of(workers),
         )  # fmt: skip
     for apart in facts["held_out"]:
         typer.echo(

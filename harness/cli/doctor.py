@@ -72,7 +72,7 @@ def look(gpu: bool) -> dict[str, Any]:
     from harness.backends.cache import default_file
     from harness.backends.counters import counters
     from harness.backends.transformers.engine import gpus
-    from harness.evaluate.spec import versions
+    from harness.core.versions import versions
 
     models: list[dict[str, Any]] = []
     for name in cards.names():

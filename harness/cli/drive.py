@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -14,6 +14,10 @@ from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.resources import folder
 from harness.core.seeds import purpose, stated
+
+if TYPE_CHECKING:
+    from harness.evaluate.run import Evaluated
+    from harness.runs.records import ClosedLoop
 
 ALL = "all"
 COLUMNS = (
@@ -53,13 +57,14 @@ def command(
     helper_thinking: options.HelperThinking = None,
     batch_size: options.BatchSize = 8,
     server: options.Servers = None,
-    workers: options.ModelWorkers = 2,
+    workers: options.ModelWorkers = "2",
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
     device_profile: options.DeviceProfile = None,
     device_model: options.DeviceModel = None,
     out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
+    shard: options.Shard = None,
     save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
     no_cache: options.NoCache = False,
     tag: options.Tags = None,
@@ -72,7 +77,7 @@ def command(
     from harness.coordination.operating_point import POINTS
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.evaluate.live_world import LiveSource
-    from harness.evaluate.run import evaluate
+    from harness.evaluate.run import evaluate, evaluate_shard
     from harness.evaluate.spec import Spec
     from harness.world.environments.examination import examine
     from harness.world.scenarios import DEFAULT
@@ -86,7 +91,9 @@ def command(
     options.in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     options.in_range("--first-seed", first_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
-    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    who, part = options.workers_of(workers), options.shard_of(shard)
+    if part and (out is None or save_video):
+        raise UserError(f"--shard {part}: give --out, a folder of its own, and --save-video to no shard")
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
@@ -120,11 +127,17 @@ def command(
         device_model=device_model,
         tags=tuple(dict.fromkeys(tag or ())),
     )
-    where = out or default_out(spec)
     silent = as_json or quiet
+    if part and out:
+        with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
+            mine = evaluate_shard(spec, out, part, progress, progress.more, who)
+        if not silent:
+            options.say_shard(part, out, f"{mine} of {driven} episodes")
+        return
+    where = out or default_out(spec)
     with bar(f"driving {printable(spec.ego.card.name, 30)}", driven, silent) as progress:
         cache = None if no_cache else default_file()
-        done = evaluate(spec, where, progress, cache, workers=workers)
+        done = evaluate(spec, where, progress, cache, workers=who)
     # They draw with matplotlib, which no episode waits for.
     from harness.cli.report import write
     from harness.cli.video import write_failures
@@ -133,22 +146,31 @@ def command(
         page = write([where], quiet=silent)
         videos = write_failures(where, save_video, silent) if save_video else []
     work.tidy(where)
-    if as_json:
-        echo_json(as_mapping(done))
+    tell(done, as_json, quiet)
     if silent:
         return
-    notes = (
-        f"n = {driven} episodes × {len(spec.seeds)} channel seeds; "
-        f"{'of ' if sample else ''}{stated(first_seed, episodes)};\n"
-        "intervals over episodes; missed: decisions that outlast the window;\n"
-        "gap: the least; clear: seconds to clear, where the ego did; both are means",
-    )
-    show(done, "closed loop", COLUMNS, notes)
     if videos:
         typer.echo(f"wrote {where / 'videos'}: {', '.join(video.name for video in videos)}")
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {page}")
+
+
+def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
+    """Print a closed-loop run."""
+    if as_json:
+        echo_json(as_mapping(done))
+    if as_json or quiet:
+        return
+    world = cast("ClosedLoop", done.manifest.world)
+    of = world.selection.get("of")
+    notes = (
+        f"n = {world.episodes} episodes × {len(done.manifest.seeds)} channel seeds; "
+        f"{'of ' if of else ''}{stated(world.first_seed, of or world.episodes)};\n"
+        "intervals over episodes; missed: decisions that outlast the window;\n"
+        "gap: the least; clear: seconds to clear, where the ego did; both are means",
+    )
+    show(done, "closed loop", COLUMNS, notes)
 
 
 def _shipped(scenario: str, otherwise: str) -> dict[str, Any]:

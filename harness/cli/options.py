@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from typer import Argument, Option
+from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable, unknown
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
     from harness.backends.base import AnswerMode
     from harness.coordination.operating_point import OperatingPoint
+    from harness.core import parallel, shards
     from harness.evaluate.agent import ImageMode
 else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
 
 MOST_SEEDS = 1000
-MOST_WORKERS = 256
 
 Runs = Annotated[list[Path], Argument(help="Folders of finished runs.", metavar="RUN...")]
 Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds them.")]
@@ -73,12 +73,27 @@ HelperThinking = Annotated[
     Option("--helper-thinking/--no-helper-thinking", help="Ask helpers to think first. Default: as the ego."),
 ]
 BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
-Workers = Annotated[int, Option(help="Processes.")]
-ModelWorkers = Annotated[int, Option(help="Processes, each with the model loaded.")]
 Servers = Annotated[
     list[str] | None,
     Option(
         "--server", help="Base URL of a served model, in place of its card's. Repeatable: any may answer."
+    ),
+]
+Workers = Annotated[
+    str, Option(metavar="WHO", help="Processes; or a Ray cluster: ray, ray://HOST:PORT, ray:HOST:PORT.")
+]
+ModelWorkers = Annotated[
+    str,
+    Option(
+        metavar="WHO",
+        help="Processes, each with the model loaded; or a Ray cluster: ray, ray://HOST:PORT, ray:HOST:PORT.",
+    ),
+]
+Shard = Annotated[
+    str | None,
+    Option(
+        metavar="I/N",
+        help="Do part I of N, for `harness merge`; auto/N: that of this task of a Slurm or Kubernetes job.",
     ),
 ]
 Device = Annotated[str | None, Option(help="cpu or cuda.")]
@@ -173,6 +188,28 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
             f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
         ) from None
     return environment.named(env, changes)
+
+
+def workers_of(text: str) -> "parallel.Workers":
+    """Who `--workers` names. Raises UserError where it names nobody."""
+    from harness.core.parallel import workers_of
+
+    return workers_of(text)
+
+
+def shard_of(text: str | None) -> "shards.Shard | None":
+    """The shard that `--shard` names; None where it is not given."""
+    from harness.core.shards import shard_of
+
+    return None if text is None else shard_of(text)
+
+
+def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
+    """Say that a shard is done, and what is done with it."""
+    echo(
+        f"wrote {printable(out)}: {what}, shard {shard}; put together all {shard.of} with "
+        "`harness merge FOLDER... --out FOLDER`"
+    )
 
 
 def in_range(option: str, value: int, least: int, most: int) -> None:

@@ -122,7 +122,7 @@ def examples(
     from harness.prompts.examples import EXAMPLES, text_of
 
     extras.need("harness prompt examples", "highway_env")
-    draft, of = prompts.load(version), ready_to_drive(scenario, count, first_seed, 1, "--count")
+    draft, of = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
     file = resources.find("prompts", version) / EXAMPLES
     if draft.released:
         raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")

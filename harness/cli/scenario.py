@@ -61,15 +61,15 @@ def check(
     name: options.Scenario,
     episodes: int = typer.Option(500, help="Episodes to drive, each by every driver."),
     seed: options.FirstSeed = 0,
-    workers: options.Workers = 2,
+    workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
     """Drive the reference drivers and show how episodes end. All drive the same episodes."""
-    scenario = ready_to_drive(name, episodes, seed, workers)
+    scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import reference as live
 
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
-        outcomes = live.check(scenario, episodes, seed, workers, progress)
+        outcomes = live.check(scenario, episodes, seed, who, progress)
     if as_json:
         echo_json(_as_mapping(name, episodes, seed, outcomes))
     else:
@@ -81,17 +81,17 @@ def audit(
     name: options.Scenario,
     layouts: int = typer.Option(300, help="Layouts to look at."),
     seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
-    workers: options.Workers = 2,
+    workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
     """Try to tell the hidden danger from what the ego sees. Exit code 1 if that can be done."""
-    scenario = ready_to_drive(name, layouts, seed, workers, "--layouts")
+    scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
     if scenario.start:
         raise UserError(f"{printable(name)} is an environment, of which no danger is known: nothing to audit")
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:
-        found = run(scenario, layouts, seed, progress, workers)
+        found = run(scenario, layouts, seed, progress, who)
     if as_json:
         echo_json({
             "scenario": name, "layouts": layouts, "seed": seed, "steps": found.steps, "tells": found.tells,
@@ -104,9 +104,7 @@ def audit(
         raise typer.Exit(1)
 
 
-def ready_to_drive(
-    name: str, episodes: int, seed: int, workers: int, counted: str = "--episodes"
-) -> "Scenario":
+def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
     """The scenario. Raises UserError if there is none, or where those layouts cannot be driven together."""
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
@@ -114,7 +112,6 @@ def ready_to_drive(
     scenario = scenarios.get(name)
     options.in_range(counted, episodes, 1, LAST_EPISODE + 1)
     options.in_range("--seed", seed, 0, LAST_SEED)
-    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
     purpose(seed, episodes)
     return scenario
 

@@ -35,7 +35,7 @@ def command(
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     batch_size: options.BatchSize = 8,
-    workers: options.ModelWorkers = 2,
+    workers: options.ModelWorkers = "2",
     device: options.Device = None,
     dtype: options.Dtype = None,
     fail_if: list[str] | None = typer.Option(
@@ -67,7 +67,7 @@ def command(
     from harness.studies.twins import asking, page, scoring
     from harness.studies.twins.declared import TWINS
 
-    options.in_range("--workers", workers, 1, options.MOST_WORKERS)
+    who = options.workers_of(workers)
     for name in twin or ():
         if name not in TWINS:
             raise unknown("--twin", name, TWINS)
@@ -96,7 +96,7 @@ def command(
     where = out or free_folder([spec], f"twins-{source.name}", study.goes_on)
     label = f"asking {printable(spec.ego.card.name, 30)}, episodes"
     with bar(label, len(study.points()), as_json or quiet) as progress:
-        pairs = asking.ask(study, where, progress, None if no_cache else default_file(), workers)
+        pairs = asking.ask(study, where, progress, None if no_cache else default_file(), who)
     with work.going_on(where):
         rows = scoring.rows(pairs, [TWINS[name] for name in study.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]

@@ -12,6 +12,10 @@ class UserError(Exception):
     """Bad input. The message names the thing, the value, what is allowed and what to do."""
 
 
+class Unfinished(UserError):
+    """Some parts of some work cannot be done; the others are."""
+
+
 def printable(text: object, limit: int = 120) -> str:
     """Hostile text made safe for one terminal line: control characters escaped, cut at `limit`."""
     shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))

@@ -16,6 +16,7 @@ OPTIONAL = {
     "sklearn": ("scikit-learn", "audit"),
     "inspect_ai": ("inspect-ai", "inspect"),
     "imageio_ffmpeg": ("imageio-ffmpeg", "video"),
+    "ray": ("ray", "ray"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),

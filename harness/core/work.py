@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unfinished, UserError, printable
 from harness.core.files import alone, forget_halves, write_whole
 from harness.core.formats import CONFIG, WORK
 
@@ -26,9 +26,15 @@ class Begun(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         settings: what has to be the same for it to go on, as plain values.
+        shard: which part of the work it is, such as `3/16`; empty for the whole.
     """
 
     settings: dict[str, Any]
+    shard: str = ""
+
+    def facts(self) -> dict[str, Any]:
+        """What has to be the same for all shards of a work."""
+        return self.settings
 
 
 Kind = TypeVar("Kind", bound=Begun)
@@ -115,10 +121,10 @@ def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
 
 @contextmanager
 def going_on(out: Path) -> Iterator[None]:
-    """Have whoever interrupts this told that nothing is lost."""
+    """Have whoever interrupts this, or leaves parts of it undone, told that nothing is lost."""
     try:
         yield
-    except KeyboardInterrupt as stopped:
+    except (KeyboardInterrupt, Unfinished) as stopped:
         stopped.add_note(f"{printable(out)} keeps what is done")
         raise
 

@@ -8,9 +8,10 @@ alone.
 import json
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
@@ -18,12 +19,13 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import msgspec
 
 from harness import __version__
-from harness.core import extras, work
+from harness.core import extras, shards, work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
-from harness.core.parallel import spread
+from harness.core.parallel import Workers, each
 from harness.core.seeds import purpose, stated
+from harness.core.shards import Shard
 from harness.dataset.forest import Forest
 from harness.dataset.freeze import freeze
 from harness.dataset.schema import (
@@ -48,30 +50,32 @@ LEAST_AUDITED = 100  # layouts; of fewer an audit says little
 
 
 def build(
-    scenario: Scenario, out: Path, episodes: int, seed: int, workers: int, progress: Callable[[int], None],
-    audits: bool = True, more: Callable[[int], None] = lambda count: None,
+    scenario: Scenario, out: Path, episodes: int, seed: int, workers: Workers,
+    progress: Callable[[int], None], audits: bool = True, more: Callable[[int], None] = lambda count: None,
+    shard: Shard | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Build a dataset in `out`.
+    """Build a dataset in `out`, or freeze a shard's part of one, for `harness merge`.
 
     Args:
         scenario: what is frozen.
         out: folder to make; its name is the dataset's name.
         episodes: how many; episode e has layout seed `seed + e`.
         seed: first layout seed.
-        workers: processes.
+        workers: who freezes.
         progress: called with the number of layouts just finished.
         audits: whether the layouts are audited for tells, from `LEAST_AUDITED` on.
         more: called with the number of layouts that are still to be audited then.
+        shard: which part of the layouts is frozen; None for the whole.
 
     Returns:
-        The manifest.
+        The manifest; of a shard what it begins with.
 
     Raises:
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
             the seeds are for several purposes; or the audit needs a package that is missing.
     """
     audits = audits and episodes >= LEAST_AUDITED and not scenario.start  # no danger is known of
-    if audits:
+    if audits and not shard:
         extras.need("an audit", "sklearn")
     config = {
         "scenario": scenario.name,
@@ -100,27 +104,64 @@ def build(
         work.same(out, config, {key: made[key] for key in config})
         work.tidy(out)
         return made
+    part = str(shard or "")
+    mine = shard.part(range(episodes)) if shard else range(episodes)
     if begun := work.begun(out, work.Begun):
-        work.same(out, config, begun.settings)
+        work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
     elif scenario.start:
         examine(scenario, seed)
-    with work.working(out, begun or work.Begun(settings=config)) as place:
-        manifest = _built(scenario, out, place, config, workers, progress, audits, more)
+    with work.working(out, begun or work.Begun(settings=config, shard=part)) as place:
+        _freeze_missing(scenario, place, seed, mine, workers, progress)
+        if shard:
+            return config
+        manifest = _joined(scenario, out, place, config, workers, progress, audits, more)
         work.tidy(out)
     return manifest
 
 
-def _built(
-    scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: int,
+def merge(
+    folders: Sequence[Path], out: Path, workers: Workers, progress: Callable[[int], None],
+    audits: bool = True, more: Callable[[int], None] = lambda count: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Make one dataset of its shards: the bytes of a build without any (see `build`).
+
+    Raises:
+        UserError: as of `build`, or these are not all shards of one build, finished and of the same bytes.
+    """
+    begun = shards.read(folders, work.Begun)
+    config = begun[0].settings
+    episodes = {part_of(e): e for e in range(config["episodes"])}
+    parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
+    if not (out / "manifest.json").exists():
+        whole = work.Begun(settings=config)
+        if left := work.begun(out, work.Begun):
+            work.same(out, whole.settings, left.settings)
+        with work.working(out, whole) as place:
+            shards.collect(parts, place)
+    scenario = scenarios.stated(config["scenario"], config["parameters"])
+    return build(scenario, out, config["episodes"], config["seed"], workers, progress, audits, more)
+
+
+def _freeze_missing(
+    scenario: Scenario, place: Path, seed: int, episodes: Sequence[int], workers: Workers,
+    progress: Callable[[int], None],
+) -> None:  # fmt: skip
+    todo = [e for e in episodes if not (place / part_of(e)).is_file()]
+    progress(len(episodes) - len(todo))
+
+    def took(at: int, data: bytes) -> None:
+        write_whole(place / part_of(todo[at]), data)
+        progress(1)
+
+    each(partial(_frozen, scenario, seed), todo, workers, took, named)
+
+
+def _joined(
+    scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: Workers,
     progress: Callable[[int], None], audits: bool, more: Callable[[int], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Freeze what is missing, and write the dataset's files, the manifest last."""
+    """Write the dataset's files of what is frozen, the manifest last."""
     episodes, seed = config["episodes"], config["seed"]
-    done = [e for e in range(episodes) if (place / _shard(e)).is_file()]
-    progress(len(done))
-    todo = sorted(set(range(episodes)) - set(done))
-    spread(partial(_freeze_to_file, scenario, place, seed), todo, workers, progress)
-
     texts = _join(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
@@ -149,7 +190,8 @@ def _built(
     return manifest
 
 
-def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> None:
+def _frozen(scenario: Scenario, seed: int, episode: int) -> bytes:
+    """A layout as a file of the working folder."""
     levels, scenes = freeze(scenario, seed + episode, episode)
     texts = ["".join(canonical_json(record) + "\n" for record in level).encode() for level in scenes]
     for line in b"".join(texts).splitlines():
@@ -160,10 +202,12 @@ def _freeze_to_file(scenario: Scenario, work: Path, seed: int, episode: int) -> 
         list(map(sha256_bytes, texts)),
     )  # fmt: skip
     _check(scenario, tree)
-    with replacing(work / _shard(episode)) as part, ZipFile(part, "w") as file:
+    data = BytesIO()
+    with ZipFile(data, "w") as file:
         file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
         for step, text in enumerate(texts):
             file.writestr(_entry(level_name(episode, step)), text)
+    return data.getvalue()
 
 
 def _check(scenario: Scenario, tree: Tree) -> None:
@@ -182,10 +226,10 @@ def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
     trees = []
     with replacing(layouts) as part, ZipFile(part, "w") as file:
         for episode in range(episodes):
-            with ZipFile(work / _shard(episode)) as shard:
-                for name in shard.namelist():
-                    file.writestr(_entry(name), shard.read(name))
-                trees.append(shard.read(tree_name(episode)))
+            with ZipFile(work / part_of(episode)) as layout:
+                for name in layout.namelist():
+                    file.writestr(_entry(name), layout.read(name))
+                trees.append(layout.read(tree_name(episode)))
     return trees
 
 
@@ -195,8 +239,14 @@ def _entry(name: str) -> ZipInfo:
     return entry
 
 
-def _shard(episode: int) -> str:
+def part_of(episode: int) -> str:
+    """Name of the file that keeps a layout in a working folder."""
     return f"{episode:05d}.zip"
+
+
+def named(episode: int) -> str:
+    """A layout for people."""
+    return f"layout {episode}"
 
 
 def _pretty(value: Any) -> bytes:

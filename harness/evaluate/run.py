@@ -1,6 +1,7 @@
 """`harness eval` and `harness drive`: walk, score, write. A run that was stopped goes on where it was."""
 
 import math
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,23 +16,26 @@ import msgspec
 from harness.backends.base import Backend
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
-from harness.core import work
+from harness.core import shards, work
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
-from harness.core.parallel import spread
+from harness.core.parallel import Workers, each, spread
+from harness.core.shards import Shard
+from harness.core.versions import versions
 from harness.dataset.load import Scene
+from harness.dataset.select import drawn
 from harness.evaluate import device, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
-from harness.evaluate.spec import Spec, versions
+from harness.evaluate.spec import Spec
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, Episode, Latency, Manifest, Score
+from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest, Score
 from harness.runs.summary import counted, scores
 
 if TYPE_CHECKING:  # the simulator is loaded by who drives
@@ -44,12 +48,27 @@ LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):
-    """What a run began with, which it keeps when it goes on."""
+    """What a run began with, which it keeps when it goes on.
+
+    Attributes:
+        command: what does it again, in words.
+        identity: of the models.
+        latency: of its decisions.
+        versions: of what it may depend on.
+    """
 
     created: str
-    identity: str  # digest of the model's
+    command: tuple[str, ...]
+    identity: dict[str, Any]
     tags: tuple[str, ...]
     latency: Latency
+    versions: dict[str, str]
+
+    def facts(self) -> dict[str, Any]:
+        """What has to be the same for all shards of a run."""
+        versions = {f"version of {name}": of for name, of in self.versions.items() if name != "platform"}
+        latency = msgspec.to_builtins(self.latency)
+        return {**_compared(self.settings), "model": self.identity, "latency": latency, **versions}
 
 
 @dataclass(frozen=True)
@@ -67,11 +86,11 @@ def evaluate(
     progress: Callable[[int], None],
     cache: Path | None = None,
     more: Callable[[int], None] = lambda count: None,
-    workers: int = 1,
+    workers: Workers = 1,
     opens: Opens | None = None,
     given: Mapping[str, Answer] = NOTHING,
 ) -> Evaluated:
-    """Evaluate a model with a prompt and write the run's folder; the same for any number of workers.
+    """Evaluate a model with a prompt and write the run's folder; the same for any workers.
 
     What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever adds to
     the run calls at the end.
@@ -83,25 +102,86 @@ def evaluate(
             included.
         cache: file of completions kept between runs, for language models; None for no cache.
         more: called with the number of answers that are owed next, where scenes are frozen.
-        workers: processes that drive, each with a backend of its own.
+        workers: who drives, each with a backend of its own.
         opens: in the place of `open_backend`, where scenes are frozen: what it gives may be open already.
         given: answers that are there already, by request id, where scenes are frozen.
 
     Raises:
         UserError: the folder holds something else, or the model is not available. Nothing is written then.
     """
-    if (out / "run.json").exists():
-        if (out / WORK).is_dir():
-            return finished(spec, out)
-        raise UserError(
-            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
-        )
+    if (out / "run.json").exists() and (out / WORK).is_dir():
+        return finished(spec, out)
+    _refuse_finished(out)
     begun = left(spec, out)
     if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
         return _frozen(spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given)
-    return _closed_loop(spec, cast("LiveSource", spec.source), out, begun, progress, cache, workers)
+    begun, chunks = _begin_driving(spec, out, begun, workers)
+    with work.working(out, begun, "run.json") as place:
+        _drive(spec, begun, chunks, place, progress, cache, workers)
+        return _gathered(out, _as_now(spec, begun), chunks, place)
+
+
+def evaluate_shard(
+    spec: Spec, out: Path, shard: Shard, progress: Callable[[int], None], more: Callable[[int], None],
+    workers: Workers = 1,
+) -> int:  # fmt: skip
+    """Drive a shard's part of a closed-loop run, for `harness merge`; what was stopped before goes on.
+
+    Args:
+        spec: the whole run.
+        out: the shard's folder.
+        shard: which part.
+        progress: called with the number of episodes just driven, those kept from before included.
+        more: called with the number of episodes that the shard has.
+        workers: who drives.
+
+    Returns:
+        How many episodes the shard has.
+
+    Raises:
+        UserError: as of `evaluate`, or the latency is to be measured.
+    """
+    _refuse_finished(out)
+    begun, chunks = _begin_driving(spec, out, left(spec, out, str(shard)), workers, str(shard))
+    mine = shard.part(chunks)
+    more(sum(map(len, mine)))
+    with work.working(out, begun, "run.json") as place:
+        _drive(spec, begun, mine, place, progress, None, workers)
+    return sum(map(len, mine))
+
+
+def merge(folders: Sequence[Path], out: Path) -> Evaluated:
+    """Make one closed-loop run of its shards: the bytes of a run that was not split (see `evaluate`).
+
+    Raises:
+        UserError: these are not all shards of one run, finished and of the same bytes, or `out` holds
+            something else.
+    """
+    begun = shards.read(folders, Begun)
+    chunks = _chunks_of(begun[0].settings)
+    of = {_part_of(chunk): chunk for chunk in chunks}
+    parts = shards.owners(folders, begun, list(of), lambda part: _named(of[part]))
+    if (out / "run.json").exists() and (out / WORK).is_dir():
+        return _finished(begun[0].settings, out)
+    _refuse_finished(out)
+    tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
+    created = min(each.created for each in begun)
+    whole = msgspec.structs.replace(begun[0], shard="", tags=tags, created=created)
+    if there := work.begun(out, Begun):
+        work.same(out, {**whole.facts(), "shard": ""}, {**there.facts(), "shard": there.shard})
+    with work.working(out, there or whole, "run.json") as place:
+        shards.collect(parts, place)
+        return _gathered(out, whole, chunks, place)
+
+
+def _refuse_finished(out: Path) -> None:
+    """Raise UserError where a folder holds a finished run."""
+    if (out / "run.json").exists():
+        raise UserError(
+            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
+        )
 
 
 @dataclass(frozen=True)
@@ -139,45 +219,100 @@ def _frozen(
         asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", given, progress, more)
         walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
         with uncollected():
-            return _written(spec, out, begun, dataset.episodes, walked, identity)
+            return _written(out, _as_now(spec, begun), dataset.episodes, walked)
 
 
-def _closed_loop(
-    spec: Spec, source: "LiveSource", out: Path, begun: Begun | None, progress: Callable[[int], None],
-    cache: Path | None, workers: int,
-) -> Evaluated:  # fmt: skip
+def _begin_driving(
+    spec: Spec, out: Path, begun: Begun | None, workers: Workers, shard: str = ""
+) -> tuple[Begun, list[Sequence[int]]]:
+    """What a closed-loop run begins with, and the chunks of its episodes."""
+    if spec.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
+        raise UserError(
+            f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; measure on "
+            "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
+        )
     # Engines are opened where they answer: a forked process has none of their threads.
-    [(identity, latency)] = spread(partial(_model, begun=begun), [spec], workers, lambda done: None)
-    begun = _begin(spec, out, begun, identity, latency)
-    with work.working(out, begun, "run.json") as place:
-        size = max(EPISODES_AT_ONCE, math.ceil(spec.batch_size / LEAST_VIEWERS))
-        chunks = [source.numbers[at : at + size] for at in range(0, len(source.numbers), size)]
-        sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
-        drive = partial(_driven, spec, source.first_seed, latency, place, cache)
-        parts = spread(drive, chunks, min(workers, len(chunks)), lambda done: progress(next(sizes)))
-        with uncollected():
-            read = [folder.read_part(part, spec.actions) for part in parts]
-            walked = Walked(
-                Decisions.concat([decisions for decisions, _, _ in read]),
-                [episode for _, episodes, _ in read for episode in episodes],
-                {answer.id: answer for _, _, answers in read for answer in answers},
-            )
-            return _written(spec, out, begun, tuple(source.numbers), walked, identity)
+    model = partial(_model, begun=begun)
+    [(identity, latency)] = spread(
+        model, [spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", _exact(spec)
+    )
+    return _begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
 
 
-def _driven(
-    spec: Spec, first_seed: int, latency: Latency, place: Path, cache: Path | None, chunk: Sequence[int]
-) -> Path:
-    """Drive a chunk, unless a killed run did."""
+def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
+    """Numbers of the episodes that are driven in step and kept together, of a closed-loop run's settings."""
+    world = msgspec.convert(settings["world"], ClosedLoop)
+    numbers: Sequence[int] = range(world.episodes)
+    if drawn_of := world.selection:
+        numbers = drawn(range(drawn_of["of"]), drawn_of["sample"], drawn_of["sample_seed"], drawn_of["of"])
+    size = max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS))
+    return [numbers[at : at + size] for at in range(0, len(numbers), size)]
+
+
+def _part_of(chunk: Sequence[int]) -> str:
+    """Name of the folder that keeps a chunk."""
+    return f"episodes-{chunk[0]:06d}"
+
+
+def _named(chunk: Sequence[int]) -> str:
+    """A chunk for people."""
+    whole = chunk == range(chunk[0], chunk[-1] + 1)
+    return f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
+
+
+def _drive(
+    spec: Spec, begun: Begun, chunks: Sequence[Sequence[int]], place: Path,
+    progress: Callable[[int], None], cache: Path | None, workers: Workers,
+) -> None:  # fmt: skip
+    """Drive the chunks that are not kept yet, and keep each as it comes."""
+    todo = [chunk for chunk in chunks if not (place / _part_of(chunk)).is_dir()]
+    progress(sum(map(len, chunks)) - sum(map(len, todo)))
+
+    def took(at: int, files: dict[str, bytes]) -> None:
+        folder.write_part(place / _part_of(todo[at]), files)
+        progress(len(todo[at]))
+
+    # The cache is a file of one machine.
+    drive = partial(_driven, spec, begun, cache if isinstance(workers, int) else None)
+    each(drive, todo, workers, took, _named, _exact(spec))
+
+
+def _exact(spec: Spec) -> bool:
+    """Whether the same question gets the same answer anywhere: rules do, and language models need not."""
+    return not any(agent.can.language_model for agent in spec.agents)
+
+
+def _driven(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
+    """Drive a chunk; returns its files by name."""
     from harness.evaluate.live_world import LiveWorld
 
-    part = place / f"episodes-{chunk[0]:06d}"
-    if not part.is_dir():
-        asker = Asker(spec, lambda: together(spec.cards, _opened_all(spec), cache), latency)
-        world = LiveWorld(spec.scenario, first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
-        walked = _walked(spec, world, asker)
-        folder.write_part(part, walked.decisions, walked.episodes, list(walked.answers.values()))
-    return part
+    source = cast("LiveSource", spec.source)
+
+    def backend() -> Backend:
+        asked = together(spec.cards, _opened_all(spec), cache)
+        if digest(asked.identity()) != digest(begun.identity):
+            raise UserError(
+                f"a worker opens {_another_model(spec)} than this run began with; give it the same"
+            )
+        return asked
+
+    asker = Asker(spec, backend, begun.latency)
+    world = LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
+    walked = _walked(spec, world, asker)
+    return folder.part_files(walked.decisions, walked.episodes, list(walked.answers.values()))
+
+
+def _gathered(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
+    """Score all chunks of a closed-loop run, which lie in a working folder, and write the run's files."""
+    actions = begun.settings["actions"]
+    with uncollected():
+        read = [folder.read_part(place / _part_of(chunk), actions) for chunk in chunks]
+        walked = Walked(
+            Decisions.concat([decisions for decisions, _, _ in read]),
+            [episode for _, episodes, _ in read for episode in episodes],
+            {answer.id: answer for _, _, answers in read for answer in answers},
+        )
+        return _written(out, begun, tuple(chain.from_iterable(chunks)), walked)
 
 
 def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
@@ -204,26 +339,33 @@ def _opened_all(spec: Spec) -> list[Backend]:
     return [opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
 
 
-def _written(
-    spec: Spec, out: Path, begun: Begun, numbers: tuple[int, ...], walked: Walked, identity: dict[str, Any]
-) -> Evaluated:
-    """Score a walk and write the run's files, the manifest last."""
-    spec, latency = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags)))), begun.latency
-    again = spec
+def _as_now(spec: Spec, begun: Begun) -> Begun:
+    """What a run began with, as it is finished: with the tags of both times, and where its world lies now."""
+    spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
     if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
-        again = replace(spec, latency=latencies.as_declared(latency))
-    grid = Grid(tuple(point.name for point in spec.points), spec.seeds, numbers)
+        spec = replace(spec, latency=latencies.as_declared(begun.latency))
+    return msgspec.structs.replace(
+        begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
+    )
+
+
+def _written(out: Path, begun: Begun, numbers: tuple[int, ...], walked: Walked) -> Evaluated:
+    """Score a walk and write the run's files, the manifest last."""
+    settings = begun.settings
+    names = tuple(condition["name"] for condition in settings["conditions"])
+    grid = Grid(names, tuple(settings["seeds"]), numbers)
     episodes = counted(grid, walked.decisions, walked.episodes)
     answers = folder.ordered(walked.answers.values(), walked.decisions)
-    summary = scores(spec.source.kind, grid, walked.decisions, episodes, answers)
+    summary = scores(settings["world"]["kind"], grid, walked.decisions, episodes, answers)
     manifest = msgspec.convert({
-        "format": FORMAT, "name": out.name, "created": begun.created, "command": again.command(out),
-        "tags": spec.tags, **spec.settings(), "latency": msgspec.to_builtins(latency),
-        "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": identity,
+        "format": FORMAT, "name": out.name, "created": begun.created,
+        "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
+        "latency": msgspec.to_builtins(begun.latency),
+        "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": begun.identity,
         "cached_answers": sum(answer.cached for answer in answers),
         "engine_errors": sum(answer.error is not None for answer in answers),
         "retries": sum(answer.retries for answer in answers),
-        "versions": versions(),
+        "versions": begun.versions,
     }, Manifest)  # fmt: skip
     folder.write(out, manifest, walked.decisions, episodes, answers, summary)
     return Evaluated(out, manifest, summary)
@@ -244,17 +386,22 @@ def made(
 
 def finished(spec: Spec, out: Path) -> Evaluated:
     """The run that is there already. Raises UserError if it is another run, or damaged."""
+    return _finished(spec.settings(), out)
+
+
+def _finished(settings: Mapping[str, Any], out: Path) -> Evaluated:
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    work.same(out, _compared(spec.settings()), _compared({key: stored[key] for key in spec.settings()}))
+    work.same(out, _compared(settings), _compared({key: stored[key] for key in settings}))
     return Evaluated(out, run.manifest, run.scores)
 
 
-def left(spec: Spec, out: Path) -> Begun | None:
+def left(spec: Spec, out: Path, shard: str = "") -> Begun | None:
     """What a stopped run in a folder began with. Raises UserError if it, or what is there, is another."""
     begun = work.begun(out, Begun)
     if begun:
-        work.same(out, _compared(spec.settings()), _compared(begun.settings))
+        now = {**_compared(spec.settings()), "shard": shard}
+        work.same(out, now, {**_compared(begun.settings), "shard": begun.shard})
     return begun
 
 
@@ -272,17 +419,23 @@ def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**{key: value for key, value in settings.items() if key != "world"}, **world}
 
 
-def _begin(spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency) -> Begun:
+def _begin(
+    spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency, shard: str = ""
+) -> Begun:
     """What the run began with. Raises UserError if that was another model."""
     if begun is None:
         return Begun(
-            settings=spec.settings(), created=datetime.now(UTC).isoformat(timespec="seconds"),
-            identity=digest(identity), tags=spec.tags, latency=latency,
+            settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=spec.words(), identity=identity, tags=spec.tags, latency=latency, versions=versions(),
         )  # fmt: skip
-    if begun.identity != digest(identity):
-        names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
+    if digest(begun.identity) != digest(identity):
         raise UserError(
-            f"--out {printable(out)} was begun with another model behind {names} (its files, package "
-            "versions or device differ); delete it, or choose another folder"
+            f"--out {printable(out)} was begun with {_another_model(spec)}; delete it, or choose "
+            "another folder"
         )
     return begun
+
+
+def _another_model(spec: Spec) -> str:
+    names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
+    return f"another model behind {names} (its files, package versions or device differ)"

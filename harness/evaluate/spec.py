@@ -1,17 +1,13 @@
 """An evaluation's settings, complete: enough to run it again."""
 
-import platform
-import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
 
-from harness import __version__
 from harness.backends.cards import Card, argument
 from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
@@ -319,8 +315,8 @@ class Spec:
             "device_model": self.device_model,
         }
 
-    def command(self, out: Path) -> str:
-        """A command line that runs this again, quoted for a shell."""
+    def words(self) -> tuple[str, ...]:
+        """A command line that runs this again, but for `--out`."""
         first = self.seeds[0]
         seeds = ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}"
         options = [
@@ -333,14 +329,14 @@ class Spec:
             ("--temperature", self.temperature or None), ("--sampling-seed", self.sampling_seed or None),
             ("--latency", self.latency),
             ("--device-profile", self.device_profile and self.device_profile.name),
-            ("--device-model", self.device_model), *(("--tag", tag) for tag in self.tags), ("--out", out),
+            ("--device-model", self.device_model), *(("--tag", tag) for tag in self.tags),
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []
         asked = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
         if self.helpers and asked != self.ego.thinking:
             flags.append("--helper-thinking" if asked else "--no-helper-thinking")
-        return shlex.join(["harness", self.source.command, *parts, *flags])
+        return ("harness", self.source.command, *parts, *flags)
 
     def _helper_options(self) -> list[tuple[str, object]]:
         if not self.helpers:
@@ -358,24 +354,3 @@ def program_sha256() -> str:
     """Digest of the harness's own code."""
     root = Path(__file__).parents[1]
     return digest({str(path.relative_to(root)): sha256_file(path) for path in root.rglob("*.py")})
-
-
-def versions(
-    packages: Sequence[str] = (
-        "numpy",
-        "scipy",
-        "jinja2",
-        "highway-env",
-        "torch",
-        "transformers",
-        "llama-cpp-python",
-    ),
-) -> Any:
-    """Versions of the installed packages that a result may depend on."""
-    installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
-    for name in packages:
-        try:
-            installed[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return installed

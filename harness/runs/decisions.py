@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -221,14 +222,23 @@ class Decisions:
 
     def write(self, path: Path) -> None:
         """Replace a Parquet file. Equal rows give equal bytes: names are numbered as rows first have them."""
+        with replacing(path) as part:
+            self._write(part)
+
+    def encoded(self) -> bytes:
+        """The bytes that `write` writes."""
+        data = BytesIO()
+        self._write(data)
+        return data.getvalue()
+
+    def _write(self, to: Path | BytesIO) -> None:
         unknown = [name for name in OPTIONAL if self.table[name].null_count == len(self)]
         table = self.table.drop_columns(unknown).combine_chunks()
         columns = [
             column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
             for column in table.columns
         ]
-        with replacing(path) as part:
-            pq.write_table(pa.table(columns, schema=table.schema), part, compression="zstd")
+        pq.write_table(pa.table(columns, schema=table.schema), to, compression="zstd")
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":

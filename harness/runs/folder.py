@@ -8,7 +8,7 @@ import csv
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -231,15 +231,23 @@ def write(
     write_whole(out / "run.json", text + b"\n")
 
 
-def write_part(
-    out: Path, decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
-) -> None:
+def part_files(
+    decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
+) -> dict[str, bytes]:
+    """The files of a part of a run, by name."""
+    return {
+        "decisions.parquet": decisions.encoded(),
+        "answers.jsonl": _ENCODER.encode_lines(answers),
+        "episodes.csv": csv_text(Episode, episodes).encode(),
+    }
+
+
+def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     """Write part of a run to a folder of its own, which is there whole or not at all."""
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)
-    decisions.write(part / "decisions.parquet")
-    write_whole(part / "answers.jsonl", _ENCODER.encode_lines(answers))
-    write_whole(part / "episodes.csv", csv_text(Episode, episodes))
+    for name, data in files.items():
+        write_whole(part / name, data)
     os.replace(part, out)
 
 

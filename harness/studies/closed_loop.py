@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness.coordination.operating_point import POINTS, named_point
+from harness.core.parallel import Workers
 from harness.core.work import tidy
 from harness.evaluate.run import Evaluated, evaluate, finished
 from harness.evaluate.spec import Spec
@@ -45,7 +46,7 @@ def panels() -> dict[str, list[Setting]]:
 
 
 def run_closed_loop(
-    spec: Spec, out: Path, workers: int, progress: Callable[[int], None], cache: Path | None
+    spec: Spec, out: Path, workers: Workers, progress: Callable[[int], None], cache: Path | None
 ) -> "pd.DataFrame":
     """Drive all grid points, and draw Figures A and B. A study that was stopped in `out` continues.
 
@@ -55,7 +56,7 @@ def run_closed_loop(
     Args:
         spec: the model and how it is asked; its conditions are those of `panels`.
         out: the study's folder.
-        workers: processes.
+        workers: who drives.
         progress: called with the number of layouts just driven under all conditions and seeds.
         cache: file of completions kept between runs.
 

@@ -11,7 +11,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
-from harness.evaluate.spec import Spec, versions
+from harness.core.versions import versions
+from harness.evaluate.spec import Spec
 from harness.report.compare.page import beside
 from harness.report.drawing.colours import INK, PALE, conditions
 from harness.report.drawing.pictures import styled

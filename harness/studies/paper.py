@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from harness.coordination.operating_point import POINTS
 from harness.core.figures import interval
 from harness.core.files import write_whole
-from harness.evaluate.spec import versions
+from harness.core.versions import versions
 from harness.report.library import picture
 from harness.report.page import environment
 from harness.studies import figures

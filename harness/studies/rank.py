@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness.core.arrays import Bools
+from harness.core.parallel import Workers
 from harness.core.statistics import Estimate, rate_difference, rate_interval
 from harness.dataset.load import Dataset
 from harness.world.drivers import DRIVERS
@@ -29,7 +30,7 @@ class Standing:
     agreement: Estimate
 
 
-def rank(dataset: Dataset, workers: int, progress: Callable[[int], None]) -> dict[str, Standing]:
+def rank(dataset: Dataset, workers: Workers, progress: Callable[[int], None]) -> dict[str, Standing]:
     """Each driver's standing over the dataset's episodes, every one of which is driven again."""
     seeds = [tree.episode_seed for tree in dataset.trees]
     live = drive_apart(dataset.scenario, seeds, workers, progress)

@@ -9,7 +9,7 @@ import msgspec
 from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
-from harness.evaluate.spec import versions
+from harness.core.versions import versions
 from harness.report.caveats import caveats, said
 from harness.report.compare.page import beside
 from harness.report.page import environment

@@ -10,7 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from harness.core.figures import shown
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
-from harness.evaluate.spec import versions
+from harness.core.versions import versions
 from harness.report.drawing.colours import COLOURS, INK, MARKERS, PALE
 from harness.report.drawing.pictures import styled
 from harness.report.library import picture

@@ -9,7 +9,7 @@ from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.figures import interval
 from harness.core.files import write_whole
-from harness.evaluate.spec import versions
+from harness.core.versions import versions
 from harness.report.library import picture
 from harness.report.page import environment
 from harness.studies import figures

@@ -28,9 +28,10 @@ from harness.core.statistics import (
     of_resamples,
     resampled,
 )
+from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
-from harness.evaluate.spec import program_sha256, versions
+from harness.evaluate.spec import program_sha256
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
 from harness.studies.stored import Stored

@@ -11,6 +11,7 @@ import transformers
 
 from harness.core import work
 from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
+from harness.core.parallel import Workers
 from harness.prompts.versions import Prompt
 from harness.training.gguf_export import export
 from harness.training.lessons import draw
@@ -58,7 +59,7 @@ def distill(
     progress: Progress,
     device: str,
     threads: int | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> dict[str, Any]:
     """Train a model in some scenarios and write checkpoint, tokenizer, GGUF file and model card to `out`.
 
@@ -72,7 +73,7 @@ def distill(
         progress: called with the stage, the sequences seen in it and the loss.
         device: `cpu` or `cuda`.
         threads: on a CPU; None is PyTorch's choice.
-        workers: processes that draw layouts.
+        workers: who draws layouts.
 
     Returns:
         What the model card states: data, plan, curves, and the KL of the read-out on held-out layouts.

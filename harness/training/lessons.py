@@ -24,7 +24,7 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import write_whole
-from harness.core.parallel import spread
+from harness.core.parallel import Workers, each
 from harness.dataset.freeze import edges, moment, scene_id
 from harness.dataset.load import Scene
 from harness.prompts.versions import Prompt
@@ -74,7 +74,7 @@ class Lessons:
 
 
 def draw(
-    scenario: Scenario, prompts: Sequence[Prompt], layouts: int, seed: int, place: Path, workers: int,
+    scenario: Scenario, prompts: Sequence[Prompt], layouts: int, seed: int, place: Path, workers: Workers,
     progress: Callable[[int], None],
 ) -> Lessons:  # fmt: skip
     """Draw what is missing in the folder `place`, a file a layout, and read all of it.
@@ -85,22 +85,27 @@ def draw(
         layouts: how many; number n has layout seed `seed + n`.
         seed: first layout seed.
         place: folder of what is drawn, which a killed call goes on with.
-        workers: processes.
+        workers: who draws.
         progress: called with the number of layouts just done.
     """
     place.mkdir(parents=True, exist_ok=True)
     files = [place / f"{n:05d}.json" for n in range(layouts)]
     todo = [n for n, file in enumerate(files) if not file.is_file()]
     progress(layouts - len(todo))
-    spread(partial(_draw_to_file, scenario, place, seed), todo, workers, progress)
+
+    def took(at: int, data: bytes) -> None:
+        write_whole(files[todo[at]], data)
+        progress(1)
+
+    each(partial(_drawn, scenario, seed), todo, workers, took, lambda number: f"layout {number}")
     points = [point for file in files for point in msgspec.json.decode(file.read_bytes())]
     scenes = tuple(Scene(point["moment"]) for point in points)
     labels = {point["moment"]["scene"]: np.array(point["label"]) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)
 
 
-def _draw_to_file(scenario: Scenario, place: Path, seed: int, number: int) -> None:
-    write_whole(place / f"{number:05d}.json", msgspec.json.encode(drawn(scenario, seed + number, number)))
+def _drawn(scenario: Scenario, seed: int, number: int) -> bytes:
+    return msgspec.json.encode(drawn(scenario, seed + number, number))
 
 
 def drawn(scenario: Scenario, seed: int, number: int) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ import numpy as np
 from harness.core import extras, noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
-from harness.core.parallel import spread
+from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, wilson
 from harness.world.drivers import choose
 from harness.world.perception.graph import scene_graph
@@ -87,7 +87,7 @@ class Moments:
 
 
 def audit(
-    scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: int = 1
+    scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers = 1
 ) -> Audit:
     """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
 

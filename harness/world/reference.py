@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.core.parallel import spread
+from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, rate_interval
 from harness.world import lockstep
 from harness.world.drivers import DRIVERS, PRIVILEGED, choose
@@ -56,17 +56,20 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
 
 
 def drive_apart(
-    scenario: Scenario, seeds: Sequence[int], workers: int, progress: Callable[[int], None]
+    scenario: Scenario, seeds: Sequence[int], workers: Workers, progress: Callable[[int], None]
 ) -> list[dict[str, Outcome]]:
-    """`drive_all` in any number of processes; `progress` is called with how many episodes are done."""
+    """`drive_all` by any workers; `progress` is called with how many episodes are done."""
     chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
     sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
-    parts = spread(partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)))
+    parts = spread(
+        partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)),
+        lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
+    )  # fmt: skip
     return [outcomes for part in parts for outcomes in part]
 
 
 def check(
-    scenario: Scenario, episodes: int, seed: int, workers: int, progress: Callable[[int], None]
+    scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
     """Drive every reference driver through the same episodes.
 

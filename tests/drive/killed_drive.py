@@ -11,4 +11,4 @@ if __name__ == "__main__":
     from killed_run import die_before
 
     die_before(int(sys.argv[2]))
-    run(spec("cruise", seeds=(0,), episodes=17), Path(sys.argv[1]))
+    run(spec("cruise", seeds=(0,), episodes=33), Path(sys.argv[1]))

@@ -12,9 +12,12 @@ import pytest
 from driving import spec
 from evaluating import FILES
 
+from harness.backends.driver import DriverBackend
 from harness.core.errors import UserError
 from harness.core.formats import FORMAT
 from harness.core.work import tidy
+from harness.evaluate import live_world
+from harness.evaluate.live_world import LiveWorld
 from harness.evaluate.run import evaluate
 
 HERE = Path(__file__).parent
@@ -76,7 +79,7 @@ def test_workers_and_batches_change_no_byte(whole, tmp_path, workers, batch_size
 
 @pytest.mark.slow
 def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp_path):
-    cruise = spec("cruise", seeds=(0,), episodes=17)  # three chunks
+    cruise = spec("cruise", seeds=(0,), episodes=33)  # three chunks
     expected = folder_of(cruise, tmp_path / "whole")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE.parent)])}
     resumed = 0
@@ -87,12 +90,44 @@ def test_killed_before_any_change_of_the_disk_and_resumed_it_is_the_same_run(tmp
         assert killed.returncode == -9, killed.stderr
         if (out / ".work" / "config.json").is_file() and not (out / "run.json").is_file():
             with pytest.raises(UserError, match="begun with another seeds"):
-                evaluate(spec("cruise", seeds=(1,), episodes=17), out, lambda done: None)
+                evaluate(spec("cruise", seeds=(1,), episodes=33), out, lambda done: None)
             resumed += 1
         if not (out / "run.json").exists() or (out / ".work").exists():
             assert folder_of(cruise, out) == expected
         assert {p.name for p in out.iterdir()} == {*FILES, "run.json"}
     assert resumed == 3
+
+
+def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(harness, tmp_path, monkeypatch):
+    """A worker is forked with the world in which it dies."""
+
+    class Deadly(LiveWorld):
+        def __init__(self, scenario, first_seed, numbers, *others):
+            if 17 in numbers:
+                os._exit(9)
+            super().__init__(scenario, first_seed, numbers, *others)
+
+    line = ("drive", "--model", "cruise", "--episodes", "33", "--seeds", "0", "--quiet", "--out", "run")
+    with monkeypatch.context() as patched:
+        patched.setattr(live_world, "LiveWorld", Deadly)
+        code, out, said = harness(*line)
+    assert (code, out) == (2, "")
+    assert said == (
+        "harness: episodes 16 to 31: the worker was killed 3 times, perhaps because memory ran out; try "
+        "fewer --workers; the other 2 are done; run keeps what is done; the same command goes on: "
+        f"harness {' '.join(line)}\n"
+    )
+    kept = {part.name for part in (tmp_path / "run/.work").glob("episodes-*")}
+    assert kept == {"episodes-000000", "episodes-000032"}
+    assert harness(*line) == (0, "", "")
+    assert harness(*line[:-1], "whole", "--workers", "1") == (0, "", "")
+    assert all((tmp_path / "run" / n).read_bytes() == (tmp_path / "whole" / n).read_bytes() for n in FILES)
+
+
+def test_a_worker_that_opens_another_model_is_told_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(DriverBackend, "identity", lambda self: {"opened": os.urandom(4).hex()})
+    with pytest.raises(UserError, match=r"a worker opens another model behind cruise .*; give it the same"):
+        evaluate(spec("cruise", seeds=(0,), episodes=1), tmp_path / "run", lambda done: None)
 
 
 def test_a_finished_run_is_not_driven_over(whole):

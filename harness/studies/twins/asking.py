@@ -13,10 +13,10 @@ from harness.backends.cache import cached
 from harness.backends.registry import opened
 from harness.core import noise, work
 from harness.core.errors import UserError, printable
-from harness.core.files import digest
-from harness.core.parallel import spread
+from harness.core.files import digest, write_whole
+from harness.core.parallel import Workers, each, spread
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.asking import Asker, fusion_request, requests
+from harness.evaluate.asking import Asker, fusion_request, read_kept, requests
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.fusion import messages_of
 from harness.evaluate.latency import PAPER
@@ -106,9 +106,9 @@ def lack(spec: Spec, twin: Twin) -> str | None:
 
 
 def ask(
-    study: Study, out: Path, progress: Callable[[int], None], cache: Path | None, workers: int
+    study: Study, out: Path, progress: Callable[[int], None], cache: Path | None, workers: Workers
 ) -> list[Pair]:
-    """Ask about decision points and their twins; the same for any number of workers.
+    """Ask about decision points and their twins; the same for any workers.
 
     What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever writes
     the result calls.
@@ -118,20 +118,35 @@ def ask(
         out: folder of the result.
         progress: called with 1 for each episode that is done.
         cache: file of completions kept between runs; None for no cache.
-        workers: processes, each with a backend of its own.
+        workers: who asks, each with a backend of its own.
 
     Raises:
         UserError: the folder holds something else, the model is not available, or no question has a twin.
     """
     if (out / RESULT).exists():
         raise UserError(f"--out {printable(out)} has finished twins; choose another folder or delete it")
-    [identity] = spread(_identity, [study.spec], workers, lambda done: None)
+    [identity] = spread(
+        _identity, [study.spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", False
+    )
     begun = study.begin(identity)
     if left := work.begun(out, work.Begun):
         work.same(out, begun.settings, left.settings)
     with work.working(out, begun, RESULT) as place:
-        done = spread(partial(_asked, study, cache, place), study.points().items(), workers, progress)
-        pairs = [pair for of in done for pair in of]
+        points = [
+            (number, study.dataset.scenes(ids), read_kept(_answers_file(place, number)))
+            for number, ids in study.points().items()
+        ]
+        found: dict[int, list[Pair]] = {}
+
+        def took(at: int, asked: tuple[list[Pair], bytes]) -> None:
+            found[at], answers = asked
+            write_whole(_answers_file(place, points[at][0]), answers)
+            progress(1)
+
+        # The cache is a file of one machine.
+        asked = partial(_asked, study, cache if isinstance(workers, int) else None)
+        each(asked, points, workers, took, lambda point: f"episode {point[0]}", repeatable=False)
+        pairs = [pair for at in range(len(points)) for pair in found[at]]
         if not pairs:
             raise UserError(f"--twin: none applies to what was drawn: {study.lacks(study.twins)}")
         return pairs
@@ -141,15 +156,20 @@ def _identity(spec: Spec) -> str:
     return digest(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size).identity())
 
 
-def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Sequence[str]]) -> list[Pair]:
-    """Ask about the decision points of an episode, then about their twins."""
-    (number, ids), spec = episode, study.spec
-    scenes = study.dataset.scenes(ids)
+def _answers_file(place: Path, episode: int) -> Path:
+    return place / f"answers-{episode:06d}.jsonl"
+
+
+def _asked(
+    study: Study, cache: Path | None, episode: tuple[int, Sequence[Scene], Mapping[str, Answer]]
+) -> tuple[list[Pair], bytes]:
+    """Ask about the decision points of an episode, then about their twins; with the answers, a line each."""
+    (number, scenes, kept), spec = episode, study.spec
 
     def backend() -> Backend:
         return cached(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
 
-    asker = Asker(spec, backend, PAPER, place / f"answers-{number:06d}.jsonl")
+    asker = Asker(spec, backend, PAPER, answers=kept)
     twins = [twin for twin in map(TWINS.__getitem__, study.twins) if lack(spec, twin) is None]
     questions = {scene.id: list(requests(spec, [scene])) for scene in scenes}
     # Fusion calls have the helpers' messages, which are there first.
@@ -169,7 +189,8 @@ def _asked(study: Study, cache: Path | None, place: Path, episode: tuple[int, Se
     known = {request.id for request in first}
     then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known}
     asker.ask(list(then.values()))
-    return [_pair(spec, each, number, asker.answers) for each in asked]
+    pairs = [_pair(spec, each, number, asker.answers) for each in asked]
+    return pairs, msgspec.json.Encoder().encode_lines(list(asker.answers.values()))
 
 
 def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:

@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 from harness.core.errors import printable
 from harness.core.figures import as_mapping, shown
 from harness.core.files import write_whole
-from harness.evaluate.spec import versions
+from harness.core.versions import versions
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.page import environment, visible

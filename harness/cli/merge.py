@@ -1,0 +1,48 @@
+"""`harness merge`: one run, or one dataset, of its shards."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from harness.cli import drive, options
+from harness.cli.estimates import echo_json
+from harness.cli.progress import bar
+from harness.core import work
+from harness.core.errors import printable
+
+
+def command(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of all shards.", metavar="FOLDER...")],
+    out: Path = typer.Option(..., help="Folder to make."),
+    audit: bool = typer.Option(True, help="Audit a dataset of 100 layouts or more for tells."),
+    workers: options.Workers = "2",
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Put the shards of a run or a dataset together. It has the bytes of one that was not split."""
+    from harness.core.shards import read
+
+    who, silent = options.workers_of(workers), as_json or quiet
+    if "world" not in read(folders, work.Begun)[0].settings:
+        from harness.dataset.build import merge as merge_dataset
+
+        with bar("layouts", quiet=silent) as progress:
+            manifest = merge_dataset(folders, out, who, progress, audit, progress.more)
+        if as_json:
+            echo_json(manifest)
+        elif not quiet:
+            typer.echo(
+                f"wrote {printable(out)}: {manifest['episodes']} layouts, {manifest['nodes']} decision points"
+            )
+        return
+    from harness.cli.report import write
+    from harness.evaluate.run import merge
+
+    done = merge(folders, out)
+    with work.going_on(out):
+        page = write([out], quiet=silent)
+    work.tidy(out)
+    drive.tell(done, as_json, quiet)
+    if not silent:
+        typer.echo(f"wrote {page}")

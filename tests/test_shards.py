@@ -1,0 +1,227 @@
+"""Shards: the bytes of a work that was not split, and what is refused; driven episodes and frozen layouts."""
+
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from evaluating import FILES
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.core.errors import UserError
+from harness.core.files import alone
+from harness.core.shards import Shard, shard_of
+
+Typed = Callable[..., tuple[int, str, str]]
+DRIVE = ("drive", "--model", "cruise", "--episodes", "36", "--seeds", "0", "--workers", "1", "--quiet")
+BUILD = ("dataset", "build", "parking-exit", "--episodes", "2", "--seed", "100", "--workers", "1")
+TIMES = ("name", "created", "command")
+
+
+@given(st.integers(1, 50), st.lists(st.integers(), max_size=60))
+def test_shards_are_all_of_it_in_order_and_of_about_one_size(of: int, items: list[int]) -> None:
+    if of > len(items):
+        with pytest.raises(UserError, match=f"give {len(items)} shards or fewer"):
+            Shard(1, of).part(items)
+        return
+    parts = [Shard(n, of).part(items) for n in range(1, of + 1)]
+    assert [item for part in parts for item in part] == items
+    assert {len(part) for part in parts} <= {len(items) // of, -(-len(items) // of)}
+
+
+@pytest.mark.parametrize(
+    ("text", "environment", "shard"),
+    [
+        ("1/1", {}, Shard(1, 1)),
+        ("3/16", {"SLURM_ARRAY_TASK_ID": "7"}, Shard(3, 16)),
+        ("auto/16", {"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_COUNT": "1"}, Shard(7, 16)),
+        ("auto/16", {"JOB_COMPLETION_INDEX": "0"}, Shard(1, 16)),
+        ("auto/16", {"JOB_COMPLETION_INDEX": "15"}, Shard(16, 16)),
+    ],
+)
+def test_a_shard_is_typed_or_is_that_of_a_jobs_task(
+    text: str, environment: Mapping[str, str], shard: Shard
+) -> None:
+    assert shard_of(text, environment) == shard
+
+
+@pytest.mark.parametrize(
+    ("text", "environment", "said"),
+    [
+        ("0/2", {}, "--shard 0/2: give 1/N to N/N"),
+        ("3/2", {}, "give 1/N to N/N"),
+        ("1", {}, "give 1/N to N/N"),
+        ("-1/2", {}, "give 1/N to N/N"),
+        ("1/2/3", {}, "give 1/N to N/N"),
+        ("1/\x1b", {}, "give 1/N to N/N"),
+        ("1/" + "9" * 5000, {}, "give 1/N to N/N"),
+        ("auto", {"SLURM_ARRAY_TASK_ID": "1"}, "give 1/N to N/N"),
+        ("auto/4", {}, "neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX is set"),
+        (
+            "auto/4",
+            {"SLURM_ARRAY_TASK_ID": "0"},
+            r"--shard 0/4 \(SLURM_ARRAY_TASK_ID is 0\): give 1/N to N/N",
+        ),
+        ("auto/4", {"JOB_COMPLETION_INDEX": "4"}, r"--shard 5/4 \(JOB_COMPLETION_INDEX is 4\)"),
+        ("auto/4", {"SLURM_ARRAY_TASK_ID": "x\x1b["}, "give 1/N to N/N"),
+    ],
+)
+def test_what_is_no_shard_is_one_line(text: str, environment: Mapping[str, str], said: str) -> None:
+    with pytest.raises(UserError, match=said) as raised:
+        shard_of(text, environment)
+    assert str(raised.value).isprintable()
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a whole run, and the same in three shards."""
+    from typer.main import get_command
+
+    from harness.cli import app
+
+    place = tmp_path_factory.mktemp("split")
+    program = get_command(app)
+    program([*DRIVE, "--out", str(place / "whole")], standalone_mode=False)
+    for n in (1, 2, 3):
+        program([*DRIVE, "--shard", f"{n}/3", "--out", str(place / str(n))], standalone_mode=False)
+    return place
+
+
+def copied(split: Path, to: Path, *names: str) -> list[Path]:
+    for name in names:
+        shutil.copytree(split / name, to / name)
+    return [to / name for name in names]
+
+
+def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Typed, tmp_path: Path) -> None:
+    shards = copied(split, tmp_path, "2", "3", "1")
+    assert harness("merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
+    whole, merged = split / "whole", tmp_path / "merged"
+    for name in FILES:
+        assert (merged / name).read_bytes() == (whole / name).read_bytes(), name
+    ours, theirs = (json.loads((run / "run.json").read_text()) for run in (merged, whole))
+    assert {k: v for k, v in ours.items() if k not in TIMES} == {
+        k: v for k, v in theirs.items() if k not in TIMES
+    }
+    assert shlex.split(ours["command"])[:-1] == shlex.split(theirs["command"])[:-1]
+    assert {path.name for path in merged.iterdir()} == {*FILES, "run.json", "report.html"}
+    code, _, said = harness("merge", *shards, "--out", "merged")
+    assert (code, "already holds a finished run" in said) == (2, True)
+    (merged / ".work").mkdir()  # killed while it tidied up
+    assert harness("merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
+    assert not (merged / ".work").exists()
+
+
+def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed, tmp_path: Path) -> None:
+    [shard] = copied(split, tmp_path, "2")
+    code, out, _ = harness(*DRIVE[:-1], "--shard", "2/3", "--out", shard)
+    assert code == 0
+    assert out == (
+        f"wrote {shard}: 16 of 36 episodes, shard 2/3; put together all 3 with "
+        "`harness merge FOLDER... --out FOLDER`\n"
+    )
+    for other in (["--shard", "1/3"], []):
+        code, _, said = harness(*DRIVE, *other, "--out", shard)
+        assert (code, "was begun with another shard;" in said) == (2, True)
+
+
+def refused(harness: Typed, shards: list[Path]) -> str:
+    """What is said where these are merged: one line, and nothing is made."""
+    code, out, said = harness("merge", *shards, "--out", "refused")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert not Path("refused").exists()
+    return said
+
+
+def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    assert "shards 2/3 are missing; give the folders of all 3" in refused(harness, [shards[0], shards[2]])
+    shutil.rmtree(next((shards[1] / ".work").glob("episodes-*")))
+    said = refused(harness, shards)
+    assert re.search(r"/2, shard 2/3, lacks episodes 16 to 31 and 0 parts more; type its command again", said)
+
+
+def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    shutil.copytree(shards[1], tmp_path / "again")
+    file = tmp_path / "again/.work/episodes-000016/episodes.csv"
+    text = file.read_text()
+    file.write_text(text.replace("True", "False"))
+    assert re.search(
+        r"episodes 16 to 31 came out otherwise in \S*/again than in \S*/2; find out which is right",
+        refused(harness, [*shards, tmp_path / "again"]),
+    )
+    file.write_text(text)
+    assert harness("merge", *shards, tmp_path / "again", "--out", "merged", "--quiet")[0] == 0
+    assert (tmp_path / "merged/answers.jsonl").read_bytes() == (split / "whole/answers.jsonl").read_bytes()
+
+
+def test_shards_of_other_runs_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    config = shards[2] / ".work/config.json"
+    stated = json.loads(config.read_text())
+
+    def said(**changed: object) -> str:
+        config.write_text(json.dumps({**stated, **changed}))
+        return refused(harness, shards)
+
+    assert "differ in seeds; give shards of one run" in said(settings={**stated["settings"], "seeds": [1]})
+    assert "differ in model;" in said(identity={"engine": "another"})
+    assert "differ in version of numpy;" in said(versions={**stated["versions"], "numpy": "1.0"})
+    assert "shards of 3 and of 4" in said(shard="4/4")
+    assert "--shard 9/3" in said(shard="9/3")
+    assert "is no shard; give folders made with --shard" in said(shard="")
+    config.write_text("{")
+    assert "is no shard" in refused(harness, shards)
+    assert "is no shard" in refused(harness, [split / "whole"])
+
+
+def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_path: Path) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    with alone(shards[0] / ".work/lock"):
+        assert "/1 is being written by another process; wait for it" in refused(harness, shards)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--shard", "1/4", "--out", "shard"), "the work has 3 parts; give 3 shards or fewer"),
+        (("--shard", "1/3"), "--shard 1/3: give --out, a folder of its own"),
+        (("--shard", "1/3", "--out", "shard", "--latency", "measured", "--model", "swarm-tiny"),
+         "--latency measured is of one machine"),
+    ],
+)  # fmt: skip
+def test_what_no_shard_can_be(options: tuple[str, ...], said: str, harness: Typed) -> None:
+    code, _, err = harness(*DRIVE, *options)
+    assert (code, said in err, err.count("\n")) == (2, True, 1)
+    assert not Path("shard").exists()
+
+
+def test_a_dataset_of_shards_is_the_one_that_was_not_split(harness: Typed, tmp_path: Path) -> None:
+    assert harness(*BUILD, "--out", "whole/small")[0] == 0
+    for n in ("1", "2"):
+        code, out, _ = harness(*BUILD, "--shard", f"{n}/2", "--out", f"shard-{n}")
+        assert (code, out.startswith(f"wrote shard-{n}: 1 of 2 layouts, shard {n}/2;")) == (0, True)
+    assert "shards 2/2 are missing" in refused(harness, [Path("shard-1")])
+    assert "differ in " in refused(harness, [Path("shard-1"), *_of_another_seed(tmp_path)])
+    code, out, _ = harness("merge", "shard-2", "shard-1", "--out", "merged/small")
+    assert (code, out.startswith("wrote merged/small: 2 layouts, ")) == (0, True)
+    whole, merged = tmp_path / "whole/small", tmp_path / "merged/small"
+    assert {path.name for path in merged.iterdir()} == {path.name for path in whole.iterdir()}
+    for file in whole.iterdir():
+        assert (merged / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+def _of_another_seed(tmp_path: Path) -> list[Path]:
+    other = tmp_path / "other"
+    shutil.copytree(tmp_path / "shard-2", other)
+    config = other / ".work/config.json"
+    stated = json.loads(config.read_text())
+    config.write_text(json.dumps({**stated, "settings": {**stated["settings"], "seed": 7}}))
+    return [other]
