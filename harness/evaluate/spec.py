@@ -2,8 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
@@ -13,7 +11,6 @@ from harness.backends.registry import registrations
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
-from harness.core.files import digest, sha256_file
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.device import rows_of
@@ -347,10 +344,3 @@ class Spec:
             ("--helper-prompt", first.prompt.version),
             ("--helper-answer", first.answer),
         ]
-
-
-@cache
-def program_sha256() -> str:
-    """Digest of the harness's own code."""
-    root = Path(__file__).parents[1]
-    return digest({str(path.relative_to(root)): sha256_file(path) for path in root.rglob("*.py")})

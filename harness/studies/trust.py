@@ -21,6 +21,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import digest
+from harness.core.kept import code_sha256
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import (
     Estimate,
@@ -31,7 +32,6 @@ from harness.core.statistics import (
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
-from harness.evaluate.spec import program_sha256
 from harness.evaluate.walk import Decided, walk
 from harness.runs.metrics import SUCCESS, difference, mean_by_place, over_episodes, p_value
 from harness.studies.stored import Stored
@@ -318,7 +318,7 @@ class _Kept:
         self._path = path
         self._of = digest([
             stored.manifest(), str(stored.run.manifest.identity), asdict(point), list(seeds),
-            versions(), program_sha256(),
+            versions(), code_sha256("**/*.py"),
         ])  # fmt: skip
         self._cells: dict[tuple[str, str, float], Cell] = {}
         data = path.read_bytes() if path.is_file() else b""

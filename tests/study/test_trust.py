@@ -97,7 +97,7 @@ def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
         assert np.array_equal(second.cells[of].success, cell.success)
         assert second.cells[of].first == cell.first
         assert second.cells[of].nats == pytest.approx(cell.nats, abs=1e-6, nan_ok=True)
-    monkeypatch.setattr(trust, "program_sha256", lambda: "of other code")
+    monkeypatch.setattr(trust, "code_sha256", lambda *patterns: "of other code")
     again.clear()
     played(done, tmp_path)
     assert len(again) == len(lines)
