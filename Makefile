@@ -46,6 +46,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/study.py
 	$(BIN)/python benchmarks/ledger.py
 	$(BIN)/python benchmarks/answer_modes.py
+	$(BIN)/python benchmarks/worlds.py
 	$(BIN)/python benchmarks/drive.py
 	$(BIN)/python benchmarks/executors.py
 	$(BIN)/python benchmarks/report.py
