@@ -20,6 +20,7 @@ from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
 from harness.world.state import separation_m
@@ -124,7 +125,7 @@ class _Lanes:
         if arcs.any():
             k, d = lane[arcs], away[arcs]
             sign, phase, radius = self.sign[k], self.phase[k], self.radius[k]
-            phi = phase + _wrapped(np.arctan2(d[:, 1], d[:, 0]) - phase)
+            phi = phase + turned(np.arctan2(d[:, 1], d[:, 0]) - phase)
             along[arcs] = sign * (phi - phase) * radius
             lateral[arcs] = sign * (radius - np.sqrt(np.vecdot(d, d)))
         return along, lateral
@@ -194,11 +195,8 @@ class _Fleet:
         self.steering, self.acceleration = np.zeros(shape), np.zeros(shape)
         self.size = np.ones((*shape, 2))
         self.reach = np.zeros(shape)
-        self.brakes_at, self.brakes_mps2, self.brakes_to = (
-            np.full(shape, np.inf),
-            np.zeros(shape),
-            np.zeros(shape),
-        )
+        self.brakes_at = np.full(shape, np.inf)
+        self.brakes_mps2, self.brakes_to = np.zeros(shape), np.zeros(shape)
         longest = max(len(v.route) for world in worlds for v in world.vehicles)
         self.route = np.full((*shape, longest + 1), -1)
         self.section = np.zeros(shape, dtype=int)
@@ -243,8 +241,8 @@ class _Fleet:
             v.action = {"steering": float(self.steering[at]), "acceleration": float(self.acceleration[at])}
             lane = names[self.lane[at]]
             if lane != v.target_lane_index:
-                v.route = v.route[v.route.index(v.target_lane_index) + 1 :]
-                v.route = v.route[v.route.index(lane) :]
+                behind = v.route.index(v.target_lane_index)
+                v.route = v.route[v.route.index(lane, behind + 1) :]
                 v.target_lane_index = lane
             v.on_state_update()
         return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
@@ -292,7 +290,7 @@ class _Fleet:
         heading = self.lanes.heading_at(along + self.speed * of.TAU_PURSUIT, self.lane)
         turn: Floats = np.clip(-of.KP_LATERAL * lateral / speed, -1.0, 1.0)
         turn = np.clip(np.arcsin(turn), -np.pi / 4, np.pi / 4)
-        rate: Floats = of.KP_HEADING * _wrapped(heading + turn - self.heading)
+        rate: Floats = of.KP_HEADING * turned(heading + turn - self.heading)
         slip = np.clip(self.size[..., 0] / 2 / speed * rate, -1.0, 1.0)
         steering: Floats = np.arctan(2 * np.tan(np.arcsin(slip)))
         return np.clip(steering, -self.most_steering, self.most_steering)
@@ -375,9 +373,3 @@ class _Fleet:
                 self.crashed[at] |= v.crashed
                 if v.impact is not None:
                     self.impact[at], self.pushed[at] = v.impact, True
-
-
-def _wrapped(angle: Floats) -> Floats:
-    """`utils.wrap_to_pi`."""
-    turned: Floats = ((angle + np.pi) % (2 * np.pi)) - np.pi
-    return turned
