@@ -193,8 +193,10 @@ class Farm:
 
     def _take(self, place: _Place) -> _Owed | None:
         """The same, or where there is none, one from the end of the longest queue."""
-        if place.aside or (owed := self._own(place)):
-            return None if place.aside else owed
+        if place.aside:
+            return None
+        if owed := self._own(place):
+            return owed
         queue = max((other.queue for other in self._places), key=len)
         return queue.pop() if queue and not queue[-1].failed[place] else None
 
