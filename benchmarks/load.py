@@ -87,7 +87,7 @@ def repeated(run: folder.Run, decisions: int, out: Path) -> Path:
         parts.append(Decisions(part, run.actions, run.decisions.helpers))
         episodes += [msgspec.structs.replace(e, episode=e.episode + n * apart) for e in run.episodes]
         answers += [msgspec.structs.replace(a, scene=f"{n}-{a.scene}") for a in run.answers]
-    folder.write(out, run.manifest, Decisions.concat(parts), episodes, answers, run.scores)
+    folder.write(out, run.manifest, Decisions.concat(parts), episodes, [folder.lines(answers)], run.scores)
     return out
 
 

@@ -90,7 +90,10 @@ def repeated(runs: Runs, decisions: int, out: Path) -> Runs:
             ]
         ),
         [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
-        [structs.replace(answer, scene=shifted(answer.scene, by)) for by in shifts for answer in run.answers],
+        [
+            folder.lines([structs.replace(answer, scene=shifted(answer.scene, by)) for answer in run.answers])
+            for by in shifts
+        ],
         run.scores,
     )
     many = folder.read(out)

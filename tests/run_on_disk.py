@@ -107,7 +107,9 @@ def change(
     said = [_changed(msgspec.structs.asdict(one), answer) for one in read.answers]
     decisions = _decisions(rows, read.actions, read.decisions.helpers)
     manifest = read.manifest
-    folder.write(run, manifest, decisions, _all(ends, Episode), _all(said, Answer), read.scores)
+    folder.write(
+        run, manifest, decisions, _all(ends, Episode), [folder.lines(_all(said, Answer))], read.scores
+    )
 
 
 def configure(run: Path, **values: object) -> None:
@@ -139,7 +141,7 @@ def _write(
     episodes = counted(grid, decisions, _all(ends, Episode))
     world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
     summary = scores(world, grid, decisions, episodes, answers)
-    folder.write(out, manifest, decisions, episodes, answers, summary)
+    folder.write(out, manifest, decisions, episodes, [folder.lines(answers)], summary)
     return out
 
 

@@ -65,6 +65,15 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     assert same_files(tmp_path / "run", proxy_run)
 
 
+@pytest.mark.parametrize("trees", [1, 3])
+def test_how_many_trees_are_walked_at_once_changes_no_byte(
+    trees: int, proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", trees)
+    run(spec_of(small), tmp_path / "run")
+    assert same_files(tmp_path / "run", proxy_run)
+
+
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real Qwen3 with random weights, whose context is too short for some prompts."""

@@ -113,8 +113,8 @@ class Dataset:
         return Forest.of(self.trees, self.actions, self.scenario.parameters.delay_allowance_s)
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """The same with these episodes only."""
-        return replace(self, trees=tuple(tree for tree in self.trees if tree.episode in numbers))
+        """The same with these episodes only; scenes are read anew."""
+        return replace(self, trees=tuple(tree for tree in self.trees if tree.episode in numbers), _scenes={})
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
         """The scenes of decision points. Raises UserError for a damaged one, KeyError for an unknown one."""

@@ -19,7 +19,7 @@ from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
 from harness.evaluate.device import answer_s
 from harness.runs import percentiles
-from harness.runs.records import Answer, Latency, Times
+from harness.runs.records import Answer, AnswerFacts, Latency, Times
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
 MEASURED = "measured"
@@ -125,9 +125,9 @@ def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
     return np.array([cast("float", latency.fusion_s) * a.turns + a.slow_s for a in answers])
 
 
-def times(answers: Iterable[Answer]) -> dict[str, Times]:
+def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
     """How long answers took that were asked alone and came at the first attempt, by role."""
-    by_role: dict[str, list[Answer]] = {}
+    by_role: dict[str, list[Answer | AnswerFacts]] = {}
     for answer in answers:
         if answer.seconds is not None and answer.error is None and not answer.retries:
             by_role.setdefault(answer.role, []).append(answer)
@@ -138,7 +138,7 @@ def times(answers: Iterable[Answer]) -> dict[str, Times]:
     return found
 
 
-def _times(answers: Sequence[Answer], which: str) -> Times | None:
+def _times(answers: Sequence[Answer | AnswerFacts], which: str) -> Times | None:
     """Percentiles of one of their times; None where no answer has it."""
     known = [(s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None]
     if not known:

@@ -35,7 +35,7 @@ from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest, Score
+from harness.runs.records import Answer, ClosedLoop, Latency, Manifest, Score
 from harness.runs.summary import counted, scores
 
 if TYPE_CHECKING:  # the simulator is loaded by who drives
@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # the simulator is loaded by who drives
 Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
 EPISODES_AT_ONCE = 16  # of the closed loop that are driven in step and kept together, at least
+TREES_AT_ONCE = 256  # of frozen scenes that are walked and kept together
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
 
 
@@ -184,24 +185,15 @@ def _refuse_finished(out: Path) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Walked:
-    """All that a walk decided, rounded, how its episodes ended, and the answers by request id."""
-
-    decisions: Decisions
-    episodes: Sequence[Episode]
-    answers: dict[str, Answer]
-
-
-def _walked(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> Walked:
+def _part(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[str, bytes]:
+    """Walk a world; returns the files of that part of the run by name."""
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
     decisions = table(decided, world.columns(), spec.actions)
     if spec.device_profile:
         answers = asker.answers.values()
         taken = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
         decisions = decisions.replace(**taken)
-    decisions = decisions.rounded()
-    return Walked(decisions, world.episodes(), asker.answers)
+    return folder.part_files(decisions.rounded(), world.episodes(), asker.answers.values())
 
 
 def _frozen(
@@ -214,12 +206,22 @@ def _frozen(
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     begun = _begin(spec, out, begun, identity, latency)
+    chunks = _chunked(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
-        asked = together(spec.cards, models, cache)
-        asker = Asker(spec, lambda: asked, latency, place / "answers.jsonl", given, progress, more)
-        walked = _walked(spec, FrozenWorld(dataset, spec.points, spec.seeds), asker)
-        with uncollected():
-            return _written(out, _as_now(spec, begun), dataset.episodes, walked)
+        asked, kept = together(spec.cards, models, cache), place / "answers.jsonl"
+        for chunk in chunks:
+            part = place / _part_of(chunk)
+            if part.is_dir():
+                n = folder.answers_in(part)
+                more(n)
+                progress(n)
+                continue
+            asker = Asker(spec, lambda: asked, latency, kept, given, progress, more)
+            # Scenes are forgotten with their chunk; those of one chunk may be wanted again for the report.
+            some = dataset.of_episodes(frozenset(chunk)) if len(chunks) > 1 else dataset
+            folder.write_part(part, _part(spec, FrozenWorld(some, spec.points, spec.seeds), asker))
+            kept.unlink(missing_ok=True)
+        return _gathered(out, _as_now(spec, begun), chunks, place)
 
 
 def _begin_driving(
@@ -245,13 +247,16 @@ def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
     numbers: Sequence[int] = range(world.episodes)
     if drawn_of := world.selection:
         numbers = drawn(range(drawn_of["of"]), drawn_of["sample"], drawn_of["sample_seed"], drawn_of["of"])
-    size = max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS))
+    return _chunked(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
+
+
+def _chunked(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
     return [numbers[at : at + size] for at in range(0, len(numbers), size)]
 
 
 def _part_of(chunk: Sequence[int]) -> str:
     """Name of the folder that keeps a chunk."""
-    return f"episodes-{chunk[0]:06d}"
+    return f"episodes-{chunk[0]:06d}-{chunk[-1]:06d}"
 
 
 def _named(chunk: Sequence[int]) -> str:
@@ -298,21 +303,32 @@ def _driven(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) 
 
     asker = Asker(spec, backend, begun.latency)
     world = LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
-    walked = _walked(spec, world, asker)
-    return folder.part_files(walked.decisions, walked.episodes, list(walked.answers.values()))
+    return _part(spec, world, asker)
 
 
 def _gathered(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score all chunks of a closed-loop run, which lie in a working folder, and write the run's files."""
-    actions = begun.settings["actions"]
+    """Score all chunks of a run, which lie in a working folder, and write the run's files."""
+    settings, parts = begun.settings, [place / _part_of(chunk) for chunk in chunks]
+    names = tuple(condition["name"] for condition in settings["conditions"])
+    grid = Grid(names, tuple(settings["seeds"]), tuple(chain.from_iterable(chunks)))
     with uncollected():
-        read = [folder.read_part(place / _part_of(chunk), actions) for chunk in chunks]
-        walked = Walked(
-            Decisions.concat([decisions for decisions, _, _ in read]),
-            [episode for _, episodes, _ in read for episode in episodes],
-            {answer.id: answer for _, _, answers in read for answer in answers},
-        )
-        return _written(out, begun, tuple(chain.from_iterable(chunks)), walked)
+        read = [folder.read_part(part, settings["actions"]) for part in parts]
+        decisions = Decisions.concat([decisions for decisions, _, _ in read])
+        answers = [answer for _, _, answers in read for answer in answers]
+        episodes = counted(grid, decisions, [episode for _, episodes, _ in read for episode in episodes])
+        summary = scores(settings["world"]["kind"], grid, decisions, episodes, answers)
+        manifest = msgspec.convert({
+            "format": FORMAT, "name": out.name, "created": begun.created,
+            "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
+            "latency": msgspec.to_builtins(begun.latency),
+            "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": begun.identity,
+            "cached_answers": sum(answer.cached for answer in answers),
+            "engine_errors": sum(answer.error is not None for answer in answers),
+            "retries": sum(answer.retries for answer in answers),
+            "versions": begun.versions,
+        }, Manifest)  # fmt: skip
+        folder.write(out, manifest, decisions, episodes, folder.lines_of(parts), summary)
+    return Evaluated(out, manifest, summary)
 
 
 def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
@@ -347,28 +363,6 @@ def _as_now(spec: Spec, begun: Begun) -> Begun:
     return msgspec.structs.replace(
         begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
     )
-
-
-def _written(out: Path, begun: Begun, numbers: tuple[int, ...], walked: Walked) -> Evaluated:
-    """Score a walk and write the run's files, the manifest last."""
-    settings = begun.settings
-    names = tuple(condition["name"] for condition in settings["conditions"])
-    grid = Grid(names, tuple(settings["seeds"]), numbers)
-    episodes = counted(grid, walked.decisions, walked.episodes)
-    answers = folder.ordered(walked.answers.values(), walked.decisions)
-    summary = scores(settings["world"]["kind"], grid, walked.decisions, episodes, answers)
-    manifest = msgspec.convert({
-        "format": FORMAT, "name": out.name, "created": begun.created,
-        "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
-        "latency": msgspec.to_builtins(begun.latency),
-        "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": begun.identity,
-        "cached_answers": sum(answer.cached for answer in answers),
-        "engine_errors": sum(answer.error is not None for answer in answers),
-        "retries": sum(answer.retries for answer in answers),
-        "versions": begun.versions,
-    }, Manifest)  # fmt: skip
-    folder.write(out, manifest, walked.decisions, episodes, answers, summary)
-    return Evaluated(out, manifest, summary)
 
 
 def made(

@@ -8,7 +8,7 @@ import csv
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
+from harness.core.files import replacing, write_whole
 from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
@@ -30,7 +30,17 @@ from harness.runs import attribution
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid, World
-from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Manifest, Score, Speed, Variant
+from harness.runs.records import (
+    Answer,
+    AnswerFacts,
+    ClosedLoop,
+    Episode,
+    FrozenScenes,
+    Manifest,
+    Score,
+    Speed,
+    Variant,
+)
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -45,7 +55,7 @@ _BROKEN = (
     csv.Error,
 )
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-_ANSWER = msgspec.json.Decoder(Answer)
+_ANSWER, _FACTS = msgspec.json.Decoder(Answer), msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
 
 
@@ -220,10 +230,20 @@ def read(path: Path) -> Run:
 
 def write(
     out: Path, manifest: Manifest, decisions: Decisions, episodes: Sequence[Episode],
-    answers: Sequence[Answer], scores: Sequence[Score],
+    answers: Iterable[bytes], scores: Sequence[Score],
 ) -> None:  # fmt: skip
-    """Write a run's files, the manifest last. Decisions are rounded already."""
-    write_whole(out / "answers.jsonl", _ENCODER.encode_lines(answers))
+    """Write a run's files, the manifest last.
+
+    Args:
+        out: its folder.
+        manifest: `run.json`.
+        decisions: rounded already.
+        episodes: one of each condition, seed and episode.
+        answers: lines of `answers.jsonl`, some at a time.
+        scores: `summary.csv`.
+    """
+    with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
+        file.writelines(answers)
     decisions.write(out / "decisions.parquet")
     write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
@@ -232,12 +252,12 @@ def write(
 
 
 def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
+    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer]
 ) -> dict[str, bytes]:
-    """The files of a part of a run, by name."""
+    """The files of a part of a run, by name. Answers may be in any order."""
     return {
         "decisions.parquet": decisions.encoded(),
-        "answers.jsonl": _ENCODER.encode_lines(answers),
+        "answers.jsonl": lines(ordered(answers, decisions)),
         "episodes.csv": csv_text(Episode, episodes).encode(),
     }
 
@@ -251,12 +271,30 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     os.replace(part, out)
 
 
-def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[Answer]]:
+def read_part(
+    part: Path, actions: Sequence[str]
+) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
     """What `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
-        _answers(part / "answers.jsonl", len(actions)),
+        _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
     ))  # fmt: skip
+
+
+def answers_in(part: Path) -> int:
+    """How many answers a part has."""
+    return (part / "answers.jsonl").read_bytes().count(b"\n")
+
+
+def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
+    """`answers.jsonl` of a run that has these parts, a part at a time."""
+    for part in parts:
+        yield (part / "answers.jsonl").read_bytes()
+
+
+def lines(answers: Sequence[Answer]) -> bytes:
+    """Lines of `answers.jsonl`."""
+    return _ENCODER.encode_lines(answers)
 
 
 def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:

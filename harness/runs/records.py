@@ -113,6 +113,32 @@ class Answer(Struct, frozen=True, kw_only=True):
         return "+".join((self.viewer, *self.heard)) + (BLIND if self.role == "blind" else "")
 
 
+class AnswerFacts(Struct, frozen=True):
+    """What a run's figures count of an answer, in its own words: all answers of a run fit into memory so.
+
+    The fields are those of `Answer`.
+    """
+
+    scene: str
+    role: Role
+    verdict: Literal["strict", "recovered", "failed"]
+    prompt_tokens: int | None
+    completion_tokens: int | None
+    seconds: float | None
+    label_mass: float | None
+    retries: int
+    cached: bool
+    error: str | None
+    first_token_s: float | None = None
+    token_s: float | None = None
+    first: FirstTurn | UnsetType = UNSET
+
+    @property
+    def turns(self) -> int:
+        """How many questions it took: 2 with a repair turn."""
+        return 2 if self.first else 1
+
+
 class Times(Struct, frozen=True, omit_defaults=True):
     """How long some answers took, each asked alone: how many, and percentiles in seconds.
 

@@ -33,14 +33,18 @@ from harness.runs.metrics import (
     percentiles,
     sum_by_place,
 )
-from harness.runs.records import Answer, Episode, Role, Score
+from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score
 
 BASELINE = "single-local"
 ROLES: tuple[Role, ...] = ("ego", "helper", "merge", "blind")
 
 
 def scores(
-    world: World, grid: Grid, decisions: Decisions, episodes: Sequence[Episode], answers: Sequence[Answer]
+    world: World,
+    grid: Grid,
+    decisions: Decisions,
+    episodes: Sequence[Episode],
+    answers: Sequence[Answer | AnswerFacts],
 ) -> list[Score]:
     """Every metric of a run; `episodes` by place."""
     values = by_episode(metrics_of(world), grid, decisions, episodes)
@@ -84,7 +88,7 @@ def _gains(conditions: Sequence[str], success: Floats) -> Iterator[Score]:
                 yield Score.of(condition, name, rate_difference(mine.T, other.T), "episodes")
 
 
-def _of_answers(answers: Sequence[Answer], decisions: Decisions) -> Iterator[Score]:
+def _of_answers(answers: Sequence[Answer | AnswerFacts], decisions: Decisions) -> Iterator[Score]:
     """How answers were parsed, and how long they and their prompts are, by role.
 
     Intervals are over episodes, whose answers go together.

@@ -118,7 +118,7 @@ def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(har
         f"harness {' '.join(line)}\n"
     )
     kept = {part.name for part in (tmp_path / "run/.work").glob("episodes-*")}
-    assert kept == {"episodes-000000", "episodes-000032"}
+    assert kept == {"episodes-000000-000015", "episodes-000032-000032"}
     assert harness(*line) == (0, "", "")
     assert harness(*line[:-1], "whole", "--workers", "1") == (0, "", "")
     assert all((tmp_path / "run" / n).read_bytes() == (tmp_path / "whole" / n).read_bytes() for n in FILES)

@@ -45,7 +45,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
         msgspec.convert(msgspec.to_builtins({**manifest, **stated}), Manifest),
         decisions.rounded(),
         episodes,
-        folder.ordered(answers, decisions),
+        [folder.lines(folder.ordered(answers, decisions))],
         scores("frozen", grid, decisions, episodes, answers),
     )
     return out
