@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import structs
 
-from harness.dataset.load import Dataset, Scene
+from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Tree
 
 
@@ -41,7 +41,9 @@ class Copies(Dataset):
 def copies(dataset: Dataset, n: int) -> Copies:
     """The dataset n times."""
     apart = len(dataset.trees)
-    trees = tuple(_tree(tree, again * apart) for again in range(n) for tree in dataset.trees)
+    trees = Trees(
+        range(n * apart), lambda number: _tree(dataset.trees[number % apart], number // apart * apart)
+    )
     return Copies(dataset.path, dataset.manifest, dataset.sha256, trees, dataset.trusted, original=dataset)
 
 

@@ -13,7 +13,7 @@ from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.work import tidy
-from harness.dataset.load import Dataset, Scene
+from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Edge, End
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
@@ -220,7 +220,8 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
             for step, name in enumerate(named)
         ]  # fmt: skip
         trees.append(msgspec.structs.replace(tree, levels=levels))
-    return replace(dataset, trees=tuple(trees), _scenes=scenes)
+    made = {tree.episode: tree for tree in trees}
+    return replace(dataset, trees=Trees(made, made.__getitem__), _scenes=scenes)
 
 
 def _edge(action: str, outcome: float | str | None, last: bool) -> Edge:

@@ -1,17 +1,20 @@
 """Reading a frozen dataset: what has not the digest and the form that were stated for it is not used."""
 
 import os
+import re
 import tomllib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 from zipfile import ZipFile
 
 import msgspec
 import numpy as np
 
+from harness.core.arrays import Bools
 from harness.core.errors import UserError, unknown
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
@@ -31,6 +34,10 @@ from harness.dataset.verify import (
 )
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
+
+# Of a dataset, the last that were read stay: some 120 and 100 MB.
+SCENES_KEPT, TREES_KEPT = 4096, 512
+TREES_AT_ONCE = 256  # whose arrays are made where every tree is asked something
 
 
 @dataclass(frozen=True)
@@ -68,9 +75,40 @@ class Scene:
         )
 
 
+class Trees(Sequence[Tree]):
+    """The decision trees of some episodes by place; each is read when it is asked for."""
+
+    def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
+        """The trees of these episodes; `read` gives an episode's."""
+        self.numbers, self.read = tuple(numbers), read
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, place: int, /) -> Tree: ...
+    @overload
+    def __getitem__(self, place: slice, /) -> "Trees": ...
+
+    def __getitem__(self, place: int | slice, /) -> "Tree | Trees":
+        if isinstance(place, slice):
+            return Trees(self.numbers[place], self.read)
+        return self.read(self.numbers[place])
+
+    @cached_property
+    def _numbers(self) -> frozenset[int]:
+        return frozenset(self.numbers)
+
+    def of_episode(self, number: int) -> Tree:
+        """An episode's. Raises KeyError if it is none of these."""
+        if number not in self._numbers:
+            raise KeyError(number)
+        return self.read(number)
+
+
 @dataclass(frozen=True)
 class Dataset:
-    """A verified dataset. Its scenes are read, and verified, when they are first asked for.
+    """A verified dataset. Its trees and scenes are read, and verified, when they are asked for.
 
     Attributes:
         path: its folder.
@@ -83,7 +121,7 @@ class Dataset:
     path: Path
     manifest: Manifest
     sha256: str
-    trees: tuple[Tree, ...]
+    trees: Trees
     trusted: bool = False
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
 
@@ -105,33 +143,71 @@ class Dataset:
     @property
     def episodes(self) -> tuple[int, ...]:
         """Numbers of the episodes."""
-        return tuple(tree.episode for tree in self.trees)
+        return self.trees.numbers
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Layout seeds of the episodes."""
+        return tuple(self.manifest.seed + number for number in self.episodes)
+
+    @cached_property
+    def nodes(self) -> int:
+        """How many decision points the trees have."""
+        return sum(len(level) for tree in self.trees for level in tree.levels)
 
     @cached_property
     def forest(self) -> Forest:
         """The trees as arrays."""
-        return Forest.of(self.trees, self.actions, self.scenario.parameters.delay_allowance_s)
+        return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """The same with these episodes only; scenes are read anew."""
-        return replace(self, trees=tuple(tree for tree in self.trees if tree.episode in numbers), _scenes={})
+        """The same with these episodes only."""
+        trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
+        return replace(self, trees=trees)
+
+    def driver_success(self) -> dict[str, Bools]:
+        """Whether each reference driver succeeds in each episode, (E,)."""
+        some = [
+            replace(self, trees=self.trees[at : at + TREES_AT_ONCE]).forest
+            for at in range(0, len(self.trees), TREES_AT_ONCE)
+        ]
+        drivers = some[0].drivers
+        return {name: np.concatenate([forest.driver_success(name) for forest in some]) for name in drivers}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
         """The scenes of decision points. Raises UserError for a damaged one, KeyError for an unknown one."""
         wanted: dict[tuple[int, int], list[int]] = {}  # places in each level of each tree
-        forest = self.forest
         for name in ids:
             if name not in self._scenes:
-                n = forest.place[name]
-                tree, step = int(forest.tree[n]), int(forest.step[n])
-                start = int(forest.root[tree]) + sum(map(len, self.trees[tree].levels[:step]))
-                wanted.setdefault((tree, step), []).append(n - start)
+                *level, place = self._place(name)
+                wanted.setdefault((level[0], level[1]), []).append(place)
         if wanted:
             with opened(self.path) as file:
-                for (tree, step), places in wanted.items():
-                    for record in self._records(file, self.trees[tree], step, places):
+                for (number, step), places in wanted.items():
+                    for record in self._records(file, self.trees.read(number), step, places):
                         self._scenes[record["scene"]] = Scene(record)
-        return [self._scenes[name] for name in ids]
+        scenes = [self._scenes[name] for name in ids]
+        for name in list(islice(self._scenes, max(0, len(self._scenes) - SCENES_KEPT))):
+            del self._scenes[name]
+        return scenes
+
+    def __contains__(self, name: str) -> bool:
+        """Whether this is the id of one of its decision points."""
+        try:
+            self._place(name)
+        except KeyError:
+            return False
+        return True
+
+    def _place(self, name: str) -> tuple[int, int, int]:
+        """A decision point's episode, step and place in that level. Raises KeyError for an unknown one."""
+        if begins := re.match("([0-9]{5})-([0-9])", name):
+            episode, step = map(int, begins.groups())
+            for at, level in enumerate(self.trees.of_episode(episode).levels):
+                for place, point in enumerate(level if at == step else ()):
+                    if point.scene == name:
+                        return episode, step, place
+        raise KeyError(name)
 
     def _records(
         self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]
@@ -205,11 +281,19 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):
         raise unusable(path, problem)
-    trusted = digest in released_digests()
-    numbers = range(manifest.episodes)[:limit]
-    try:
-        with opened(path) as file:
-            trees = tuple(read_tree(file, manifest, number, trusted) for number in numbers)
-    except Damaged as damage:
-        raise unusable(path, str(damage)) from None
+    trusted, checked = digest in released_digests(), set[int]()
+
+    @lru_cache(maxsize=TREES_KEPT)
+    def read(number: int) -> Tree:
+        try:
+            with opened(path) as file:
+                tree = read_tree(file, manifest, number, trusted or number in checked)
+        except Damaged as damage:
+            raise unusable(path, str(damage)) from None
+        checked.add(number)
+        return tree
+
+    trees = Trees(range(manifest.episodes)[:limit], read)
+    for number in trees.numbers:
+        read(number)
     return Dataset(path, manifest, digest, trees, trusted)

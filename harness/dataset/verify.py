@@ -1,11 +1,13 @@
 """Whether a dataset is what it says: its files by digest, each tree and decision point by form and sense."""
 
+import os
 import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -125,11 +127,21 @@ class Damaged(Exception):
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
     """A dataset's layouts. Digests pin what is in them: how a machine compresses it is its own."""
+    file = path / LAYOUTS
     try:
-        with ZipFile(path / LAYOUTS) as file:
-            yield file
+        now = file.stat()
+        yield _layouts(file, (now.st_ino, now.st_size, now.st_mtime_ns), os.getpid())
     except (OSError, zipfile.BadZipFile) as error:
         raise unusable(path, f"{LAYOUTS}: cannot be read ({printable(error)})") from None
+
+
+@lru_cache(maxsize=2)
+def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
+    """A file that stays open, since to list what is in a large one takes long.
+
+    A `state` of it is read by one `process`: a forked one would move its parent's place in the file.
+    """
+    return ZipFile(file)
 
 
 def _entry(file: ZipFile, name: str, sha256: str) -> bytes:

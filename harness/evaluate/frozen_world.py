@@ -44,14 +44,13 @@ class FrozenSource:
     @property
     def layout_seeds(self) -> Sequence[int]:
         """Of the selected episodes."""
-        seeds: list[int] = self.dataset.forest.seeds.tolist()
-        return seeds
+        return self.dataset.seeds
 
     def record(self) -> FrozenScenes:
         """The dataset, pinned by its digest."""
         p = self.scenario.parameters
         return FrozenScenes(
-            name=self.dataset.name, sha256=self.dataset.sha256, nodes=len(self.dataset.forest.ids),
+            name=self.dataset.name, sha256=self.dataset.sha256, nodes=self.dataset.nodes,
             episodes=len(self.dataset.episodes), limit=self.selection.limit,
             delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path), selection=self.selection.given,

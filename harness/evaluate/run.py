@@ -217,7 +217,6 @@ def _frozen(
                 progress(n)
                 continue
             asker = Asker(spec, lambda: asked, latency, kept, given, progress, more)
-            # Scenes are forgotten with their chunk; those of one chunk may be wanted again for the report.
             some = dataset.of_episodes(frozenset(chunk)) if len(chunks) > 1 else dataset
             folder.write_part(part, _part(spec, FrozenWorld(some, spec.points, spec.seeds), asker))
             kept.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 
 from harness.core.files import digest
+from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.device import answer_s
@@ -23,6 +24,7 @@ from harness.world import scenarios
 from harness.world.perception.graph import blinded
 
 BLOCK = 24  # scenes that are compressed and read together
+READ = 64 * BLOCK  # that are in memory at a time
 FRAMES = 400  # cameras' pictures in a page, each some 3.5 kB of it
 REPLAYED = 60  # decision points of a closed-loop run that are replayed, for their picture and prompts
 
@@ -90,7 +92,10 @@ class Decisions:
         self._ends = [_ends(run) for run in runs.runs]
         self._left_out = [_left_out(run) for run in runs.runs]
         self._episodes = [_episodes(run) for run in runs.runs]
-        self._scenes = self._frozen() if runs.dataset else self._played(failed)
+        if runs.dataset:
+            for run in runs.runs:
+                check_scenes(run, runs.dataset)
+        self._replayed = {} if runs.dataset else self._played(failed)
         self._framed = self._telling()
         self.index = {
             "actions": runs.actions,
@@ -101,12 +106,6 @@ class Decisions:
             "statuses": list(map(str, Status)),
             "runs": [self._indexed(n, list(of)) for n, of in enumerate(failed)],
         }
-
-    def _frozen(self) -> dict[str, Scene]:
-        assert self._runs.dataset is not None
-        for run in self._runs.runs:
-            check_scenes(run, self._runs.dataset)
-        return dict(zip(self.ids, self._runs.dataset.scenes(self.ids), strict=True))
 
     def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
         """The telling decision points, replayed; none where this simulator differs from the run's."""
@@ -128,9 +127,9 @@ class Decisions:
 
     def _telling(self) -> set[str]:
         """Decision points that have cameras' pictures: where episodes are lost, then a sample."""
-        most = FRAMES // max((len(scene.viewers) for scene in self._scenes.values()), default=1)
+        most = FRAMES // (1 + max(run.decisions.helpers for run in self._runs.runs))
         if self._runs.live:
-            return set(spread(list(self._scenes), most))
+            return set(spread(list(self._replayed), most))
         runs = self._runs.runs
         first = spread(list(dict.fromkeys(scene for run in runs for scene in lost(run))), most)
         more = dict.fromkeys(scene for run in runs for scene in pick(run, {}, most) if scene not in first)
@@ -167,19 +166,20 @@ class Decisions:
 
     def blocks(self) -> Iterator[list[dict[str, Any]]]:
         """Details of the scenes, so many a block."""
-        for start in range(0, len(self.ids), BLOCK):
-            yield [self._detail(scene) for scene in self.ids[start : start + BLOCK]]
+        for start in range(0, len(self.ids), READ):
+            ids, forest, scenes = self.ids[start : start + READ], None, self._replayed
+            if dataset := self._runs.dataset:
+                scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
+                forest = dataset.of_episodes({scene.record["episode"] for scene in scenes.values()}).forest
+            for at in range(0, len(ids), BLOCK):
+                yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
 
-    def _detail(self, name: str) -> dict[str, Any]:
-        scene = self._scenes.get(name)
+    def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
         sent: dict[str, Any] = {}
-        outcomes = None
-        if scene and self._runs.dataset:
-            outcomes = scenes.outcomes(self._runs.dataset.forest, name)
         return {
             "world": scene and scenes.world(scene),
             "cameras": scene and name in self._framed and scenes.cameras(self._runs.scenario, scene),
-            "outcomes": outcomes,
+            "outcomes": forest and scenes.outcomes(forest, name),
             "runs": [self._of_run(n, name, scene, sent) for n in range(len(self._runs.runs))],
             "prompts": list(sent.values()),
         }

@@ -126,5 +126,5 @@ def _references(runs: Runs) -> dict[str, float]:
         }
         scores = {name: run.score(run.conditions[0], "success_rate") for name, run in drivers.items()}
         return {name: score.value for name, score in scores.items() if score and score.value is not None}
-    forest = runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes}).forest
-    return {driver: float(forest.driver_success(driver).mean()) for driver in forest.drivers}
+    some = runs.dataset.of_episodes({number for run in runs.runs for number in run.grid.episodes})
+    return {driver: float(success.mean()) for driver, success in some.driver_success().items()}

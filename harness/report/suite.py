@@ -94,8 +94,8 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
 
 
 def _drivers(dataset: Dataset, run: Run) -> dict[str, Score]:
-    forest = dataset.of_episodes(run.grid.episodes).forest
-    rates = {driver: rate_interval(forest.driver_success(driver).astype(float)) for driver in forest.drivers}
+    successes = dataset.of_episodes(run.grid.episodes).driver_success()
+    rates = {driver: rate_interval(success.astype(float)) for driver, success in successes.items()}
     return {driver: Score.of(driver, SUCCESS, rate, "episodes") for driver, rate in rates.items()}
 
 

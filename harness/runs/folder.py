@@ -327,12 +327,14 @@ def dataset_of(run: Run) -> Dataset:
 
 def check_scenes(run: Run, dataset: Dataset) -> None:
     """Raise UserError if a run decided or answered in a scene that its dataset has not."""
+    decided = run.decisions.scenes
     of_files: dict[str, Iterable[str]] = {
-        "decisions.parquet": run.decisions.scenes, "answers.jsonl": run.answers_by_scene,
-    }  # fmt: skip
+        "decisions.parquet": decided,
+        "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
+    }
     for file, scenes in of_files.items():
         for scene in scenes:
-            if scene not in dataset.forest.place:
+            if scene not in dataset:
                 raise UserError(
                     f"{printable(run.path / file)} has scene {printable(scene)!r}, "
                     "which its dataset has not; make the run again"

@@ -32,11 +32,10 @@ class Standing:
 
 def rank(dataset: Dataset, workers: Workers, progress: Callable[[int], None]) -> dict[str, Standing]:
     """Each driver's standing over the dataset's episodes, every one of which is driven again."""
-    seeds = [tree.episode_seed for tree in dataset.trees]
-    live = drive_apart(dataset.scenario, seeds, workers, progress)
+    live = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
+    frozen = dataset.driver_success()
     return {
-        driver: _standing(dataset.forest.driver_success(driver), np.array([o[driver].success for o in live]))
-        for driver in DRIVERS
+        driver: _standing(frozen[driver], np.array([o[driver].success for o in live])) for driver in DRIVERS
     }
 
 
