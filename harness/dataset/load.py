@@ -153,6 +153,8 @@ class Dataset:
     @cached_property
     def nodes(self) -> int:
         """How many decision points the trees have."""
+        if len(self.trees) == self.manifest.episodes:
+            return self.manifest.nodes
         return sum(len(level) for tree in self.trees for level in tree.levels)
 
     @cached_property

@@ -249,6 +249,7 @@ def write(
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
+    pa.default_memory_pool().release_unused()  # a page is often made next, of tables of its own
 
 
 def part_files(

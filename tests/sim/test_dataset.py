@@ -95,6 +95,37 @@ def test_a_built_dataset_is_sound_and_has_every_course(small, small_folder):
         assert sum(sizes) < 130
 
 
+def test_trees_and_scenes_that_were_forgotten_are_read_again_as_they_were(small, small_folder, monkeypatch):
+    monkeypatch.setattr("harness.dataset.load.TREES_KEPT", 2)
+    monkeypatch.setattr("harness.dataset.load.SCENES_KEPT", 3)
+    data = load(small_folder)
+    assert list(data.trees) == list(small.trees)
+    ids, records = small.forest.ids[::7], [scene.record for scene in small.scenes(small.forest.ids[::7])]
+    for _ in range(2):
+        assert [scene.record for scene in data.scenes(ids)] == records
+        assert len(data._scenes) == 3
+
+
+def test_a_dataset_knows_which_ids_are_its_own(small):
+    one = small.of_episodes({2})
+    [mine, *_] = one.forest.ids
+    assert mine in one
+    assert mine in small
+    assert small.forest.ids[0] not in one
+    for other in (
+        "",
+        "2",
+        "00002-0",
+        f"{mine}x",
+        mine.replace("-0-", "-9-"),
+        "00099-0-000000000000",
+        "é" * 99,
+    ):
+        assert other not in small
+    with pytest.raises(KeyError):
+        one.scenes([small.forest.ids[0]])
+
+
 def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
     for scene in scenes_of(small)[::9]:
         assert scene.viewers == ("v1", "v2", "v3", "v4")

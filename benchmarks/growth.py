@@ -1,0 +1,168 @@
+"""How time and memory grow with the decisions of a run, and time with the workers.
+
+Decisions: `harness eval --model proxy`, report included, on the first layouts of the shipped dataset, and on
+all of them many times over where they are too few. The limit of the time is what the proxy takes to answer
+all that is asked; that of the memory, a process that only holds the decisions as a table and the page's text.
+Workers: chunks that wait for a second, four a worker, so that any number of them fits the cores that are
+here; the limit is those four seconds.
+
+    python benchmarks/growth.py [--decisions 1000 10000 100000 1000000] [--workers 1 2 4 8 16 32 64]
+                                [--picture growth.svg]
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from time import perf_counter, process_time
+
+from commands import HERE, copied, run
+from executors import nap
+from matplotlib.figure import Figure
+
+from harness.backends import cards
+from harness.backends.registry import open_backend
+from harness.core.parallel import spread
+from harness.core.resources import DATASET
+from harness.dataset.load import find, load
+from harness.evaluate.agent import Agent
+from harness.evaluate.asking import requests
+from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.spec import Spec
+from harness.prompts import versions as prompts
+from harness.report.drawing.colours import BAD, GREY, ROLES
+from harness.report.drawing.pictures import save, styled
+from harness.runs import folder
+
+FIRST = 20  # layouts that tell how many decisions a layout has, and how long an answer takes
+A_WORKER = 4
+HOLDS = """
+import resource, sys
+from pathlib import Path
+import pyarrow.parquet as pq
+run = Path(sys.argv[1])
+held = pq.read_table(run / "decisions.parquet"), (run / "report.html").read_text()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+Row = Mapping[str, float]
+
+
+def main() -> None:
+    """Print two tables and one line of JSON, and draw them."""
+    arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    arguments.add_argument("--decisions", type=int, nargs="*", default=[1_000, 10_000, 100_000, 1_000_000])
+    arguments.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8, 16, 32, 64])
+    arguments.add_argument("--picture", type=Path)
+    given = arguments.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        decisions = of_decisions(given.decisions, Path(scratch))
+    workers = [of_workers(n) for n in given.workers]
+    for rows in (decisions, workers):
+        print("".join(f"{name:>12}" for name in rows[0]))
+        for row in rows:
+            print("".join(f"{value:12.0f}" if value >= 100 else f"{value:12.2f}" for value in row.values()))
+    if given.picture:
+        save(drawn(decisions, workers), given.picture, "svg")
+    print(json.dumps({"decisions": decisions, "workers": workers}))
+
+
+def of_decisions(sizes: Sequence[int], scratch: Path) -> list[Row]:
+    """Runs of about so many decisions: what each took, and its limits."""
+    shipped = load(find(DATASET))
+    each = len(evaluated(["--limit", str(FIRST)], scratch)[0].decisions) / FIRST
+    answer_s = of_an_answer()
+    rows: list[Row] = []
+    for size in sizes:
+        layouts, options = math.ceil(size / each), ["--limit", str(math.ceil(size / each))]
+        if layouts > len(shipped.episodes):
+            large = copied(math.ceil(layouts / len(shipped.episodes)), scratch / f"large-{size}")
+            options = ["--dataset", str(large)]
+        made, row = evaluated(options, scratch)
+        command = [sys.executable, "-c", HOLDS, str(made.path)]
+        held = subprocess.run(command, capture_output=True, check=True, text=True).stdout
+        answers = (made.path / "answers.jsonl").read_bytes().count(b"\n")
+        rows.append({
+            "decisions": len(made.decisions), **row, "limit_s": answer_s * answers, "limit_mb": float(held),
+        })  # fmt: skip
+    return rows
+
+
+def evaluated(options: Sequence[str], scratch: Path) -> tuple[folder.Run, Row]:
+    """`harness eval --model proxy` with some options: the run, its wall and CPU time and its memory."""
+    start = perf_counter()
+    cpu_s, peak_mb = run(HERE, ["eval", "--model", "proxy", "--quiet", *options, "--out", "OUT"], scratch)
+    row = {"wall_s": perf_counter() - start, "cpu_s": cpu_s, "peak_mb": peak_mb}
+    return folder.read(scratch / "run"), row
+
+
+def of_an_answer() -> float:
+    """CPU seconds that the proxy takes to answer."""
+    dataset, card = load(find(DATASET), FIRST), cards.resolve("proxy")
+    spec = Spec(Agent(card, prompts.load("v2")), FrozenSource(dataset), (), (0,))
+    asked = list(requests(spec, dataset.scenes(dataset.courses())))
+    backend = open_backend(card)
+    start = process_time()
+    backend.complete(asked)
+    return (process_time() - start) / len(asked)
+
+
+def of_workers(workers: int) -> Row:
+    """Wall time of four chunks a worker, after one each that pays for the start."""
+    both = [[0.0] * workers + [1.0] * (A_WORKER * workers), [0.0] * workers]
+    took = []
+    for chunks in both:
+        start = perf_counter()
+        spread(nap, chunks, workers, lambda done: None, repeatable=False)
+        took.append(perf_counter() - start)
+    return {"workers": workers, "wall_s": took[0], "start_s": took[1], "limit_s": float(A_WORKER)}
+
+
+@styled
+def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
+    """Three charts, each with its limit."""
+    figure = Figure(figsize=(7.2, 2.6))
+    time, memory, hands = figure.subplots(1, 3)
+
+    def line(axes, rows, x: str, y: Callable[[Row], float], colour: str, label: str, end: str = "-") -> None:  # type: ignore[no-untyped-def]
+        axes.plot(
+            [row[x] for row in rows],
+            [y(row) for row in rows],
+            end,
+            marker="o",
+            ms=3,
+            color=colour,
+            label=label,
+        )
+
+    line(
+        time, decisions, "decisions", lambda row: row["cpu_s"], ROLES["ego"], "harness eval, report included"
+    )
+    line(time, decisions, "decisions", lambda row: row["limit_s"], GREY, "limit: the proxy's answers", "--")
+    time.set(xscale="log", yscale="log", xlabel="decisions", ylabel="CPU seconds")
+    line(memory, decisions, "decisions", lambda row: row["peak_mb"], ROLES["ego"], "peak of harness eval")
+    line(memory, decisions, "decisions", lambda row: row["limit_mb"], GREY, "limit: table and page", "--")
+    memory.axhline(2000, color=BAD, lw=0.8)
+    memory.set(xscale="log", yscale="log", xlabel="decisions", ylabel="MB")
+    line(
+        hands, workers, "workers", lambda row: row["wall_s"] - row["start_s"], ROLES["ego"], "after the start"
+    )
+    line(hands, workers, "workers", lambda row: row["wall_s"], ROLES["helper"], "with the start")
+    line(hands, workers, "workers", lambda row: row["limit_s"], GREY, "limit: the chunks' own", "--")
+    hands.set(xscale="log", xlabel="workers", ylabel="seconds of four chunks a worker", ylim=(0, None))
+    hands.set_xticks(
+        [row["workers"] for row in workers], [f"{row['workers']:.0f}" for row in workers], minor=False
+    )
+    hands.minorticks_off()
+    for axes in (time, memory, hands):
+        axes.legend(fontsize=6, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.17, top=0.97, wspace=0.3)
+    return figure
+
+
+if __name__ == "__main__":
+    main()
