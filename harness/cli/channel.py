@@ -222,9 +222,10 @@ def crowd(
     """
     import numpy as np
 
+    from harness.core.config import settable
     from harness.radio.channel import Physical
     from harness.radio.constant import density_coupled_loss
-    from harness.radio.profiles import CHANNELS, settable
+    from harness.radio.profiles import CHANNELS
     from harness.studies.reception import SIGHTS, crowded
 
     if sight not in SIGHTS:

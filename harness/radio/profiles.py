@@ -5,23 +5,21 @@ point in the group `swarmdrive.channels`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_type_hints
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from harness.core.config import convert, toml
-from harness.core.errors import UserError, printable, unknown
+from harness.core.config import convert, settable, toml
+from harness.core.errors import printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.resources import entries, find
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
-
-Settings = TypeVar("Settings")
 
 # Name of a model to its class, or to a function of a file's parameters, its folder and what to call them in
 # messages. A physical one takes a while to import, so only what is named is.
@@ -101,49 +99,6 @@ def _number(value: object) -> float:
         return float(value) if isinstance(value, str | int | float) else np.nan
     except ValueError:
         return np.nan
-
-
-def changed(channel: Settings, settings: Mapping[str, str], where: str) -> Settings:
-    """The channel, or another frozen dataclass, with some of its fields from their texts.
-
-    Args:
-        channel: what is changed.
-        settings: fields' names and values.
-        where: what to call it in messages.
-
-    Raises:
-        UserError: a field that it has not, or a value that is not allowed.
-    """
-    hints = get_type_hints(type(channel), include_extras=True)
-    known = {name: getattr(channel, name) for name in settable(channel)}
-    for key in settings:
-        if key not in known:
-            raise unknown(f"setting of {where}", key, known)
-    values = {key: value_of(known[key], text) for key, text in settings.items()}
-    kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
-    convert(values, kind, where)
-    try:
-        return cast("Settings", replace(cast("Any", channel), **values))
-    except ValueError as problem:
-        raise UserError(f"{where}: {printable(problem)}") from None
-
-
-def settable(channel: Any) -> list[str]:
-    """Names of the fields that are one number, switch or text."""
-    values = {field.name: getattr(channel, field.name) for field in fields(channel)}
-    return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
-
-
-def value_of(usual: object, text: str) -> object:
-    """A value of the kind that is usual; what is none stays text, which no setting of that kind allows."""
-    if isinstance(usual, bool):
-        return {"true": True, "false": False}.get(text, text)
-    if isinstance(usual, str):
-        return text
-    try:
-        return int(text) if isinstance(usual, int) else float(text)
-    except ValueError:
-        return text
 
 
 def _files() -> list[str]:
