@@ -4,7 +4,7 @@ A file names a model and its parameters, and says what they rest on. A package a
 point in the group `swarmdrive.channels`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib import import_module
@@ -16,8 +16,7 @@ import numpy as np
 
 from harness.core.config import convert, settable, toml
 from harness.core.errors import printable, unknown
-from harness.core.plugins import Plugins
-from harness.core.resources import entries, find
+from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 
@@ -54,23 +53,19 @@ class Profile:
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-class Profiles(Plugins[Channel]):
+class Profiles(FilesAndPlugins[Channel]):
     """The channels of all profiles, by name."""
 
-    def __getitem__(self, name: str) -> Channel:
-        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
-        return _read(*_stamp(name))[1] if name in _files() else super().__getitem__(name)
+    folder = "channels"
 
-    def __iter__(self) -> Iterator[str]:
-        return iter({**dict.fromkeys(_files()), **dict.fromkeys(super().__iter__())})
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
+    def read(self, file: Path) -> Channel:
+        """The file's channel."""
+        return _read(file, file.stat().st_mtime_ns)[1]
 
     def profile(self, name: str) -> Profile:
         """What the file says; of a package's channel, what it is."""
-        if name in _files():
-            return _read(*_stamp(name))[0]
+        if file := self.file(name):
+            return _read(file, file.stat().st_mtime_ns)[0]
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
@@ -99,15 +94,6 @@ def _number(value: object) -> float:
         return float(value) if isinstance(value, str | int | float) else np.nan
     except ValueError:
         return np.nan
-
-
-def _files() -> list[str]:
-    return [path.stem for path in entries("channels", "*.toml")]
-
-
-def _stamp(name: str) -> tuple[Path, int]:
-    path = find("channels", f"{name}.toml")
-    return path, path.stat().st_mtime_ns
 
 
 @lru_cache(maxsize=64)
