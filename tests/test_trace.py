@@ -121,6 +121,7 @@ def test_a_trace_without_places_is_refused(tmp_path):
         ({}, "has no file; add it"),
         ({"file": 7}, "has no file; add it"),
         ({"file": "nowhere.csv"}, "cannot be read as a table"),
+        ({"file": "\x1b[31mred.csv"}, r"\x1b[31mred.csv: cannot be read as a table"),
         ({"file": "run.csv", "beyond": "on"}, "known: held, zero"),
         ({"file": "run.csv", "latency_s": -1}, "latency_s = -1; allowed: seconds, 0 or more"),
         ({"file": "run.csv", "latency": 1}, "did you mean 'latency_s'?"),

@@ -14,9 +14,9 @@ from pathlib import Path
 from harness.backends.card import Card, Dtype, Latency, LatencySource, Thinking, read
 from harness.backends.registry import engines
 from harness.backends.vision import Vision, of_checkpoint
+from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
-from harness.core.resources import entries, find
 
 __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", "each_engine", "load",
            "load_all", "names", "resolve"]  # fmt: skip
@@ -30,7 +30,7 @@ _GGUF_HEAD = 1 << 25  # bytes of a GGUF file that hold its vocabulary and its te
 
 def names() -> list[str]:
     """Names of all card files, sorted."""
-    return sorted({path.stem for path in entries("models", "*.toml")})
+    return resources.names("models")
 
 
 def load(name: str) -> Card:
@@ -55,7 +55,7 @@ def load_all() -> list[Card]:
 
 def each_engine(stem: str) -> list[Card]:
     """The card of a file's name on each of its engines. Raises UserError if the file has a mistake."""
-    return read(find("models", f"{stem}.toml"))
+    return read(resources.find("models", f"{stem}.toml"))
 
 
 def resolve(text: str, engine: str | None = None) -> Card:

@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
+from harness.core import resources
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.resources import entries, find
 from harness.runs.records import Constant, Device, DeviceRow, Speed
 
 RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
@@ -22,7 +22,7 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 def names() -> list[str]:
     """Names of all device profiles, sorted."""
-    return sorted({path.stem for path in entries("devices", "*.toml")})
+    return resources.names("devices")
 
 
 def load(name: str) -> Device:
@@ -33,7 +33,7 @@ def load(name: str) -> Device:
     """
     if name not in names():
         raise unknown("device profile", name, names())
-    path = find("devices", f"{name}.toml")
+    path = resources.find("devices", f"{name}.toml")
     where = f"device profile {printable(path)}"
     table = toml(path, where)
     sources = table.pop("sources", {})

@@ -5,15 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from harness.backends.base import AGAIN, Backend, Completion, Request
 from harness.backends.cache import cached, default_file
 from harness.backends.cards import Card
 from harness.backends.registry import find, open_backend
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
-from harness.core.files import canonical_json, digest, sha256_file
+from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
 from harness.runs.records import BLIND, Answer, FirstTurn, Latency
 
@@ -87,7 +85,7 @@ class Replay:
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 stored = manifest.identity["helpers"][0]
-            if msgspec.json.decode(canonical_json(model.identity())) != stored:
+            if digest(model.identity()) != digest(stored):
                 raise UserError(
                     f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} is not the "
                     "model that it was; run it again"

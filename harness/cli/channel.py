@@ -9,6 +9,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json, table
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import as_mapping, known, shown
 
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
@@ -41,38 +42,32 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     """
     import textwrap
 
-    import numpy as np
-
-    from harness.cli.docstrings import attributes
+    from harness.cli.docstrings import echo_fields
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
     from harness.studies.reception import DISTANCES_M, by_sight
 
     profile_name, channel = _of(name)
-    profile, meanings = CHANNELS.profile(profile_name), attributes(type(channel))
-    settings = asdict(channel)
+    profile, settings = CHANNELS.profile(profile_name), asdict(channel)
     beyond = outside(settings, profile.limits)
     curves: dict[str, list[float]] = {}
     busy = None
     if isinstance(channel, Physical):
         curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
-        busy = channel.busy_ratio()
+        busy = known(channel.busy_ratio())
     if as_json:
         about = {key: value for key, value in asdict(profile).items() if key != "parameters"}
         reception = {"distance_m": DISTANCES_M, **curves} if curves else None
         echo_json({
             "name": name, **about, "settings": settings, "outside": beyond, "reception": reception,
-            "busy_ratio": None if busy is None or np.isnan(busy) else busy,
+            "busy_ratio": busy,
         })  # fmt: skip
         return
     typer.echo(f"{printable(profile_name)} · {printable(profile.model)} · {profile.status}")
     for text in (profile.description, f"source: {profile.source}"):
         typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  "))
     typer.echo()
-    for key, value in settings.items():
-        shown = f"{value:g}" if type(value) in (int, float) else printable(str(value).lower(), 60)
-        typer.echo(f"{key} = {shown}")
-        typer.echo(textwrap.fill(meanings.get(key, ""), 80, initial_indent="    ", subsequent_indent="    "))
+    echo_fields(channel)
     typer.echo()
     for line in beyond:
         typer.echo(textwrap.fill(line, 80, subsequent_indent="  "))
@@ -82,7 +77,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     heads = ["reception, %", "in sight", "behind a car", "behind a building"]
     shares = zip(DISTANCES_M, *curves.values(), strict=True)
     table(heads, [(f"{d} m", *(f"{100 * share:.1f}" for share in row)) for d, *row in shares])
-    if busy is not None and not np.isnan(busy):
+    if busy is not None:
         typer.echo(f"channel busy ratio {busy:.3f} under the background load")
 
 
@@ -106,7 +101,6 @@ def check(
     """
     import numpy as np
 
-    from harness.core.figures import as_mapping, shown
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS, outside
     from harness.radio.transceiver import Transceiver
@@ -135,7 +129,7 @@ def check(
         save(reception(name, by_sight(channel, every), every, messages, of_others), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         echo_json({
-            "name": name, "n": n, "outside": beyond, "busy_ratio": None if np.isnan(busy) else busy,
+            "name": name, "n": n, "outside": beyond, "busy_ratio": known(busy),
             "waits": [
                 {"distance_m": w.distance_m, "mean_s": as_mapping(w.mean_s), "p95_s": as_mapping(w.p95_s),
                  "independent_s": w.independent_s if np.isfinite(w.independent_s) else None}
@@ -222,9 +216,10 @@ def crowd(
     """
     import numpy as np
 
+    from harness.core.config import settable
     from harness.radio.channel import Physical
     from harness.radio.constant import density_coupled_loss
-    from harness.radio.profiles import CHANNELS, settable
+    from harness.radio.profiles import CHANNELS
     from harness.studies.reception import SIGHTS, crowded
 
     if sight not in SIGHTS:

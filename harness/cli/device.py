@@ -10,6 +10,7 @@ import typer
 from harness.cli import options
 from harness.cli.estimates import echo_json, table
 from harness.core.errors import UserError, printable
+from harness.core.figures import as_mapping, known, shown
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -70,8 +71,8 @@ def show(
             "device": msgspec.to_builtins(device), "window_ms": window_ms, "run": run and str(run),
             "fits": [
                 {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
-                 "output_tokens": fit.output_tokens, "ms": _number(1000 * fit.seconds),
-                 "in_time": _mapping(fit.in_time), "joules": _mapping(fit.joules)}
+                 "output_tokens": fit.output_tokens, "ms": known(1000 * fit.seconds),
+                 "in_time": as_mapping(fit.in_time), "joules": as_mapping(fit.joules)}
                 for fit in found
             ],
         })  # fmt: skip
@@ -116,7 +117,6 @@ def check(
     The run's machine is the device's, or the figures say how far the two are apart.
     """
     from harness.backends import devices
-    from harness.core.figures import as_mapping, shown
     from harness.runs.folder import read
     from harness.studies.device_fit import held
 
@@ -126,7 +126,7 @@ def check(
     if as_json:
         echo_json([
             {"role": each.role, "what": each.what, "measured": as_mapping(each.measured),
-             "stated": _number(each.stated)}
+             "stated": known(each.stated)}
             for each in found
         ])  # fmt: skip
         return
@@ -170,7 +170,6 @@ def measure(
     from harness.backends.counters import counters
     from harness.backends.registry import open_backend
     from harness.cli.progress import bar
-    from harness.core.figures import as_mapping, shown
     from harness.core.resources import DATASET
     from harness.dataset import load
     from harness.evaluate.agent import Agent
@@ -252,16 +251,6 @@ def _say(text: str) -> None:
     typer.echo(textwrap.fill(printable(text, 1000), 80, subsequent_indent="  ", break_on_hyphens=False))
 
 
-def _number(value: float) -> float | None:
-    return None if value != value else value
-
-
-def _mapping(estimate: "Estimate") -> dict[str, float | int | None]:
-    from harness.core.figures import as_mapping
-
-    return as_mapping(estimate)
-
-
 def _shown(value: float, digits: int) -> str:
     return "unknown" if value != value else f"{value:.{digits}f}"
 
@@ -271,12 +260,8 @@ def _yes(share: float) -> str:
 
 
 def _share(estimate: "Estimate") -> str:
-    from harness.core.figures import shown
-
     return "unknown" if estimate.value != estimate.value else shown(estimate)
 
 
 def _interval(estimate: "Estimate") -> str:
-    from harness.core.figures import shown
-
     return "unknown" if estimate.value != estimate.value else shown(estimate, 1.0, 2)

@@ -102,19 +102,12 @@ def command(
         examine(source.scenario, first_seed)
     driven = len(source.numbers)
     options.in_range("--save-video", save_video, 0, driven)
+    swarm = Swarm(
+        model, engine, prompt, answer, thinking, image,
+        helper_model, helper_prompt, helper_answer, helper_thinking,
+    )  # fmt: skip
     spec = Spec(
-        **Swarm(
-            model,
-            engine,
-            prompt,
-            answer,
-            thinking,
-            image,
-            helper_model,
-            helper_prompt,
-            helper_answer,
-            helper_thinking,
-        ).agents(source.scenario),
+        **swarm.agents(source.scenario),
         source=source,
         points=options.points(tuple(names), attacks=attack),
         seeds=options.parse_seeds(seeds),

@@ -90,17 +90,9 @@ def command(
         for name in (named.datasets if named else (dataset,))
     ]
     swarm = Swarm(
-        model,
-        engine,
-        prompt,
-        answer,
-        thinking,
-        image,
-        helper_model,
-        helper_prompt,
-        helper_answer,
-        helper_thinking,
-    )
+        model, engine, prompt, answer, thinking, image,
+        helper_model, helper_prompt, helper_answer, helper_thinking,
+    )  # fmt: skip
     channel_seeds = options.parse_seeds(seeds)
     specs = [
         Spec(

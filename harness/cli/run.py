@@ -50,13 +50,13 @@ class Swarm:
     model: str
     engine: str | None
     prompt: str | None
-    answer: "AnswerMode"
-    thinking: bool
-    image: "ImageMode"
-    helper_model: str | None
-    helper_prompt: str | None
-    helper_answer: "AnswerMode | None"
-    helper_thinking: bool | None
+    answer: "AnswerMode" = "json"
+    thinking: bool = False
+    image: "ImageMode" = "own"
+    helper_model: str | None = None
+    helper_prompt: str | None = None
+    helper_answer: "AnswerMode | None" = None
+    helper_thinking: bool | None = None
 
     def agents(self, scenario: "Scenario") -> "dict[str, Any]":
         """The fields of a `Spec` that say who answers in a scenario: `ego` and `helpers`."""

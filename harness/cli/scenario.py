@@ -34,26 +34,20 @@ def list_scenarios(as_json: options.Json = False) -> None:
 @app.command()
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
     """Print a scenario's actions and parameters. Each parameter has its meaning and value."""
-    import textwrap
-
+    from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
     scenario = scenarios.get(name)
     description, actions = scenario.description, scenario.actions
-    parameters = _parameters(scenario)
     if as_json:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
         described = {"name": name, "description": description, "actions": actions}
         schemas = {role: answer_schema(role, actions, name) for role in ROLES}
-        echo_json({**described, "parameters": parameters, "answer_schema": schemas})
+        echo_json({**described, "parameters": _parameters(scenario), "answer_schema": schemas})
         return
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
-    for parameter, of in parameters.items():
-        values = of["value"] if isinstance(of["value"], tuple) else (of["value"],)
-        shown_values = ", ".join(f"{v:g}" if type(v) in (int, float) else str(v).lower() for v in values)
-        typer.echo(f"{parameter} = {shown_values}")
-        typer.echo(textwrap.fill(of["meaning"], 80, initial_indent="    ", subsequent_indent="    "))
+    echo_fields(scenario.parameters)
 
 
 @app.command()

@@ -104,7 +104,7 @@ def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> 
     from harness.evaluate.spec import Spec
 
     frozen = load.load(load.find(resources.DATASET))
-    swarm = Swarm(model, None, prompt, "json", False, "own", None, None, None, None)
+    swarm = Swarm(model, None, prompt)
     return Spec(
         **swarm.agents(frozen.scenario),
         source=FrozenSource(frozen),

@@ -18,9 +18,9 @@ from msgspec import Meta
 
 from harness.coordination.intents import Intents
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.config import changed, settable
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
-from harness.radio.profiles import changed, settable
 
 MOST_VOICES = 16
 Share = Annotated[float, Meta(ge=0, le=1, description="a share of the helpers from 0 to 1, such as 1/3")]

@@ -10,10 +10,11 @@ from harness.coordination.attacks import attacks_of, in_text
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
+from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.networks import Network, network
-from harness.radio.profiles import CHANNELS, NO_CHANNEL, changed, settable, value_of
+from harness.radio.profiles import CHANNELS, NO_CHANNEL
 from harness.radio.roadside import Relay
 from harness.radio.wrapped import AtLoss
 

@@ -5,12 +5,11 @@ no single helper makes it another one. A pool of probabilities alone does not: w
 for itself, one voice can make a second choice of all others the first.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from harness.coordination.consensus import Fused, Messages, linear_pool
+from harness.coordination.consensus import Fused, Messages, Pool, linear_pool
 from harness.core.arrays import Bools, Floats, Ints
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
@@ -22,18 +21,11 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite where a message is the medi
 
 
 @dataclass(frozen=True)
-class Heads:
+class Heads(Pool):
     """A pool over heads, whose result no single helper flips where all others agree.
 
-    Attributes:
-        pool: from intents `(..., 1+H, A)` and equal weights `(..., 1+H)`, 0 for who is not heard.
+    Whoever is heard has the same weight.
     """
-
-    pool: Callable[[Floats, Floats], Floats]
-
-    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Nothing."""
-        return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
         """The pool; where it leaves what all but one want, the mean of those."""

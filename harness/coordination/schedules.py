@@ -4,7 +4,6 @@ A file holds a learnt schedule and what it was learnt from; `harness schedule le
 a schedule by an entry point in the group `swarmdrive.schedules`.
 """
 
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -13,30 +12,22 @@ from harness.coordination.scheduling import FORMULAS, Schedule
 from harness.core.config import convert, toml
 from harness.core.errors import printable
 from harness.core.files import sha256_file
-from harness.core.plugins import Plugins
-from harness.core.resources import entries, find
+from harness.core.plugins import FilesAndPlugins
 
 
-class Schedules(Plugins[Schedule]):
+class Schedules(FilesAndPlugins[Schedule]):
     """All schedules."""
 
-    def __getitem__(self, name: str) -> Schedule:
-        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
-        return _read(find("schedules", f"{name}.toml")) if name in _files() else super().__getitem__(name)
+    folder = "schedules"
+
+    def read(self, file: Any) -> Schedule:
+        """The learnt schedule."""
+        return _read(file)
 
     def file_sha256(self, name: str) -> str | None:
         """Digest of the file that holds a schedule; None for one that no file holds."""
-        return sha256_file(find("schedules", f"{name}.toml")) if name in _files() else None
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**dict.fromkeys(self.built_in), **dict.fromkeys(_files()), **self._entries()})
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
-
-
-def _files() -> list[str]:
-    return [path.stem for path in entries("schedules", "*.toml")]
+        file = self.file(name)
+        return sha256_file(file) if file else None
 
 
 @lru_cache(maxsize=64)

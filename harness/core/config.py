@@ -13,12 +13,13 @@ value is converted but an integer to a float. An unknown key is refused, with th
     convert(toml(path, f"channel file {path}"), Channel, f"channel file {path}")
 """
 
+import dataclasses
 import re
 import tomllib
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import msgspec
 from msgspec.inspect import type_info
@@ -82,6 +83,49 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
         return msgspec.convert({**table, **given}, kind)
     except msgspec.ValidationError as error:
         raise _mistake(str(error), table, info, where) from None
+
+
+def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
+    """A frozen dataclass with some of its fields from their texts.
+
+    Args:
+        record: what is changed.
+        settings: fields' names and values.
+        where: what to call it in messages.
+
+    Raises:
+        UserError: a field that it has not, or a value that is not allowed.
+    """
+    hints = get_type_hints(type(record), include_extras=True)
+    known = {name: getattr(record, name) for name in settable(record)}
+    for key in settings:
+        if key not in known:
+            raise unknown(f"setting of {where}", key, known)
+    values = {key: value_of(known[key], text) for key, text in settings.items()}
+    kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
+    convert(values, kind, where)
+    try:
+        return cast("Record", dataclasses.replace(cast("Any", record), **values))
+    except ValueError as problem:
+        raise UserError(f"{where}: {printable(problem)}") from None
+
+
+def settable(record: Any) -> list[str]:
+    """Names of the fields that are one number, switch or text."""
+    values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
+
+
+def value_of(usual: object, text: str) -> object:
+    """A value of the kind that is usual; what is none stays text, which no setting of that kind allows."""
+    if isinstance(usual, bool):
+        return {"true": True, "false": False}.get(text, text)
+    if isinstance(usual, str):
+        return text
+    try:
+        return int(text) if isinstance(usual, int) else float(text)
+    except ValueError:
+        return text
 
 
 def _place(where: str, path: Sequence[str]) -> str:

@@ -7,10 +7,15 @@ if TYPE_CHECKING:  # commands that print nothing start without NumPy
     from harness.core.statistics import Estimate
 
 
+def known(value: float) -> float | None:
+    """The number; None where it is NaN."""
+    return None if math.isnan(value) else value
+
+
 def as_mapping(estimate: "Estimate") -> dict[str, float | int | None]:
     """`value`, `low`, `high` and `n`; null where there is no number."""
-    ends = {"value": estimate.value, "low": estimate.low, "high": estimate.high}
-    return {**{k: None if math.isnan(v) else v for k, v in ends.items()}, "n": estimate.n}
+    ends = {end: known(getattr(estimate, end)) for end in ("value", "low", "high")}
+    return {**ends, "n": estimate.n}
 
 
 def shown(estimate: "Estimate", scale: float = 100.0, decimals: int = 1) -> str:

@@ -1,8 +1,11 @@
 """Plug-ins: what a room has built in, and what installed packages add by entry points."""
 
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from harness.core import resources
 from harness.core.errors import UserError, printable
 
 T = TypeVar("T")
@@ -33,7 +36,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         return iter({**self.built_in, **self._entries()})
 
     def __len__(self) -> int:
-        return len({**self.built_in, **self._entries()})
+        return len(list(iter(self)))
 
     def _entries(self) -> dict[str, Any]:
         from importlib.metadata import entry_points  # only a look-up pays for it
@@ -54,3 +57,27 @@ class Plugins(Mapping[str, T], Generic[T]):
                 f"{what} is of type {type(plugin).__name__} and no {self.kind.__name__}; {repair}"
             )
         return plugin
+
+
+class FilesAndPlugins(Plugins[T]):
+    """Plug-ins, and before them what TOML files hold, shipped and a project's."""
+
+    folder: str
+    """The files' kind of resource."""
+
+    @abstractmethod
+    def read(self, file: Path) -> T:
+        """What a file holds. Raises UserError for one that does not work."""
+
+    def file(self, name: str) -> Path | None:
+        """The file that holds a thing; None for one that no file holds."""
+        there = name in resources.names(self.folder)
+        return resources.find(self.folder, f"{name}.toml") if there else None
+
+    def __getitem__(self, name: str) -> T:
+        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
+        file = self.file(name)
+        return self.read(file) if file else super().__getitem__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys([*self.built_in, *resources.names(self.folder), *self._entries()]))

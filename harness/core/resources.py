@@ -32,6 +32,11 @@ def entries(kind: str, pattern: str) -> list[Path]:
     return sorted(path for where in _folders(kind) for path in where.glob(pattern))
 
 
+def names(kind: str) -> list[str]:
+    """Names of the TOML files of one kind, sorted."""
+    return sorted({path.stem for path in entries(kind, "*.toml")})
+
+
 def find(kind: str, name: str) -> Path:
     """Where a resource lies; if nowhere, where it would lie among those that ship.
 

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.resources import entries, find
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ class Network:
 
 def names() -> list[str]:
     """Of the networks that there are, a project's among them."""
-    return [path.stem for path in entries("networks", "*.toml")]
+    return resources.names("networks")
 
 
 def network(name: str) -> Network:
     """A network by its name. Raises UserError for an unknown one and for a file that does not work."""
     if name not in names():
         raise unknown("round_trip", name, names())
-    path = find("networks", f"{name}.toml")
+    path = resources.find("networks", f"{name}.toml")
     return _read(path, path.stat().st_mtime_ns)
 
 

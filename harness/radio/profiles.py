@@ -4,24 +4,21 @@ A file names a model and its parameters, and says what they rest on. A package a
 point in the group `swarmdrive.channels`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_type_hints
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from harness.core.config import convert, toml
-from harness.core.errors import UserError, printable, unknown
-from harness.core.plugins import Plugins
-from harness.core.resources import entries, find
+from harness.core.config import convert, settable, toml
+from harness.core.errors import printable, unknown
+from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
-
-Settings = TypeVar("Settings")
 
 # Name of a model to its class, or to a function of a file's parameters, its folder and what to call them in
 # messages. A physical one takes a while to import, so only what is named is.
@@ -56,23 +53,19 @@ class Profile:
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-class Profiles(Plugins[Channel]):
+class Profiles(FilesAndPlugins[Channel]):
     """The channels of all profiles, by name."""
 
-    def __getitem__(self, name: str) -> Channel:
-        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
-        return _read(*_stamp(name))[1] if name in _files() else super().__getitem__(name)
+    folder = "channels"
 
-    def __iter__(self) -> Iterator[str]:
-        return iter({**dict.fromkeys(_files()), **dict.fromkeys(super().__iter__())})
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
+    def read(self, file: Path) -> Channel:
+        """The file's channel."""
+        return _read(file, file.stat().st_mtime_ns)[1]
 
     def profile(self, name: str) -> Profile:
         """What the file says; of a package's channel, what it is."""
-        if name in _files():
-            return _read(*_stamp(name))[0]
+        if file := self.file(name):
+            return _read(file, file.stat().st_mtime_ns)[0]
         kind = type(self[name])
         doc = (kind.__doc__ or "").strip().partition("\n")[0]
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
@@ -101,58 +94,6 @@ def _number(value: object) -> float:
         return float(value) if isinstance(value, str | int | float) else np.nan
     except ValueError:
         return np.nan
-
-
-def changed(channel: Settings, settings: Mapping[str, str], where: str) -> Settings:
-    """The channel, or another frozen dataclass, with some of its fields from their texts.
-
-    Args:
-        channel: what is changed.
-        settings: fields' names and values.
-        where: what to call it in messages.
-
-    Raises:
-        UserError: a field that it has not, or a value that is not allowed.
-    """
-    hints = get_type_hints(type(channel), include_extras=True)
-    known = {name: getattr(channel, name) for name in settable(channel)}
-    for key in settings:
-        if key not in known:
-            raise unknown(f"setting of {where}", key, known)
-    values = {key: value_of(known[key], text) for key, text in settings.items()}
-    kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
-    convert(values, kind, where)
-    try:
-        return cast("Settings", replace(cast("Any", channel), **values))
-    except ValueError as problem:
-        raise UserError(f"{where}: {printable(problem)}") from None
-
-
-def settable(channel: Any) -> list[str]:
-    """Names of the fields that are one number, switch or text."""
-    values = {field.name: getattr(channel, field.name) for field in fields(channel)}
-    return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
-
-
-def value_of(usual: object, text: str) -> object:
-    """A value of the kind that is usual; what is none stays text, which no setting of that kind allows."""
-    if isinstance(usual, bool):
-        return {"true": True, "false": False}.get(text, text)
-    if isinstance(usual, str):
-        return text
-    try:
-        return int(text) if isinstance(usual, int) else float(text)
-    except ValueError:
-        return text
-
-
-def _files() -> list[str]:
-    return [path.stem for path in entries("channels", "*.toml")]
-
-
-def _stamp(name: str) -> tuple[Path, int]:
-    path = find("channels", f"{name}.toml")
-    return path, path.stat().st_mtime_ns
 
 
 @lru_cache(maxsize=64)

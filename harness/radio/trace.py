@@ -128,27 +128,28 @@ def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace
 
 def read(path: Path) -> tuple[Point, ...]:
     """The rows of a table, by sight and distance. Raises UserError: file, line, value and what is allowed."""
+    shown = printable(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             if missing := {"distance_m", "reception"} - {*(rows.fieldnames or ())}:
-                raise UserError(f"{path}: has no column {' or '.join(sorted(missing))}")
+                raise UserError(f"{shown}: has no column {' or '.join(sorted(missing))}")
             for name in rows.fieldnames or ():
                 if name not in COLUMNS:
-                    raise unknown(f"column of {path}", name, COLUMNS)
-            points = [_point(f"{path}, line {rows.line_num}", row) for row in rows]
+                    raise unknown(f"column of {shown}", name, COLUMNS)
+            points = [_point(f"{shown}, line {rows.line_num}", row) for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        raise UserError(f"{path}: cannot be read as a table ({problem})") from problem
+        raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
     if not points:
-        raise UserError(f"{path}: has no rows; give reception at one distance at least")
+        raise UserError(f"{shown}: has no rows; give reception at one distance at least")
     said = {p.sight for p in points}
     if said != {None} and said != {*SIGHTS}:
         lacks = next(name for name in SIGHTS if name not in said)
-        raise UserError(f"{path}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
+        raise UserError(f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
     points.sort(key=lambda p: (SIGHTS[p.sight] if p.sight else CLEAR, p.distance_m))
     for a, b in pairwise(points):
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
-            raise UserError(f"{path}: distance_m {a.distance_m:g} stands there twice; give each once")
+            raise UserError(f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once")
     return tuple(points)
 
 

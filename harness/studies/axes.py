@@ -9,8 +9,9 @@ import numpy as np
 from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
+from harness.core.config import settable
 from harness.core.errors import UserError, printable, unknown
-from harness.radio.profiles import CHANNELS, settable
+from harness.radio.profiles import CHANNELS
 
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points

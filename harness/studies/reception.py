@@ -14,11 +14,11 @@ from msgspec import Meta
 from harness.coordination.operating_point import pairs
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
+from harness.core.config import changed
 from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Physical, Site
 from harness.radio.fading import Trips
-from harness.radio.profiles import changed
 from harness.radio.transceiver import Transceiver
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)

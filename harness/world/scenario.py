@@ -8,9 +8,10 @@ from typing import Any, Literal, get_args
 
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Texts
+from harness.core.config import changed
 from harness.core.errors import UserError, printable, unknown
 from harness.radio.channel import Physical
-from harness.radio.profiles import CHANNELS, changed
+from harness.radio.profiles import CHANNELS
 from harness.world.ambient import AMBIENTS, DAY, Ambient
 from harness.world.road import Road
 from harness.world.state import Building, Kind, Part

@@ -192,7 +192,7 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
         ("beacon_hz=0", "beacon_hz is 0.0; it must be above 0, at most 50"),
         ("beacon_hz=nan", "beacon_hz is nan; it must be above 0"),
         ("beacon_delay_s=-0.1", "beacon_delay_s is -0.1; it must be seconds from 0 to 1"),
-        ("perfect_knowledge=2", "perfect_knowledge is 2.0; it must be true or false"),
+        ("perfect_knowledge=2", "perfect_knowledge is '2'; give true or false"),
         ("beacon_noise_m=much", "beacon_noise_m is 'much'; give a number"),
         ("beacon_los=0.1", "unknown setting of scenario occluded-intersection 'beacon_los'; did you mean"),
         ("danger_share=0.5", "unknown setting of scenario occluded-intersection 'danger_share'"),

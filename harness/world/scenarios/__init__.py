@@ -11,6 +11,7 @@ from importlib.metadata import entry_points
 from pkgutil import iter_modules
 from typing import Any
 
+from harness.core.config import value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.world.environments import environment
 from harness.world.environments import scenario as environments
@@ -47,19 +48,17 @@ def dials(scenario: Scenario) -> tuple[str, ...]:
     return (*DIALS, *(environments.DIALS if scenario.start else ()))
 
 
-def _setting(scenario: Scenario, text: str) -> tuple[str, bool | float | str]:
+def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
     key, _, value = text.partition("=")
     shown, known = printable(scenario.name), dials(scenario)
     if key not in known:
         raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
-    if key == "perfect_knowledge" and value in ("true", "false"):
-        return key, value == "true"
-    if isinstance(getattr(scenario.parameters, key), str):
-        return key, value
-    try:
-        return key, (int if type(getattr(scenario.parameters, key)) is int else float)(value)
-    except ValueError:
-        raise UserError(f"scenario {shown}: {key} is {printable(value)!r}; give a number") from None
+    usual = getattr(scenario.parameters, key)
+    setting = value_of(usual, value)
+    if isinstance(setting, str) and not isinstance(usual, str):
+        allowed = "true or false" if isinstance(usual, bool) else "a number"
+        raise UserError(f"scenario {shown}: {key} is {printable(value)!r}; give {allowed}")
+    return key, setting
 
 
 def _named(name: str) -> Scenario:
