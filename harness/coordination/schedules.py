@@ -22,7 +22,9 @@ class Schedules(Plugins[Schedule]):
 
     def __getitem__(self, name: str) -> Schedule:
         """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
-        return _read(find("schedules", f"{name}.toml")) if name in _files() else super().__getitem__(name)
+        if name not in self._loaded and name in _files():
+            return _read(find("schedules", f"{name}.toml"))
+        return super().__getitem__(name)
 
     def file_sha256(self, name: str) -> str | None:
         """Digest of the file that holds a schedule; None for one that no file holds."""

@@ -1,10 +1,12 @@
 """A study's folder: its figures, its tables and how it was made."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from harness.core.files import replacing, write_whole
@@ -26,11 +28,55 @@ def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.Dat
         for kind in FORMATS:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
     for stem, table in tables.items():
-        with replacing(out / f"{stem}.csv") as part:
-            table.to_csv(part, index=False)
-        with replacing(out / f"{stem}.jsonl") as part, part.open("w", encoding="utf-8") as file:
-            for first in range(0, len(table), ROWS):
-                file.write(table[first : first + ROWS].to_json(orient="records", lines=True))
+        parts = [table[first : first + ROWS] for first in range(0, len(table), ROWS)]
+        with replacing(out / f"{stem}.csv") as path, path.open("w", encoding="utf-8", newline="") as file:
+            table[:0].to_csv(file, index=False)
+            for part in parts:
+                file.writelines(f"{row}\n" for row in _rows(part, _as_csv))
+        with replacing(out / f"{stem}.jsonl") as path, path.open("w", encoding="utf-8") as file:
+            for part in parts:
+                file.writelines(f"{{{row}}}\n" for row in _rows(part, _as_json))
+
+
+def _rows(table: "pd.DataFrame", text: "Callable[[pd.DataFrame], list[str]]") -> Iterator[str]:
+    """What pandas writes of each row; what a column has many times is written once."""
+    import pandas as pd
+
+    columns = []
+    for name, column in table.items():
+        code: Any = slice(None)
+        distinct: Any = column
+        if column.dtype == float:  # by its bits, which 0.0 and -0.0 do not share
+            code, bits = pd.factorize(column.to_numpy().view(np.int64))
+            distinct = bits.view(float)
+        elif column.dtype != object:  # in which 1, 1.0 and True would count as one
+            code, distinct = pd.factorize(column, use_na_sentinel=False)
+        columns.append(np.array(text(pd.DataFrame({name: distinct})), dtype=object)[code].tolist())
+    return map(",".join, zip(*columns, strict=True))
+
+
+class _Rows(StringIO):
+    """What is written to it, piece by piece: of CSV each piece is a row."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[str] = []
+
+    def write(self, row: str) -> int:
+        self.rows.append(row)
+        return len(row)
+
+
+def _as_csv(column: "pd.DataFrame") -> list[str]:
+    """Each field of a column; one that is empty is quoted only where it is alone."""
+    written = _Rows()
+    column.to_csv(written, index=False, header=False, lineterminator="\n")
+    return ["" if row == '""\n' else row[:-1] for row in written.rows]
+
+
+def _as_json(column: "pd.DataFrame") -> list[str]:
+    """Each field of a column behind its name."""
+    return [row[1:-1] for row in column.to_json(orient="records", lines=True).splitlines()]
 
 
 def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
