@@ -205,12 +205,12 @@ class Asker:
             any(_id(s, v, blind) not in self.answers for v in self.spec.viewers(s)[blind:]) for s in moments
         ]
 
-    def laid_out(self, moments: Sequence[Scene], blind: bool = False) -> Intents:
-        """The answers that are there as arrays; NaN for one that is not, or that failed."""
+    def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
+        """The answers that are there as arrays, with `width` vehicles or more; NaN for one that failed."""
         answers = [
             [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
         ]
-        width, actions = max(map(len, answers)), len(self.spec.actions)
+        width, actions = max(width, *map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
         distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
         bits = np.zeros((len(moments), width - 1))

@@ -122,8 +122,7 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
     def joint(of: Callable[[_Drawn], Any]) -> Any:
         return np.concatenate([of(part) for part in parts])
 
-    names = parts[0].intents.arrays()
-    intents = Intents(**{name: joint(attrgetter(f"intents.{name}")) for name in names})
+    intents = Intents.joined([part.intents for part in parts])
     draws = Draws(joint(attrgetter("draws.link")), joint(attrgetter("draws.jitter")))
     right, knowing, witness = (joint(attrgetter(name)) for name in ("right", "knowing", "witness"))
     return _Drawn(right, intents, knowing, witness, draws)
