@@ -35,6 +35,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.prompts.versions import Prompt
+from harness.runs import folder as folders
 from harness.runs.folder import read
 
 AIM_MS = 0.3
@@ -45,7 +46,10 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "prompt": [(Prompt, "render")],
     "parse": [(asking, "parse")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
-    "record": [(asking, "_keep"), (run, "_written")],
+    "record": [
+        (asking, "_keep"), (run, "table"), (run, "_gathered"),
+        (folders, "part_files"), (folders, "write_part"),
+    ],
 }  # fmt: skip
 OTHERS = ("proxy", "copies")
 LIMIT = "limit"
