@@ -2,7 +2,8 @@
 
 A decision is a decision point that some walk came to: one ego answer and up to three helper answers, scored
 under three conditions and five seeds. Sizes are copies of the dataset. Own time is the process's CPU time
-less what `backend.complete` takes. Loading the dataset is apart, since it is done once.
+less what `backend.complete` takes, and less what making the copies takes. Loading the dataset is apart, since
+it is done once.
 
     python benchmarks/own_time.py [DATASET] [--sizes 1 5] [--repeats 3] [--prompt v2]
 """
@@ -13,14 +14,14 @@ import json
 import statistics
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import process_time
 from typing import Any
 from unittest.mock import patch
 
-from copies import copies
+from copies import Copies, copies
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
@@ -38,14 +39,19 @@ from harness.runs import folder as folders
 from harness.runs.folder import read
 
 AIM_MS = 0.3
-# Functions whose time makes up a part; `complete` is the backend's own and no part of the harness.
+# Functions whose time makes up a part; what the backend and the copies take is no part of the harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
+    "copies": [(Copies, "scenes")],
     "prompt": [(Prompt, "render")],
     "parse": [(asking, "parse")],
-    "coordinate": [(walk, "coordinate")],
-    "record": [(asking, "_keep"), (run, "table"), (run, "counted"), (run, "scores"), (folders, "write")],
+    "coordinate": [(walk, "exchange"), (walk, "fuse")],
+    "record": [
+        (asking, "_keep"), (run, "table"), (run, "_gathered"),
+        (folders, "part_files"), (folders, "write_part"),
+    ],
 }  # fmt: skip
+OTHERS = ("proxy", "copies")
 LIMIT = "limit"
 
 
@@ -67,13 +73,13 @@ def main() -> None:
              tuple(POINTS.values()), tuple(range(5)))
         for size in given.sizes
     ]  # fmt: skip
-    first = evaluated(specs[0], ["proxy"])  # pays for imports and compiled templates
+    first = evaluated(specs[0], OTHERS)  # pays for imports and compiled templates
     requests = first["answers"] / first["decisions"]
-    # Clocks around every call take time too, so the total comes from runs with the proxy's alone.
-    total = slopes(specs, ["proxy"], given.repeats)
+    # Clocks around every call take time too, so the total comes from runs with few of them.
+    total = slopes(specs, OTHERS, given.repeats)
     parts = slopes(specs, list(PARTS), given.repeats)
     own_ms = total["own"]
-    shown = {part: parts[part] for part in (*PARTS, "other") if part != "proxy"}
+    shown = {part: parts[part] for part in (*PARTS, "other") if part not in OTHERS}
     result = {
         "sizes": given.sizes, "repeats": given.repeats, "requests_per_decision": round(requests, 3),
         "own_ms": own_ms, "own_ms_per_request": own_ms / requests, "limit_ms": total[LIMIT],
@@ -91,7 +97,7 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def slopes(specs: list[Spec], parts: list[str], repeats: int) -> dict[str, float]:
+def slopes(specs: list[Spec], parts: Sequence[str], repeats: int) -> dict[str, float]:
     """Milliseconds a decision more costs, by part: median over repeats of the slope between two sizes."""
     found: dict[str, list[float]] = {}
     for _ in range(repeats):
@@ -103,7 +109,7 @@ def slopes(specs: list[Spec], parts: list[str], repeats: int) -> dict[str, float
     return {part: statistics.median(values) for part, values in found.items()}
 
 
-def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
+def evaluated(spec: Spec, parts: Sequence[str]) -> dict[str, float]:
     """CPU seconds of one evaluation: its parts, its own time, its record's limit; and what it counted."""
     assert isinstance(spec.source, FrozenSource)
     with tempfile.TemporaryDirectory() as folder:
@@ -115,7 +121,7 @@ def evaluated(spec: Spec, parts: list[str]) -> dict[str, float]:
             start = process_time()
             out = run.evaluate(spec, Path(folder) / "run", lambda done: None).out
             whole = process_time() - start
-        own = whole - spent["proxy"]
+        own = whole - sum(spent[part] for part in OTHERS)
         other = whole - sum(spent.values())
         limit = limit_s(spec, out)
         made = read(out)

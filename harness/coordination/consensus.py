@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from harness.coordination.claims import Claims
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, summed
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,7 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
         weights: weight of each vehicle, `(..., 1+H)`, summing to 1.
     """
     row_weights = weights[..., None]
-    pooled: Floats = np.sum(row_weights * np.where(row_weights > 0, p, 0.0), axis=-2)
-    return pooled
+    return summed(row_weights * np.where(row_weights > 0, p, 0.0), axis=-2)
 
 
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:

@@ -109,13 +109,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
 
     `asked` is who is asked, `(..., H)`, of those in the radius, in place of whom the point's schedule asks.
     """
-    own_failed, own = own_intent(point, intents)
-    entropy = entropy_nats(own)
-    in_radius = intents.valid & (intents.range_m <= point.radius_m)
+    own_failed, known = _at_once(point, intents)
+    in_radius = known.may_ask
     if point.profile is None:
         asks, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
     elif asked is None:
-        worth, above = worth_of(point, intents, draws), point.asks_above
+        worth, above = _worth(point, known, intents, draws), point.asks_above
         asks = np.any(worth > above, axis=-1)
         asked = chosen(worth, above, in_radius, intents.range_m, point.max_helpers)
     else:
@@ -125,9 +124,9 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
     delivered = sent.up if intents.silent is None else sent.up & ~intents.silent
     loss, arrival_s = sent.loss, np.where(delivered, request_s + sent.end_s, np.inf)
     return Exchange(
-        own=own,
+        own=known.own,
         own_failed=own_failed,
-        entropy_nats=entropy,
+        entropy_nats=known.entropy_nats,
         triggered=asks,
         asked=sent.asked,
         requests=sent.requests,
@@ -174,20 +173,34 @@ def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """What asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
-    return SCHEDULES[point.schedule].worth(known_of(point, intents, draws))
+    return _worth(point, _at_once(point, intents)[1], intents, draws)
+
+
+def _worth(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Floats:
+    return SCHEDULES[point.schedule].worth(_with_needs(point, known, intents, draws))
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
     """What the ego knows before it asks, as far as the point's schedule looks at it."""
-    own, in_radius = own_intent(point, intents)[1], intents.valid & (intents.range_m <= point.radius_m)
+    return _with_needs(point, _at_once(point, intents)[1], intents, draws)
+
+
+def _at_once(point: OperatingPoint, intents: Intents) -> tuple[Bools, Known]:
+    """Whether the ego's answer failed, `(...)`, and what it knows whatever its schedule looks at."""
+    failed, own = own_intent(point, intents)
+    in_radius = intents.valid & (intents.range_m <= point.radius_m)
+    return failed, Known(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
+
+
+def _with_needs(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Known:
     if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
         raise UserError(NO_SCENE.format(printable(point.schedule)))
-    return Known(
-        own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m,
-        _in_time(point, intents, in_radius, draws) if point.needs("in_time") else None,
-        intents.outlook if point.needs("outlook") else None,
-        draws.of(".lot").wait if point.needs("lot") else None,
-    )  # fmt: skip
+    return replace(
+        known,
+        in_time=_in_time(point, intents, known.may_ask, draws) if point.needs("in_time") else None,
+        outlook=intents.outlook if point.needs("outlook") else None,
+        lot=draws.of(".lot").wait if point.needs("lot") else None,
+    )
 
 
 NO_SCENE = (

@@ -1,5 +1,6 @@
 """What coordination needs to know of a set of decisions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -55,6 +56,22 @@ class Intents:
             claims=self.claims and self.claims.take(at),
             **{name: array[at] for name, array in self.arrays().items()},
         )
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Intents]") -> "Intents":
+        """Decisions of as many vehicles, one part below the other; none has parts of a scene."""
+        arrays = [part.arrays() for part in parts]
+        joint: dict[str, Any] = {name: np.concatenate([each[name] for each in arrays]) for name in arrays[0]}
+        return cls(**joint)
+
+    def of_first(self, helpers: int) -> "Intents":
+        """The same with so many helpers, of decisions without parts of a scene."""
+        cut = {
+            name: array[..., : helpers + (name in WITH_EGO)]
+            for name, array in self.arrays().items()
+            if name not in ("own", "helpers")
+        }
+        return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
         """The same with the helpers of these places `(n, H')`, of decisions `(n, H)`; one may come again."""

@@ -277,7 +277,7 @@ class OperatingPoint:
         texts = {**pairs(self.radio), **settings}
         return replace(self, radio=",".join(f"{key}={value}" for key, value in texts.items()))
 
-    @property
+    @cached_property
     def asks_above(self) -> float:
         """What asking has to be worth more than, in the schedule's unit."""
         if self.schedule == PAPER:
@@ -287,8 +287,14 @@ class OperatingPoint:
 
     def needs(self, what: str) -> bool:
         """Whether its schedule, its rule or an attack looks at `in_time`, `outlook`, `lot` or `claims`."""
+        return what in self._needs
+
+    @cached_property
+    def _needs(self) -> frozenset[str]:
+        if self.profile is None:
+            return frozenset()
         parts = (SCHEDULES[self.schedule], RULES.get(self.consensus), *attacks_of(self.attack))
-        return self.profile is not None and any(what in getattr(part, "needs", ()) for part in parts)
+        return frozenset(need for part in parts for need in getattr(part, "needs", ()))
 
     @property
     def asks_again(self) -> bool:

@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, summed
 
 
 def entropy_nats(p: Floats) -> Floats:
     """Shannon entropy of intents `(..., A)`, in nats, with 0 log 0 = 0. Shape `(...)`."""
     # No term of a distribution is positive; abs() also turns -0.0 into 0.0.
-    entropy: Floats = np.sum(np.abs(p * np.log(np.where(p > 0, p, 1.0))), axis=-1)
-    return entropy
+    return summed(np.abs(p * np.log(np.where(p > 0, p, 1.0))), axis=-1)
 
 
 def normalised_entropy(p: Floats) -> Floats:

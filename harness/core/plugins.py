@@ -60,7 +60,7 @@ class Plugins(Mapping[str, T], Generic[T]):
 
 
 class FilesAndPlugins(Plugins[T]):
-    """Plug-ins, and before them what TOML files hold, shipped and a project's."""
+    """Plug-ins; behind what is built in and before packages come TOML files, shipped and a project's."""
 
     folder: str
     """The files' kind of resource."""
@@ -71,7 +71,7 @@ class FilesAndPlugins(Plugins[T]):
 
     def file(self, name: str) -> Path | None:
         """The file that holds a thing; None for one that no file holds."""
-        there = name in resources.names(self.folder)
+        there = name not in self.built_in and name in resources.names(self.folder)
         return resources.find(self.folder, f"{name}.toml") if there else None
 
     def __getitem__(self, name: str) -> T:

@@ -31,6 +31,8 @@ from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
+# Or so many batches: one of egos to three of helpers, which share no batch, so that each may be full.
+BATCHES = 4
 
 
 def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
@@ -157,7 +159,7 @@ class Asker:
         # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
         # depend on the other requests in its batch.
         backend, batch = self._backend(), self.spec.batch_size
-        size = batch * math.ceil(CHUNK / batch)
+        size = batch * max(BATCHES, math.ceil(CHUNK / batch))
         chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # whose batches are whole, as the others' are
@@ -205,12 +207,12 @@ class Asker:
             any(_id(s, v, blind) not in self.answers for v in self.spec.viewers(s)[blind:]) for s in moments
         ]
 
-    def laid_out(self, moments: Sequence[Scene], blind: bool = False) -> Intents:
-        """The answers that are there as arrays; NaN for one that is not, or that failed."""
+    def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
+        """The answers that are there as arrays, with `width` vehicles or more; NaN for one that failed."""
         answers = [
             [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
         ]
-        width, actions = max(map(len, answers)), len(self.spec.actions)
+        width, actions = max(width, *map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
         distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
         bits = np.zeros((len(moments), width - 1))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.fft import irfft, next_fast_len, rfft
 
 from harness.core.arrays import Floats
 
@@ -79,7 +79,10 @@ class Scheduling:
         at a busy ratio of about 0.75 and more.
         """
         sensed = self.sensed(np.abs(np.arange(-REACH_M, REACH_M + 1.0)), self.threshold_dbm)
-        overlap = correlate(sensed, sensed, method="fft")[2 * REACH_M :]  # (30.2), by metre from 0 on
+        size = 2 * sensed.size - 1
+        length = next_fast_len(size, real=True)
+        both_ways = irfft(rfft(sensed, length) * rfft(sensed[::-1], length), length)
+        overlap = both_ways[2 * REACH_M : size]  # (30.2), by metre from 0 on
         by_chance = taken**2 / self.resources
         # In (30) the density cancels: beta / Spsr is 1 / the sum of `sensed`.
         nearness = overlap / max(overlap[0], 1e-300)

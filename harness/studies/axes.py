@@ -74,7 +74,7 @@ def axis_of(name: str) -> Axis:
     """An axis by its name, or by that of any setting in its own unit. Raises UserError if there is none."""
     if name in AXES:
         return AXES[name]
-    usual = _usual()
+    usual = {name: getattr(POINTS["6g"], name)} if name in SETTINGS else _usual()
     if name not in usual:
         raise unknown("--over", name, {*AXES, *usual})
     return Axis(name, name.replace("_", " "), name, 1.0, "", isinstance(usual[name], str | bool))

@@ -16,6 +16,7 @@ and who reads it rightly, in its share to within one, and each link's luck is sp
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,25 @@ class _Drawn:
     witness: Bools
     draws: Draws
 
+    def step(self, number: int) -> "_Drawn":
+        """The rows of one step."""
+        at = slice(number, None, STEPS)
+        return _Drawn(
+            self.right[at], self.intents.take(at), self.knowing[at], self.witness[at], self.draws.take(at)
+        )
+
+
+def _below(parts: Sequence[_Drawn]) -> _Drawn:
+    """Drawn parts, one below the other."""
+
+    def joint(of: Callable[[_Drawn], Any]) -> Any:
+        return np.concatenate([of(part) for part in parts])
+
+    intents = Intents.joined([part.intents for part in parts])
+    draws = Draws(joint(attrgetter("draws.link")), joint(attrgetter("draws.jitter")))
+    right, knowing, witness = (joint(attrgetter(name)) for name in ("right", "knowing", "witness"))
+    return _Drawn(right, intents, knowing, witness, draws)
+
 
 class CalibratedWorld:
     """Episodes whose moments are drawn: each step's, for all episodes at once.
@@ -114,27 +134,23 @@ class CalibratedWorld:
     An ego that has fused the witness's message knows from its next decision on. The last decision decides.
     """
 
-    def __init__(self, drawn: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
-        self._drawn = drawn  # of each seed, with as many episodes as `numbers`
+    def __init__(self, drawn: _Drawn, seeds: Sequence[int], numbers: Ints) -> None:
+        self._drawn = drawn  # of all seeds, one below the other, with as many episodes each as `numbers`
         self._seed, self._episode = np.repeat(seeds, len(numbers)), np.tile(numbers, len(seeds))
         self._step = -1
         self._knows = np.zeros(len(self._seed), dtype=bool)
         self.success: Bools = self._knows
 
-    def _now(self, of: Callable[[_Drawn], Any]) -> Any:
-        """Arrays of this step."""
-        return np.concatenate([of(d)[self._step :: STEPS] for d in self._drawn])
-
     def observe(self) -> Sequence[int]:
         """The episodes, while there are decisions to make."""
         self._step += 1
+        self._now = self._drawn.step(self._step)
         return range(len(self._knows)) if self._step < STEPS else ()
 
     def __call__(self, moments: Sequence[int]) -> Intents:
         """What every vehicle intends at this step."""
-        names = self._drawn[0].intents.arrays()
-        now = Intents(**{name: self._now(lambda d: d.intents.arrays()[name]) for name in names})  # noqa: B023
-        return replace(now, own=np.where(self._knows[:, None], self._now(lambda d: d.knowing), now.own))
+        own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
+        return replace(self._now.intents, own=own)
 
     def blind(self, moments: Sequence[int], at: Ints) -> Intents:
         """Nobody is asked blindly: no point of the study has it."""
@@ -146,8 +162,7 @@ class CalibratedWorld:
 
     def due(self, point: OperatingPoint) -> Due:
         """Every episode."""
-        draws = Draws(self._now(lambda d: d.draws.link), self._now(lambda d: d.draws.jitter))
-        return Due(np.arange(len(self._knows)), self._episode, self._seed, draws)
+        return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def site(self, units: Collection[Unit]) -> None:
         """The study's vehicles are nowhere in particular."""
@@ -161,8 +176,8 @@ class CalibratedWorld:
     def step(self, decided: Sequence[Decided[int]]) -> None:
         """Learn what was heard, and see whether the last action is the right one."""
         [part] = decided
-        self._knows = self._knows | (part.result.on_time & self._now(lambda d: d.witness)).any(axis=1)
-        self.success = part.result.action == self._now(lambda d: d.right)
+        self._knows = self._knows | (part.result.on_time & self._now.witness).any(axis=1)
+        self.success = part.result.action == self._now.right
 
 
 class Calibrated:
@@ -179,7 +194,7 @@ class Calibrated:
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._draw = lru_cache(maxsize=32)(self._drawn)
+        self._of_seeds = lru_cache(maxsize=6)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
         """What a reader needs to know of where the intents come from."""
@@ -196,7 +211,7 @@ class Calibrated:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
         for first in range(0, self.episodes, CHUNK):
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
-            drawn = [self._draw(seed, vehicles - 1, first) for seed in seeds]
+            drawn = self._of_seeds(tuple(seeds), vehicles - 1, first)
             world = CalibratedWorld(drawn, seeds, numbers)
             columns, places = walk_through(world, point, world, seeds, numbers)
             success = world.success.reshape(len(seeds), len(numbers)).astype(float)
@@ -207,7 +222,10 @@ class Calibrated:
             }
             yield Walked(numbers, ends, columns, places)
 
-    def _drawn(self, seed: int, helpers: int, first: int) -> _Drawn:
+    def _drawn(self, seeds: tuple[int, ...], helpers: int, first: int) -> _Drawn:
+        return _below([self._draw(seed, helpers, first) for seed in seeds])
+
+    def _draw(self, seed: int, helpers: int, first: int) -> _Drawn:
         """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""
         p, e = self.parameters, min(CHUNK, self.episodes - first)
         n = e * STEPS

@@ -12,10 +12,11 @@ from harness.core.arrays import Floats
 from harness.report.drawing.colours import COLOURS, GREY, INK, MARKERS, PALE, conditions
 from harness.report.drawing.pictures import styled
 from harness.studies.axes import CORE, axis_of
-from harness.studies.reception import Compared, Drawn
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from harness.studies.reception import Compared, Drawn
 
 CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
 PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: its panel of swarm sizes
@@ -235,8 +236,8 @@ def _lettered(drawn: Any) -> None:
 
 @styled
 def reception(
-    name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: Sequence[Drawn],
-    against: Sequence[Compared],
+    name: str, curves: Mapping[str, Floats], distances_m: Floats, messages: "Sequence[Drawn]",
+    against: "Sequence[Compared]",
 ) -> Figure:  # fmt: skip
     """A radio's reception against distance, and beside it, if there are any, against others' curves.
 

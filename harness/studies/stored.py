@@ -99,6 +99,8 @@ class Stored:
         self._asks = asks
         self.left_out: set[str] = set()
         self._opened: dict[int, Backend] = {}
+        self._laid_out: Intents | None = None  # at every decision point that was asked for
+        self._row: dict[str, int] = {}  # of each of them, by id
         self._asker = Asker(
             self._spec(), self._open, PAPER if latency == "paper" else manifest.latency, folder / MORE,
             {answer.id: answer for answer in self.run.answers}, done, more,
@@ -156,14 +158,21 @@ class Stored:
 
     def intents(self, moments: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """What every vehicle intends; where its model is not asked, walks without an answer are left out."""
-        lacks = np.array(self._asker.lacks(moments))
-        if not lacks.any():
+        new = [scene for scene in moments if scene.id not in self._row]
+        if any(self._asker.lacks(new)):
+            if self._asks:
+                return self(moments)
+            lacks = np.array(self._asker.lacks(moments))
+            self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
+            leave_out(lacks)
             return self._asker.laid_out(moments)
-        if self._asks:
-            return self(moments)
-        self.left_out |= {scene.id for scene, left in zip(moments, lacks, strict=True) if left}
-        leave_out(lacks)
-        return self._asker.laid_out(moments)
+        if new:
+            more = self._asker.laid_out(new, width=self.vehicles)
+            self._laid_out = Intents.joined([self._laid_out, more]) if self._laid_out else more
+            self._row |= {scene.id: len(self._row) + n for n, scene in enumerate(new)}
+        assert self._laid_out is not None
+        there = self._laid_out.take([self._row[scene.id] for scene in moments])
+        return there.of_first(max(len(scene.viewers) for scene in moments) - 1)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """The same where helpers are shown nothing; what the run has not is asked, and kept in it."""
