@@ -15,6 +15,7 @@ from harness.dataset.load import Dataset, load
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 EPISODES, SEED = 4, 100
+Once = Callable[[str, Callable[[Path], object]], Path]
 
 # A loaded machine is no failure, and what CI finds must be there to be found again.
 settings.register_profile("harness", deadline=None, derandomize="CI" in os.environ)
@@ -32,16 +33,28 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(scope="session")
-def small_path(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
-    """Folder of a real dataset of four episodes, built once, whoever of several workers comes first."""
+def once(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Once:
+    """A folder by name, filled once, by whoever of several workers comes first; tests leave it as it is."""
     base = tmp_path_factory.getbasetemp()
     if hasattr(request.config, "workerinput"):
         base = base.parent
-    with (base / "small.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (base / "small" / "manifest.json").is_file():
-            build(SCENARIO, base / "small", EPISODES, SEED, 1, lambda done: None)
-    return base / "small"
+
+    def filled(name: str, fill: Callable[[Path], object]) -> Path:
+        done = base / f"{name}.done"
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                fill(base / name)
+                done.touch()
+        return base / name
+
+    return filled
+
+
+@pytest.fixture(scope="session")
+def small_path(once: Once) -> Path:
+    """Folder of a real dataset of four episodes."""
+    return once("small", lambda out: build(SCENARIO, out, EPISODES, SEED, 1, lambda done: None))
 
 
 @pytest.fixture(scope="session")

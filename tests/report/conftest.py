@@ -7,11 +7,9 @@ from harness.world.scenarios.occluded_intersection import SCENARIO
 
 
 @pytest.fixture(scope="session")
-def dataset(tmp_path_factory):
+def dataset(once):
     """Two episodes."""
-    out = tmp_path_factory.mktemp("report") / "two"
-    build(SCENARIO, out, episodes=2, seed=5, workers=1, progress=lambda done: None)
-    return load(out)
+    return load(once("two", lambda out: build(SCENARIO, out, 2, 5, 1, lambda done: None)))
 
 
 @pytest.fixture(scope="session")

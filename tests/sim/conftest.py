@@ -1,5 +1,6 @@
-"""Six frozen episodes, built once a session: dangers from the left, the right and oncoming, and none."""
+"""Six frozen episodes: dangers from the left, the right and oncoming, and none."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,8 @@ FIRST_SEED = 178  # left, none, left, right, left, oncoming
 
 
 @pytest.fixture(scope="session")
-def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("built") / "small-v1"
-    build(SCENARIO, folder, 6, FIRST_SEED, 1, lambda done: None)
-    return folder
+def small_folder(once: Callable[..., Path]) -> Path:
+    return once("small-v1", lambda out: build(SCENARIO, out, 6, FIRST_SEED, 1, lambda done: None))
 
 
 @pytest.fixture(scope="session")
