@@ -1,5 +1,6 @@
 """A run killed at any moment and resumed has the bytes of one that never was."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -70,20 +71,24 @@ def unfinished(spec: Spec, out: Path, kept: bytes) -> Path:
     return out
 
 
-@pytest.fixture
-def answers(small: Dataset, tmp_path: Path) -> bytes:
+@pytest.fixture(scope="module")
+def answers(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """All answers of a run, as they are kept while it goes on."""
-    spec = spec_of(small)
-    walked(spec, open_backend(spec.ego.card), PAPER, tmp_path / "answers.jsonl")
-    return (tmp_path / "answers.jsonl").read_bytes()
+    spec, kept = spec_of(small), tmp_path_factory.mktemp("kept") / "answers.jsonl"
+    walked(spec, open_backend(spec.ego.card), PAPER, kept)
+    return kept.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run that nobody killed."""
+    return run(spec_of(small), tmp_path_factory.mktemp("whole") / "run").out
 
 
 @pytest.mark.parametrize("torn", [1, 5, 300, 20_000])
 def test_a_torn_last_line_is_dropped_and_asked_again(
-    torn: int, answers: bytes, small: Dataset, tmp_path: Path
+    torn: int, whole: Path, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
-    whole = tmp_path / "whole"
-    run(spec_of(small), whole)
     out = unfinished(spec_of(small), tmp_path / "torn", answers[:-torn])
     run(spec_of(small), out)
     assert same_files(out, whole)
@@ -130,11 +135,11 @@ def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Datase
 )
 @pytest.mark.parametrize("finished", [True, False])
 def test_other_settings_are_refused_by_name_and_change_nothing(
-    finished: bool, other, named: str, answers: bytes, small: Dataset, tmp_path: Path
+    finished: bool, other, named: str, whole: Path, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
     if finished:
-        run(spec_of(small), out)
+        shutil.copytree(whole, out)
         (out / ".work").mkdir()
     else:
         unfinished(spec_of(small), out, answers[:5000])

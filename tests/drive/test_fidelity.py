@@ -11,24 +11,34 @@ import pandas as pd
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from typer.main import get_command
 
+from harness.cli import app
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.studies.fidelity import disagreements, fidelity
 
 Said = tuple[int, str, str]
+MODELS = ("proxy", "cruise", "brake", "local-view")
 LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0:2", "--workers", "1")  # those of `small`
 
 
+@pytest.fixture(scope="module")
+def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of four models, each frozen and driven."""
+    folder = tmp_path_factory.mktemp("fidelity")
+    for model in MODELS:
+        evaluate(spec_of(small, model), folder / f"eval-{model}")
+        drive = ("drive", "--model", model, *LAYOUTS, "--quiet", "--out", str(folder / f"drive-{model}"))
+        get_command(app)(drive, standalone_mode=False)
+    return folder
+
+
 @pytest.fixture
-def runs(harness: Callable[..., Said], small: Dataset) -> list[Path]:
-    """Four models, each frozen and driven."""
-    made = []
-    for model in ("proxy", "cruise", "brake", "local-view"):
-        made.append(evaluate(spec_of(small, model), Path(f"eval-{model}")).out)
-        assert harness("drive", "--model", model, *LAYOUTS, "--out", f"drive-{model}")[0] == 0
-        made.append(Path(f"drive-{model}"))
-    return made
+def runs(made: Path, harness: Callable[..., Said]) -> list[Path]:
+    """Where the test is: each model's frozen and driven run."""
+    shutil.copytree(made, Path(), dirs_exist_ok=True)
+    return [Path(f"{kind}-{model}") for model in MODELS for kind in ("eval", "drive")]
 
 
 def success(run: Path, condition: str) -> pd.Series:

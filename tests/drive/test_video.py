@@ -11,8 +11,9 @@ from driving import FROM_LEFT
 from evaluating import live_spec_of, run
 from PIL import Image, ImageSequence
 from run_on_disk import made_up
+from typer.testing import CliRunner
 
-from harness.cli import main
+from harness.cli import app, main
 from harness.core.errors import UserError
 from harness.evaluate.replay import find, stills
 from harness.report.drawing.video import write_video
@@ -52,9 +53,17 @@ def typed(monkeypatch, capsys, *words):
     return end.value.code or 0, *capsys.readouterr()
 
 
-def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, tmp_path, monkeypatch, capsys):
-    picture = tmp_path / "episode.gif"
-    assert typed(monkeypatch, capsys, "video", out, 0, "--out", picture) == (0, f"wrote {picture}\n", "")
+@pytest.fixture(scope="module")
+def drawn(out, tmp_path_factory):
+    """A GIF of its first episode by the command, and what that said."""
+    picture = tmp_path_factory.mktemp("drawn") / "episode.gif"
+    done = CliRunner().invoke(app, ["video", str(out), "0", "--out", str(picture)])
+    return picture, (done.exit_code, done.stdout, done.stderr)
+
+
+def test_an_episode_is_drawn_as_a_gif_in_which_things_move(out, drawn):
+    picture, said = drawn
+    assert said == (0, f"wrote {picture}\n", "")
     seen = list(stills(find(out, 0, None, None)))
     with Image.open(picture) as image:
         frames = [frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(image)]
@@ -73,11 +82,9 @@ def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(out, tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["episode.mp4"]
 
 
-def test_the_same_episode_gives_the_same_gif(out, tmp_path):
-    played = find(out, 0, None, None)
-    for name in ("a.gif", "b.gif"):
-        write_video(played, tmp_path / name, lambda done: None)
-    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+def test_the_same_episode_gives_the_same_gif(out, drawn, tmp_path):
+    write_video(find(out, 0, None, None), tmp_path / "again.gif", lambda done: None)
+    assert (tmp_path / "again.gif").read_bytes() == drawn[0].read_bytes()
 
 
 def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
