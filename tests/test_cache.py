@@ -224,7 +224,7 @@ def _write(path: str, first: int) -> None:
 
 
 def test_processes_that_write_at_once_lose_nothing(file: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     writers = [context.Process(target=_write, args=(str(file), 20 * n)) for n in range(4)]
     for writer in writers:
         writer.start()

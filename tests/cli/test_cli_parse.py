@@ -1,25 +1,34 @@
 """`harness parse`, run as a user does."""
 
+import io
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 COMPLETIONS = Path(__file__).parents[1] / "completions"
+Parse = Callable[..., tuple[int, str, str]]
 
 
-def harness(*arguments: str, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(
-        [sys.executable, "-m", "harness", "parse", *arguments], input=stdin, capture_output=True
-    )
+@pytest.fixture
+def parse(harness: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> Parse:
+    """The command as typed, with these bytes on stdin: its exit code, and what it said."""
+
+    def typed(*arguments: str, stdin: bytes = b"") -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+        return harness("parse", *arguments)
+
+    return typed
 
 
-def test_a_table_says_status_repairs_and_distribution() -> None:
-    done = harness(str(COMPLETIONS / "y_recovered_fence_json.txt"), "--scenario", "occluded-intersection")
-    rows = dict(line.split(None, 1) for line in done.stdout.decode().splitlines())
-    assert done.returncode == 0
+def test_a_table_says_status_repairs_and_distribution(parse: Parse) -> None:
+    file = COMPLETIONS / "y_recovered_fence_json.txt"
+    code, out, _ = parse(str(file), "--scenario", "occluded-intersection")
+    rows = dict(line.split(None, 1) for line in out.splitlines())
+    assert code == 0
     assert rows["status"].startswith("recovered:")
     assert rows["repair"].startswith("code_fence:")
     assert [rows[name] for name in ("SLOWER", "IDLE", "FASTER", "mass")] == [
@@ -30,38 +39,38 @@ def test_a_table_says_status_repairs_and_distribution() -> None:
     ]
 
 
-def test_json_has_the_intent_by_action_and_the_helpers_message() -> None:
-    done = harness(str(COMPLETIONS / "y_strict_helper_distribution.txt"), "--role", "helper", "--json")
-    parsed = json.loads(done.stdout)
+def test_json_has_the_intent_by_action_and_the_helpers_message(parse: Parse) -> None:
+    _, out, _ = parse(str(COMPLETIONS / "y_strict_helper_distribution.txt"), "--role", "helper", "--json")
+    parsed = json.loads(out)
     assert parsed["verdict"] == "strict"
     assert parsed["intent"] == {"SLOWER": 0.5, "IDLE": 0.4, "FASTER": 0.1}
     assert parsed["message"]["risk"] == "medium"
     assert parsed["repairs"] == []
 
 
-def test_a_failed_verdict_is_data_and_exits_with_zero() -> None:
+def test_a_failed_verdict_is_data_and_exits_with_zero(parse: Parse) -> None:
     text = b'{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}'
-    done = harness("-", "--finish-reason", "length", "--json", stdin=text)
-    assert done.returncode == 0
-    assert json.loads(done.stdout)["status"] == "truncated_json"
-    assert (
-        json.loads(harness("-", "--thinking", "--json", stdin=text).stdout)["status"] == "truncated_reasoning"
-    )
+    code, out, _ = parse("-", "--finish-reason", "length", "--json", stdin=text)
+    assert code == 0
+    assert json.loads(out)["status"] == "truncated_json"
+    assert json.loads(parse("-", "--thinking", "--json", stdin=text)[1])["status"] == "truncated_reasoning"
 
 
 def test_bytes_that_are_no_utf8_are_replaced_and_said_so() -> None:
-    done = harness("-", stdin=b'\xff{"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}')
+    command = [sys.executable, "-m", "harness", "parse", "-"]
+    said = b'\xff{"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}'
+    done = subprocess.run(command, input=said, capture_output=True)
     assert done.returncode == 0
     assert b"note: not UTF-8 from byte 0 on" in done.stderr
     assert b"prose_around" in done.stdout
 
 
-def test_hostile_text_cannot_reach_the_terminal() -> None:
+def test_hostile_text_cannot_reach_the_terminal(parse: Parse) -> None:
     text = (
         rb'{"evidence": "\u001b[31mred", "risk": "low", "recommended_maneuver": "\u001b[2J", "confidence": 1}'
     )
-    assert b"\x1b" not in harness("-", "--role", "helper", stdin=text).stdout
-    assert b"\x1b" not in harness("-", "--role", "helper", stdin=text.replace(rb"\u001b[2J", b"IDLE")).stdout
+    assert "\x1b" not in parse("-", "--role", "helper", stdin=text)[1]
+    assert "\x1b" not in parse("-", "--role", "helper", stdin=text.replace(rb"\u001b[2J", b"IDLE"))[1]
 
 
 @pytest.mark.parametrize(
@@ -80,15 +89,14 @@ def test_hostile_text_cannot_reach_the_terminal() -> None:
         ),
     ],
 )
-def test_bad_input_is_one_line_and_exits_with_two(arguments: list[str], line: str) -> None:
-    done = harness(*arguments)
-    assert done.returncode == 2
-    assert done.stdout == b""
-    assert done.stderr.decode().startswith(line)
-    assert len(done.stderr.splitlines()) == 1
+def test_bad_input_is_one_line_and_exits_with_two(parse: Parse, arguments: list[str], line: str) -> None:
+    code, out, err = parse(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith(line)
+    assert len(err.splitlines()) == 1
 
 
-def test_a_device_without_an_end_is_one_line() -> None:
-    done = harness("/dev/zero")
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, b"", 1)
-    assert done.stderr.startswith(b"harness: ")
+def test_a_device_without_an_end_is_one_line(parse: Parse) -> None:
+    code, out, err = parse("/dev/zero")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert err.startswith("harness: ")
