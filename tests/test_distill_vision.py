@@ -35,7 +35,7 @@ from harness.training.train import STAGES, Plan
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
-PLAN = Plan(dict(zip(STAGES, (32, 64, 32, 32), strict=True)), batch=8)
+PLAN = Plan(dict.fromkeys(STAGES, 16), batch=8)
 LAYOUTS = 2
 
 

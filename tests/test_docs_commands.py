@@ -33,6 +33,9 @@ SHARD = "--episodes 17 --seeds 0 --workers 1"  # the fewest of which there are t
 CUT = {
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
+    "harness eval --model ./my-checkpoint": "--limit 1",  # by transformers, which is slow on a CPU
+    "harness eval --model ./my-checkpoint --prompt v2": "--limit 1",
+    "harness eval --model my-model": "--limit 1",
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
     "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
@@ -44,7 +47,8 @@ CUT = {
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
     "harness scenario check": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness scenario audit": "--layouts 24 --workers 1",  # of 300
-    "harness distill": "--layouts 3 --samples 64,64,64,64 --workers 1",  # of 240, and of 300 000 sequences
+    "harness distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240, and of 300 000 sequences
+    "harness prompt check mine --tokenizer ../tokenizer.json": "--dataset ../few",  # 4 episodes of 240
     "harness parity": "--prompts 1",  # of 64, on two engines
 }
 
@@ -97,9 +101,9 @@ def parsed(args: list[str]) -> tuple[str, list[str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in pages() if blocks(page)], ids=name)
 def test_a_page_can_be_followed(
-    page: Path, harness: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for file, stands_for in READER_HAS.items():
+    for file, stands_for in {**READER_HAS, "few": small_path}.items():
         (tmp_path / file).symlink_to(stands_for)
     known: dict[str, Any] = {}
     for language, block in blocks(page):
