@@ -18,10 +18,10 @@ eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the defau
 	$(BIN)/harness eval --model swarm-tiny --prompt v2
 
 test: check browser ## every check and every test
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
-	.venv-light/bin/python -m pytest -n 2 $(ONLY)
+	.venv-light/bin/python -m pytest -n 2 --dist worksteal $(ONLY)
 
 browser: ## Debian's chromium for the tests that open pages, which are skipped where there is none
 	@command -v chromium >/dev/null || (apt-get update --quiet=2 && apt-get install --quiet=2 --yes \
