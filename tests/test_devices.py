@@ -241,7 +241,7 @@ def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_workers_change_no_row(tmp_path: Path) -> None:
     """Each in a process of its own, as a user types it: a fork has none of an open engine's threads."""
-    drive = ("drive", "--model", "swarm-tiny", "--episodes", "9", "--seeds", "0,1", "--condition", "6g")
+    drive = ("drive", "--model", "swarm-tiny", "--episodes", "17", "--seeds", "0", "--condition", "6g")
     on = ("--device-profile", "agx-orin", "--device-model", "qwen3-0.6b", "--quiet")
     for workers in "12":
         typed = (sys.executable, "-m", "harness", *drive, *on, "--workers", workers, "--out", workers)

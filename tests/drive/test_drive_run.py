@@ -72,7 +72,8 @@ def test_a_summary_agrees_with_its_episodes(whole):
 
 
 @pytest.mark.parametrize(("workers", "batch_size"), [(2, 8), (1, 1), (1, 100), (2, 3)])
-def test_workers_and_batches_change_no_byte(whole, tmp_path, workers, batch_size):
+def test_workers_and_batches_change_no_byte(whole, tmp_path, monkeypatch, workers, batch_size):
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 4)  # so that both workers have some
     found = folder_of(spec(episodes=10, batch_size=batch_size), tmp_path / "run", workers)
     assert found == {name: (whole / name).read_bytes() for name in FILES}
 
