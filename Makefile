@@ -50,6 +50,7 @@ bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/drive.py
 	$(BIN)/python benchmarks/executors.py
 	$(BIN)/python benchmarks/report.py
+	$(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/load.py
 	$(BIN)/python benchmarks/servers.py
 	$(BIN)/python benchmarks/camera.py

@@ -23,6 +23,7 @@ from time import perf_counter, process_time
 from commands import HERE, copied, run
 from executors import nap
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from harness.backends import cards
 from harness.backends.registry import open_backend
@@ -34,12 +35,13 @@ from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
-from harness.report.drawing.colours import BAD, GREY, ROLES
+from harness.report.drawing.colours import BAD, GREY, INK
 from harness.report.drawing.pictures import save, styled
 from harness.runs import folder
 
 FIRST = 20  # layouts that tell how many decisions a layout has, and how long an answer takes
 A_WORKER = 4
+AIM_MB = 2000
 HOLDS = """
 import resource, sys
 from pathlib import Path
@@ -138,29 +140,31 @@ def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
             label=label,
         )
 
-    line(
-        time, decisions, "decisions", lambda row: row["cpu_s"], ROLES["ego"], "harness eval, report included"
-    )
+    line(time, decisions, "decisions", lambda row: row["cpu_s"], INK, "harness eval, report included")
     line(time, decisions, "decisions", lambda row: row["limit_s"], GREY, "limit: the proxy's answers", "--")
     time.set(xscale="log", yscale="log", xlabel="decisions", ylabel="CPU seconds")
-    line(memory, decisions, "decisions", lambda row: row["peak_mb"], ROLES["ego"], "peak of harness eval")
+    line(memory, decisions, "decisions", lambda row: row["peak_mb"], INK, "peak of harness eval")
     line(memory, decisions, "decisions", lambda row: row["limit_mb"], GREY, "limit: table and page", "--")
-    memory.axhline(2000, color=BAD, lw=0.8)
+    memory.axhline(AIM_MB, color=BAD, lw=0.8, label="aim")
     memory.set(xscale="log", yscale="log", xlabel="decisions", ylabel="MB")
-    line(
-        hands, workers, "workers", lambda row: row["wall_s"] - row["start_s"], ROLES["ego"], "after the start"
-    )
-    line(hands, workers, "workers", lambda row: row["wall_s"], ROLES["helper"], "with the start")
+    line(hands, workers, "workers", lambda row: row["wall_s"] - row["start_s"], INK, "after the start")
+    line(hands, workers, "workers", lambda row: row["wall_s"], INK, "with the start", ":")
     line(hands, workers, "workers", lambda row: row["limit_s"], GREY, "limit: the chunks' own", "--")
     hands.set(xscale="log", xlabel="workers", ylabel="seconds of four chunks a worker", ylim=(0, None))
     hands.set_xticks(
         [row["workers"] for row in workers], [f"{row['workers']:.0f}" for row in workers], minor=False
     )
     hands.minorticks_off()
+    powers = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+    for axes in (time, memory):
+        axes.xaxis.set_major_formatter(lambda n, _: f"10{str(round(math.log10(n))).translate(powers)}")
+        axes.yaxis.set_major_formatter(lambda n, _: f"{n:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    memory.set_yticks([200, 500, 1000, 2000])
     for axes in (time, memory, hands):
         axes.legend(fontsize=6, frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.17, top=0.97, wspace=0.3)
+    figure.subplots_adjust(left=0.075, right=0.99, bottom=0.17, top=0.97, wspace=0.3)
     return figure
 
 
