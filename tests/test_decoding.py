@@ -305,12 +305,6 @@ def test_requests_that_are_answered_alike_share_a_batch(backend: LanguageModel) 
     assert [c.batch_size for c in backend.complete(requests)] == [3] * 9
 
 
-def test_a_batch_is_of_one_role(backend: LanguageModel) -> None:
-    """Of six requests in batches of four none shares one with a role that begins otherwise."""
-    requests = [ask(i, role=role) for i, role in enumerate(("ego", "helper") * 3)]
-    assert [c.batch_size for c in backend.complete(requests)] == [3] * 6
-
-
 @pytest.mark.parametrize("answer", MODES)
 def test_weights_that_are_no_numbers_are_an_error_of_the_engine_and_no_answer(
     answer: AnswerMode, tmp_path: Path

@@ -84,15 +84,12 @@ class LanguageModel:
         return self.engine.identity()
 
     def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:
-        """Prompts that are answered alike, begin alike (a role has one system prompt) and are about as long.
-
-        Two roles in one batch would have nothing in common that is computed once.
-        """
+        """Prompts that are answered alike, begin alike (a role has one system prompt) and are as long."""
 
         def kind(p: _Prompt) -> tuple[str, str, int, int]:
             return p.request.answer, p.request.role, p.request.max_tokens, len(p.ids)
 
-        for _, same in groupby(sorted(prompts, key=kind, reverse=True), lambda p: kind(p)[:2]):
+        for _, same in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
             alike = list(same)
             for start in range(0, len(alike), self.batch_size):
                 yield alike[start : start + self.batch_size]

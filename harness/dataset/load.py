@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, overload
@@ -286,19 +286,33 @@ def load(path: Path, limit: int | None = None) -> Dataset:
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):
         raise unusable(path, problem)
-    trusted, checked = digest in released_digests(), set[int]()
-
-    @lru_cache(maxsize=TREES_KEPT)
-    def read(number: int) -> Tree:
-        try:
-            with opened(path) as file:
-                tree = read_tree(file, manifest, number, trusted or number in checked)
-        except Damaged as damage:
-            raise unusable(path, str(damage)) from None
-        checked.add(number)
-        return tree
-
-    trees = Trees(range(manifest.episodes)[:limit], read)
+    trusted = digest in released_digests()
+    trees = Trees(range(manifest.episodes)[:limit], _Folder(path, manifest, trusted))
     for number in trees.numbers:
-        read(number)
+        trees.read(number)
     return Dataset(path, manifest, digest, trees, trusted)
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """Gives an episode's tree from a dataset's folder. Raises UserError where that is damaged."""
+
+    path: Path
+    manifest: Manifest
+    trusted: bool
+    _kept: dict[int, Tree] = field(default_factory=dict, repr=False, compare=False)
+    _checked: set[int] = field(default_factory=set, repr=False, compare=False)
+
+    def __call__(self, number: int) -> Tree:
+        if number in self._kept:
+            return self._kept[number]
+        try:
+            with opened(self.path) as file:
+                tree = read_tree(file, self.manifest, number, self.trusted or number in self._checked)
+        except Damaged as damage:
+            raise unusable(self.path, str(damage)) from None
+        self._checked.add(number)
+        self._kept[number] = tree
+        if len(self._kept) > TREES_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return tree

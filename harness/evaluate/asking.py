@@ -31,8 +31,6 @@ from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
 CHUNK = 64  # requests that are asked for, and kept, at a time, at least
-# Or so many batches: one of egos to three of helpers, which share no batch, so that each may be full.
-BATCHES = 4
 
 
 def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
@@ -159,7 +157,7 @@ class Asker:
         # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
         # depend on the other requests in its batch.
         backend, batch = self._backend(), self.spec.batch_size
-        size = batch * max(BATCHES, math.ceil(CHUNK / batch))
+        size = batch * math.ceil(CHUNK / batch)
         chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # whose batches are whole, as the others' are
