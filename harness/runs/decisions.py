@@ -1,5 +1,6 @@
 """The table of decisions: a row a decision point, condition and seed. The file `decisions.parquet`."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -243,7 +244,7 @@ class Decisions:
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
         """Read a Parquet file. Raises OSError or ValueError if it is none, or has not a run's columns."""
-        with path.open("rb") as file:  # not read_table, which takes names of folders for columns
+        with arrow_file(path) as file:  # not read_table, which takes names of folders for columns
             table = pq.ParquetFile(file).read()
         for name in OPTIONAL:
             if name not in table.column_names:
@@ -262,6 +263,12 @@ class Decisions:
         import pandas as pd
 
         return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
+
+
+def arrow_file(path: Path) -> pa.OSFile:
+    """A file open for Arrow's threads, which can abort the process when they let go of one of Python's."""
+    with path.open("rb"):  # which says in few words why a file cannot be opened
+        return pa.OSFile(os.fsencode(path))
 
 
 # Where pyarrow turns what is not its own into an array, or the reverse, it loads pandas: buffers spare that.

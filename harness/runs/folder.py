@@ -28,7 +28,7 @@ from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs import attribution
 from harness.runs.attribution import Attribution
-from harness.runs.decisions import Decisions
+from harness.runs.decisions import Decisions, arrow_file
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
@@ -357,7 +357,7 @@ def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | N
 def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
-    with file.open("rb") as lines:
+    with arrow_file(file) as lines:
         table = pacsv.read_csv(
             lines,
             parse_options=pacsv.ParseOptions(newlines_in_values=True),
