@@ -85,7 +85,7 @@ def test_requests_of_a_decision_go_to_one_server_and_each_server_has_some_decisi
     assert again == [r.id for r in asked]
     of_one, of_other = ({name.partition("/")[0] for name in names(there)} for there in (one, other))
     assert not of_one & of_other
-    assert min(len(of_one), len(of_other)) >= 4
+    assert min(len(of_one), len(of_other)) >= 1  # ports are drawn: one has all once in eight million
     assert len(one.asked) + len(other.asked) == 2 * len(asked)
 
 
@@ -112,7 +112,7 @@ def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -
         ports.add(asked.handler.client_address)
         said_back(asked)
 
-    before = threading.active_count()
+    before = set(threading.enumerate())  # threads of earlier tests may still be ending
     with serving(play) as there:
         backend = opened(there)
         for _ in range(5):
@@ -122,9 +122,9 @@ def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -
         del backend
         gc.collect()
     until_s = time.monotonic() + 20
-    while threading.active_count() > before and time.monotonic() < until_s:  # the server's end as these do
+    while set(threading.enumerate()) - before and time.monotonic() < until_s:  # the server's end as these do
         time.sleep(0.01)
-    assert threading.active_count() == before
+    assert not set(threading.enumerate()) - before
 
 
 def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Dataset, tmp_path: Path) -> None:
