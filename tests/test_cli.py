@@ -87,6 +87,12 @@ def one_line(said: Said) -> str:
         (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
         (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),
         (["eval", "--batch-size", "0"], "--batch-size 0: give 1 or more"),
+        (["eval", "--workers", "0"], "--workers 0: give 1 to 256 processes, or ray for a Ray cluster"),
+        (
+            ["eval", "--model", "swarm-tiny", "--workers", "2"],
+            "--workers 2: the answers of rules are spread over workers, and swarm-tiny is a language model; "
+            "give --batch-size, or several --server",
+        ),
         (["eval", "--thinking"], "--thinking: proxy cannot think; leave it out"),
         (["eval", "--device", "cuda"], "--device cuda: proxy has no weights here (engines transformers"),
         (["eval", "--dtype", "int3"], "--dtype int3: proxy has no weights here (engines transformers"),

@@ -34,6 +34,7 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.runs.records import Answer, FrozenScenes
@@ -65,13 +66,15 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     assert same_files(tmp_path / "run", proxy_run)
 
 
-@pytest.mark.parametrize("trees", [1, 3])
-def test_how_many_trees_are_walked_at_once_changes_no_byte(
-    trees: int, proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("trees", "workers"), [(1, 1), (3, 1), (1, 2)])
+def test_how_many_trees_are_walked_at_once_and_by_whom_changes_no_byte(
+    trees: int, workers: int, proxy_run: Path, small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("harness.evaluate.run.TREES_AT_ONCE", trees)
-    run(spec_of(small), tmp_path / "run")
+    answered, owed = list[int](), list[int]()
+    evaluate(spec_of(small), tmp_path / "run", answered.append, more=owed.append, workers=workers)
     assert same_files(tmp_path / "run", proxy_run)
+    assert sum(answered) == sum(owed) == len(answers_of(proxy_run))
 
 
 @pytest.fixture(scope="module")

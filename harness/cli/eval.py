@@ -1,5 +1,6 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -16,6 +17,7 @@ from harness.core.errors import UserError, printable
 from harness.core.seeds import stated
 
 if TYPE_CHECKING:
+    from harness.core.parallel import Workers
     from harness.dataset.load import Dataset as Frozen
     from harness.evaluate.run import Evaluated, Opens
     from harness.evaluate.spec import Spec
@@ -60,6 +62,7 @@ def command(
         None, "--repeats", help="Evaluate so many times, with sampling seeds one after the other."
     ),
     batch_size: options.BatchSize = 8,
+    workers: options.RuleWorkers = None,
     server: options.Servers = None,
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -129,8 +132,11 @@ def command(
             for each in zip(specs, counted, strict=True):
                 _show_counted(*each)
         return
+    if workers is not None:
+        _refuse_language_models(specs, workers)
     silent, cache = as_json or quiet, None if no_cache else default_file()
-    evaluated = partial(_evaluated, cache=cache, silent=silent)
+    who = options.workers_of(workers or "2")
+    evaluated = partial(_evaluated, cache=cache, silent=silent, workers=who)
     if repeat is not None:
         repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
         return
@@ -154,19 +160,28 @@ def command(
 
 def _evaluated(
     spec: "Spec", dataset: "Frozen", folder: Path, opens: "Opens | None" = None,
-    *, cache: Path | None, silent: bool,
+    *, cache: Path | None, silent: bool, workers: "Workers",
 ) -> "tuple[Evaluated, Path]":  # fmt: skip
     """Evaluate, and write the run and its page."""
     from harness.evaluate.run import evaluate
 
     with bar(f"asking {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
-        done = evaluate(spec, folder, progress, cache, progress.more, opens=opens)
+        done = evaluate(spec, folder, progress, cache, progress.more, workers, opens)
     from harness.cli.report import write
 
     with work.going_on(folder):
         page = write([folder], quiet=silent, dataset=dataset)
     work.tidy(folder)
     return done, page
+
+
+def _refuse_language_models(specs: "Sequence[Spec]", workers: str) -> None:
+    for agent in (agent for spec in specs for agent in spec.agents):
+        if agent.can.language_model:
+            raise UserError(
+                f"--workers {printable(workers)}: the answers of rules are spread over workers, and "
+                f"{printable(agent.card.name)} is a language model; give --batch-size, or several --server"
+            )
 
 
 def _counted(spec: "Spec", dataset: "Frozen", tokenizer: Path | None) -> dict[str, Any]:

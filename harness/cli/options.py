@@ -89,6 +89,13 @@ ModelWorkers = Annotated[
         help="Processes, each with the model loaded; or a Ray cluster: ray, ray://HOST:PORT, ray:HOST:PORT.",
     ),
 ]
+RuleWorkers = Annotated[
+    str | None,
+    Option(
+        metavar="WHO",
+        help="Of rules in more than 256 layouts: processes, or a Ray cluster as of drive. Default: 2.",
+    ),
+]
 Shard = Annotated[
     str | None,
     Option(

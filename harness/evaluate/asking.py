@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from functools import partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -189,21 +189,27 @@ class Asker:
     def __call__(self, moments: Sequence[Scene]) -> Intents:
         """What every viewer intends; NaN for one without a request, or whose answer failed."""
         if any(self.lacks(moments)):
-            self.answer(list(requests(self.spec, moments)))
+            self.answer(list(requests(self.spec, self._not_given(moments))))
         return self.laid_out(moments)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """The same where helpers are shown nothing; NaN for those of other moments than these."""
         wanted = [moments[n] for n in at.tolist()]
         if any(self.lacks(wanted, blind=True)):
-            self.answer(list(requests(self.spec, wanted, blind=True)))
+            self.answer(list(requests(self.spec, self._not_given(wanted, blind=True), blind=True)))
         return self.laid_out(moments, blind=True)
 
     def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
         """Whether some viewer's answer is missing, of each; some helper's who is shown nothing."""
-        return [
-            any(_id(s, v, blind) not in self.answers for v in self.spec.viewers(s)[blind:]) for s in moments
-        ]
+        return self._lacking(moments, self.answers, blind)
+
+    def _not_given(self, moments: Sequence[Scene], blind: bool = False) -> list[Scene]:
+        """Those with more to ask than `answer` leaves out: no prompt of the rest has to be written."""
+        lacks = self._lacking(moments, self._given, blind)
+        return [scene for scene, lacking in zip(moments, lacks, strict=True) if lacking]
+
+    def _lacking(self, moments: Sequence[Scene], there: Container[str], blind: bool) -> list[bool]:
+        return [any(_id(s, v, blind) not in there for v in self.spec.viewers(s)[blind:]) for s in moments]
 
     def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
         """The answers that are there as arrays, with `width` vehicles or more; NaN for one that failed."""

@@ -103,7 +103,8 @@ def evaluate(
             included.
         cache: file of completions kept between runs, for language models; None for no cache.
         more: called with the number of answers that are owed next, where scenes are frozen.
-        workers: who drives, each with a backend of its own.
+        workers: who drives, each with a backend of its own, or walks the parts of frozen scenes that rules
+            answer in; a language model answers in frozen scenes in this process.
         opens: in the place of `open_backend`, where scenes are frozen: what it gives may be open already.
         given: answers that are there already, by request id, where scenes are frozen.
 
@@ -117,7 +118,9 @@ def evaluate(
     if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given)
+        return _frozen(
+            spec, spec.source, out, begun, progress, cache, more, opens or open_backend, given, workers
+        )
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
@@ -199,6 +202,7 @@ def _part(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[st
 def _frozen(
     spec: Spec, source: FrozenSource, out: Path, begun: Begun | None, progress: Callable[[int], None],
     cache: Path | None, more: Callable[[int], None], opens: Opens, given: Mapping[str, Answer],
+    workers: Workers,
 ) -> Evaluated:  # fmt: skip
     dataset = source.dataset
     options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
@@ -209,17 +213,29 @@ def _frozen(
     chunks = _chunked(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
         asked, kept = together(spec.cards, models, cache), place / "answers.jsonl"
-        for chunk in chunks:
-            part = place / _part_of(chunk)
-            if part.is_dir():
-                n = folder.answers_in(part)
-                more(n)
-                progress(n)
-                continue
+        todo = [chunk for chunk in chunks if not (place / _part_of(chunk)).is_dir()]
+        apart = len(todo) > 1 and workers != 1 and _exact(spec) and not given
+
+        def here(chunk: Sequence[int]) -> dict[str, bytes]:
             asker = Asker(spec, lambda: asked, latency, kept, given, progress, more)
-            some = dataset.of_episodes(frozenset(chunk)) if len(chunks) > 1 else dataset
-            folder.write_part(part, _part(spec, FrozenWorld(some, spec.points, spec.seeds), asker))
+            return _part(spec, _world(spec, chunk), asker)
+
+        def count(chunk: Sequence[int]) -> None:
+            n = folder.answers_in(place / _part_of(chunk))
+            more(n)
+            progress(n)
+
+        def took(at: int, files: dict[str, bytes]) -> None:
+            folder.write_part(place / _part_of(todo[at]), files)
             kept.unlink(missing_ok=True)
+            if apart:
+                count(todo[at])
+
+        for chunk in chunks:
+            if chunk not in todo:
+                count(chunk)
+        walked = partial(_walked, spec, begun, None) if apart else here
+        each(walked, todo, workers if apart else 1, took, _named)
         return _gathered(out, _as_now(spec, begun), chunks, place)
 
 
@@ -277,8 +293,8 @@ def _drive(
         progress(len(todo[at]))
 
     # The cache is a file of one machine.
-    drive = partial(_driven, spec, begun, cache if isinstance(workers, int) else None)
-    each(drive, todo, workers, took, _named, _exact(spec))
+    walked = partial(_walked, spec, begun, cache if isinstance(workers, int) else None)
+    each(walked, todo, workers, took, _named, _exact(spec))
 
 
 def _exact(spec: Spec) -> bool:
@@ -286,11 +302,8 @@ def _exact(spec: Spec) -> bool:
     return not any(agent.can.language_model for agent in spec.agents)
 
 
-def _driven(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
-    """Drive a chunk; returns its files by name."""
-    from harness.evaluate.live_world import LiveWorld
-
-    source = cast("LiveSource", spec.source)
+def _walked(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
+    """Walk a chunk in a worker; returns its files by name."""
 
     def backend() -> Backend:
         asked = together(spec.cards, _opened_all(spec), cache)
@@ -300,9 +313,18 @@ def _driven(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) 
             )
         return asked
 
-    asker = Asker(spec, backend, begun.latency)
-    world = LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
-    return _part(spec, world, asker)
+    return _part(spec, _world(spec, chunk), Asker(spec, backend, begun.latency))
+
+
+def _world(spec: Spec, chunk: Sequence[int]) -> "FrozenWorld | LiveWorld":
+    """The world of a chunk of a run's episodes."""
+    if isinstance(spec.source, FrozenSource):
+        some = spec.source.dataset.of_episodes(frozenset(chunk))
+        return FrozenWorld(some, spec.points, spec.seeds)
+    from harness.evaluate.live_world import LiveWorld
+
+    source = cast("LiveSource", spec.source)
+    return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
 
 
 def _gathered(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
