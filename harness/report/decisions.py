@@ -19,7 +19,7 @@ from harness.report import scenes
 from harness.report.choose import failures, lost, pick, spread
 from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
-from harness.runs.records import Answer, Decision
+from harness.runs.records import Answer, Decision, Episode
 from harness.world import scenarios
 from harness.world.perception.graph import blinded
 
@@ -88,6 +88,7 @@ class Decisions:
                 places[scene] = int(episode[rows.start]), int(step[rows.start]), danger[rows.start]
         order = sorted(places.items(), key=lambda item: (*item[1][:2], item[0]))
         self.ids = [scene for scene, _ in order]
+        self._episode_of = {scene: episode for scene, (episode, _, _) in order}
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         self._ends = [_ends(run) for run in runs.runs]
         self._left_out = [_left_out(run) for run in runs.runs]
@@ -220,7 +221,7 @@ class Decisions:
         for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
             shown = {**_shown(d), "end": str(self._ends[n][row])}
             decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
-        ends = self._episodes[n][int(run.decisions.whole("episode")[rows.start])]
+        ends = [_end(episode) for episode in self._episodes[n][self._episode_of[name]]]
         detail = {"answers": answers, "decisions": list(decisions.values()), "ends": ends}
         if left_out := self._left_out[n].get(name):
             detail |= {"left_out": left_out}
@@ -250,17 +251,21 @@ def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
     return of
 
 
-def _episodes(run: Run) -> dict[int, list[dict[str, Any]]]:
-    """How each episode ended, by number: an entry a condition and seed."""
-    ends: dict[int, list[dict[str, Any]]] = {}
-    for e in run.episodes:
-        ends.setdefault(e.episode, []).append({
-            "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared",
-            "partner": e.partner, "striker": e.striker, "fault": e.fault, "time_s": e.time_s,
-            "delay_s": e.delay_s, "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings,
-            "other_crashes": e.other_crashes,
-        })  # fmt: skip
-    return ends
+def _episodes(run: Run) -> dict[int, list[Episode]]:
+    """The run's episodes by number: one of each condition and seed."""
+    of: dict[int, list[Episode]] = {}
+    for episode in run.episodes:
+        of.setdefault(episode.episode, []).append(episode)
+    return of
+
+
+def _end(e: Episode) -> dict[str, Any]:
+    """How an episode ended, for the page."""
+    return {
+        "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared", "partner": e.partner,
+        "striker": e.striker, "fault": e.fault, "time_s": e.time_s, "delay_s": e.delay_s,
+        "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings, "other_crashes": e.other_crashes,
+    }  # fmt: skip
 
 
 def _ends(run: Run) -> Any:

@@ -5,7 +5,7 @@ text nodes and nothing else of what it reads, characters that show nothing or tu
 out, and the page's own policy lets two scripts run, named by their digests, and forbids every request.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader, Undefined
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
+from harness.core.files import replacing
 from harness.core.memory import uncollected
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
@@ -28,6 +28,7 @@ from harness.report.runs import Runs
 TEMPLATES = Path(__file__).parent / "templates"
 
 
+@uncollected()
 def write_report(
     runs: Runs,
     out: Path,
@@ -51,14 +52,15 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    save(render(runs, prompts, progress), out, "--out")
+    save(_pieces(runs, prompts, progress), out, "--out")
     return out
 
 
-def save(page: str, out: Path, option: str) -> None:
-    """Write a page where an option says. Raises UserError if it cannot be written."""
+def save(page: Iterable[str], out: Path, option: str) -> None:
+    """Write a page, whole or in pieces, where an option says. Raises UserError if it cannot be written."""
     try:
-        write_whole(out, page)
+        with replacing(out) as part, part.open("w", encoding="utf-8", newline="") as file:
+            file.writelines([page] if isinstance(page, str) else page)
     except OSError as error:
         raise UserError(
             f"{option} {printable(out)} cannot be written ({error.strerror}); name another file"
@@ -70,6 +72,11 @@ def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:
     """The page."""
+    return "".join(_pieces(runs, prompts, progress))
+
+
+def _pieces(runs: Runs, prompts: Prompts, progress: Callable[[int], None]) -> Iterator[str]:
+    """The page in pieces, since that of a million decisions weighs as much as all that is read for it."""
     lines = matrix.lines(runs)
     charts = list(panels(runs))
     decisions = Decisions(runs, prompts)
@@ -77,11 +84,7 @@ def render(
     by_name = dict(zip(runs.names, runs.runs, strict=True))
     unread = caveats.said(by_name, lambda run: caveats.unread(run.scores))
     others = caveats.said(by_name, caveats.of_run)
-    blocks = []
-    for block in decisions.blocks():
-        blocks.append(library.packed(block))
-        progress(len(block))
-    return environment().get_template("page.html.j2").render(
+    return environment().get_template("page.html.j2").generate(
         runs=runs,
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
@@ -106,8 +109,14 @@ def render(
         script=library.script(),
         about=library.packed(_about(runs, charts)),
         index=library.packed(decisions.index),
-        blocks=blocks,
+        blocks=_packed(decisions, progress),
     )  # fmt: skip
+
+
+def _packed(decisions: Decisions, progress: Callable[[int], None]) -> Iterator[Markup]:
+    for block in decisions.blocks():
+        yield library.packed(block)
+        progress(len(block))
 
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
