@@ -22,8 +22,9 @@ def test_the_citation_is_of_this_version() -> None:
 def test_code_dataset_and_weights_have_one_licence() -> None:
     licence = PROJECT["license"]
     assert "Apache License" in (ROOT / "LICENSE").read_text()
-    assert cards.load("swarm-tiny").licence == licence
-    assert f"Licence: {licence}" in (ROOT / "models/swarm-tiny/README.md").read_text()
+    for model in ("swarm-tiny", "swarm-tiny-six"):
+        assert cards.load(model).licence == licence
+        assert f"Licence: {licence}" in (ROOT / "models" / model / "README.md").read_text()
     for manifest in (ROOT / "datasets").glob("*/manifest.json"):
         [row] = [
             line for line in (ROOT / "datasets/README.md").read_text().splitlines()
