@@ -11,6 +11,7 @@ from harness.core.rounding import rounded
 from harness.prompts.versions import Prompt
 
 PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
+MOST_SEEN = 5  # vehicles of a picture that are listed
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
 
 
@@ -36,6 +37,18 @@ def evidence(view: Mapping[str, Any], named: bool = True) -> str:
         return f"{who(gaps[0][1])} from {gaps[0][1]['sector']}, one of us stands"
     hidden = [s["sector"] for s in view["sectors"] if s["occluded"]]
     return f"nothing crosses, hidden {' '.join(hidden) or 'none'}"
+
+
+def sights(view: Mapping[str, Any]) -> str:
+    """What the cameras of a viewer show, the nearest first: kinds, metres ahead and to the left, lamps."""
+    seen = [node for node in view["nodes"] if "camera" in node["sensors"]]
+    seen.sort(key=lambda node: float(np.hypot(node["forward_m"], node["left_m"])))
+    parts = []
+    for node in seen[:MOST_SEEN]:
+        lamps = "brake" if node.get("braking") else node["indicator"]
+        lit = f" {lamps}" if lamps not in (None, "off") else ""
+        parts.append(f"{node['type']} {node['forward_m']:.0f} {node['left_m']:.0f}{lit}")
+    return "; ".join(parts) or "nobody"
 
 
 def _gap_s(conflict: Mapping[str, Any]) -> float | None:

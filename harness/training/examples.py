@@ -68,13 +68,11 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 
 
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
-    """The same questions with nothing in them but the conflicts; those that have any."""
+    """The same questions with no text in them but the conflicts; those that have any, or a picture."""
     for q in questions:
-        if q.graph["conflicts"]:
-            graph = {**q.graph, "nodes": [], "sectors": []}
-            yield replace(
-                q, graph=graph, messages=q.prompt.render(graph, q.actions, words=q.scenario.prompt_words)
-            )
+        if q.graph["conflicts"] or q.image:
+            shown = {**q.graph, "nodes": [], "sectors": []}
+            yield replace(q, messages=q.prompt.render(shown, q.actions, words=q.scenario.prompt_words))
 
 
 def with_messages(

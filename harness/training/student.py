@@ -12,7 +12,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts import readout
-from harness.training.answers import answer, evidence
+from harness.training.answers import answer, evidence, sights
 from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
@@ -46,14 +46,18 @@ class Student:
         self.model.to(device)
         self._shared: dict[str, Any] = {}
 
-    def reading(self, questions: Sequence[Question]) -> list[Sample]:
-        """Samples where one letter is asked for; drawn by the label, it is followed by a report in words."""
+    def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
+        """Samples where one letter is asked for; drawn by the label, it is followed by a report in words.
+
+        The report is of the nearest conflict, or of whom the picture shows, where there is one and `seen` is
+        true.
+        """
         rng = np.random.default_rng(self.plan.seed)
         samples = []
         for q in questions:
             letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=q.label)]
-            said = f"{letter}: {evidence(q.graph, q.named)}{END}"
-            samples.append(self._sample(q.read_out, said, q.label, q.image))
+            report = sights(q.graph) if seen and q.image else evidence(q.graph, q.named)
+            samples.append(self._sample(q.read_out, f"{letter}: {report}{END}", q.label, q.image))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
@@ -109,7 +113,7 @@ class Student:
     def samples(self, stage: str) -> list[Sample]:
         """What a stage learns from; the last two rehearse the read-outs of earlier ones."""
         if stage == "excerpts":
-            return self.reading(list(excerpts(self.questions)))
+            return self.reading(list(excerpts(self.questions)), seen=True)
         if stage == "alone":
             return self.asked
         with_heard = self.reading(self.heard)
