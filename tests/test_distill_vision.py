@@ -18,10 +18,12 @@ from harness.core.errors import UserError
 from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
+from harness.training.answers import sights
 from harness.training.distill import Curriculum, distill
 from harness.training.examples import Question, alone
 from harness.training.lessons import Lessons, draw
 from harness.training.model import (
+    END,
     MARKS,
     VISION,
     new_model,
@@ -84,6 +86,32 @@ def test_an_answer_names_only_those_whom_its_prompt_names(lessons: Lessons):
         if q.named:
             assert q.prompt.version == "v7"
             assert any(f"{c['with']} " in q.messages[-1]["content"] for c in q.graph["conflicts"])
+
+
+def test_whom_the_cameras_show_is_listed_nearest_first():
+    def node(kind: str, forward_m: float, left_m: float, **more: Any) -> dict[str, Any]:
+        seen = {"type": kind, "forward_m": forward_m, "left_m": left_m, "sensors": ["camera", "lidar"]}
+        return {**seen, "indicator": "off", **more}
+
+    near = node("van", 11.7, 0.3, braking=True, indicator="left")
+    far = node("car", 30.2, -3.6, braking=False, indicator="left")
+    unseen = node("vehicle", 5.0, 1.0, sensors=["radar"], indicator=None)
+    assert sights({"nodes": [far, unseen, near]}) == "van 12 0 brake; car 30 -4 left"
+    assert sights({"nodes": [unseen]}) == "nobody"
+    many = {"nodes": [node("car", 10.0 * n, 0.0) for n in range(1, 9)]}
+    assert sights(many) == "; ".join(f"car {10 * n} 0" for n in range(1, 6))
+
+
+def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path: Path):
+    student = Student([lessons], PLAN, tmp_path, "cpu")
+    learnt = student.lessons[0].scenes
+    listed = [sights(scene.record["graphs"][v]) for scene in learnt for v in scene.viewers]
+    samples = student.samples("excerpts")
+    said = [
+        student.tokenizer.decode(s.ids[s.answer_at :].tolist(), skip_special_tokens=False) for s in samples
+    ]
+    assert all(sample.image is not None for sample in samples)
+    assert [text[3:].removesuffix(END) for text in said] == [text for text in listed for _ in VERSIONS]
 
 
 def test_an_engine_reads_what_the_model_learnt_from(
