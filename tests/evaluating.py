@@ -19,8 +19,9 @@ from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker, requests
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.live_world import LiveSource
-from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Decided, table, walk
 from harness.prompts import versions as prompts

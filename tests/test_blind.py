@@ -30,7 +30,8 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.asking import requests
-from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.report.decisions import Decisions
 from harness.report.runs import gather

@@ -28,7 +28,8 @@ from harness.core.image import Image
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.world.scenarios.occluded_intersection import SCENARIO

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset
-from harness.evaluate.run import Evaluated
+from harness.evaluate.lifecycle import Evaluated
 from harness.report.caveats import caveats, no_prompt, of_run
 from harness.runs import folder
 from harness.runs.records import Manifest, Score

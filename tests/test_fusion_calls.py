@@ -40,7 +40,8 @@ from harness.evaluate import run as evaluation
 from harness.evaluate import timing
 from harness.evaluate.attackers import Said
 from harness.evaluate.fusion import FusionAnswers, codes_of, heard_in
-from harness.evaluate.run import Evaluated, evaluate
+from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Due, heard_codes
 from harness.prompts.versions import load as prompt

@@ -13,7 +13,7 @@ from run_on_disk import answers_of
 from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.run import Evaluated
+from harness.evaluate.lifecycle import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 

@@ -16,7 +16,7 @@ from harness.core.resources import folder
 from harness.core.seeds import purpose, stated
 
 if TYPE_CHECKING:
-    from harness.evaluate.run import Evaluated
+    from harness.evaluate.lifecycle import Evaluated
     from harness.runs.records import ClosedLoop
 
 ALL = "all"

@@ -19,7 +19,8 @@ from harness.core.seeds import stated
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
     from harness.dataset.load import Dataset as Frozen
-    from harness.evaluate.run import Evaluated, Opens
+    from harness.evaluate.lifecycle import Evaluated
+    from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
 
 COLUMNS = (

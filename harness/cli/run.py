@@ -18,7 +18,7 @@ from harness.core.formats import WORK
 if TYPE_CHECKING:
     from harness.backends.base import AnswerMode
     from harness.evaluate.agent import Agent, ImageMode
-    from harness.evaluate.run import Evaluated
+    from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
     from harness.runs.records import Manifest, Score
     from harness.world.scenario import Scenario
@@ -100,9 +100,9 @@ def file_name(model: str) -> str:
 
 def default_out(spec: "Spec") -> Path:
     """The first folder of the run's name under reports/ that is free, or where this was stopped."""
-    from harness.evaluate.run import goes_on
+    from harness.evaluate.lifecycle import resumable
 
-    return free_folder([spec], spec.source.name, lambda folder: goes_on(spec, folder))
+    return free_folder([spec], spec.source.name, lambda folder: resumable(spec, folder))
 
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
@@ -140,7 +140,7 @@ class Together:
 
     def check(self, out: Path) -> None:
         """Raise UserError unless a folder is new, or these runs were stopped in it."""
-        from harness.evaluate.run import finished, left
+        from harness.evaluate.lifecycle import finished, unfinished
 
         if (out / self.marker).is_file():
             raise UserError(
@@ -154,7 +154,7 @@ class Together:
                 f"--out {printable(out)} is a folder with other files in it; choose an empty or a new one"
             )
         for name, spec in self.specs.items():
-            (finished if (out / name / "run.json").is_file() else left)(spec, out / name)
+            (finished if (out / name / "run.json").is_file() else unfinished)(spec, out / name)
 
     def goes_on(self, out: Path) -> bool:
         """Whether these runs were stopped in a folder, and nobody is at them."""

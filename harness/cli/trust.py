@@ -50,7 +50,7 @@ def command(
     from harness.backends.registry import open_backend
     from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES
-    from harness.evaluate.run import made
+    from harness.evaluate.run import read_or_evaluate
     from harness.studies.stored import Stored
     from harness.studies.trust import CAPPED, USUAL, names_of, run_bench, shares_of
     from harness.studies.trust_page import as_json as plain
@@ -65,7 +65,8 @@ def command(
             spec = _spec(model, prompt, condition, seeds)
             name = f"trust-{file_name(model)}-{spec.ego.prompt.version}-{spec.source.name}"
             out = out or Path("reports") / name
-            run = made(spec, out / "run", progress, default_file(), progress.more, open_backend).path
+            cache = default_file()
+            run = read_or_evaluate(spec, out / "run", progress, cache, progress.more, open_backend).path
         assert run is not None
         stored = Stored(run, more=progress.more, done=progress, asks=not no_model)
         draws = options.parse_seeds(seeds) if seeds else stored.seeds

@@ -1,10 +1,8 @@
-"""`harness eval` and `harness drive`: walk, score, write. A run that was stopped goes on where it was."""
+"""`harness eval` and `harness drive`: walk a world in chunks, keep each, score and write the run."""
 
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -17,28 +15,38 @@ from harness.backends.base import Backend
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.core.formats import FORMAT, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.shards import Shard
-from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import device, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
+from harness.evaluate.lifecycle import (
+    Begun,
+    Evaluated,
+    another_model,
+    as_finished,
+    begin,
+    finished,
+    finished_with,
+    refuse_finished,
+    unfinished,
+)
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Latency, Manifest, Score
+from harness.runs.records import Answer, ClosedLoop, Latency, Manifest
 from harness.runs.summary import counted, scores
 
-if TYPE_CHECKING:  # the simulator is loaded by who drives
+if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
 
 Opens = Callable[..., Backend]  # as `open_backend` is called
@@ -46,39 +54,6 @@ NOTHING: Mapping[str, Answer] = MappingProxyType({})
 EPISODES_AT_ONCE = 16  # of the closed loop that are driven in step and kept together, at least
 TREES_AT_ONCE = 256  # of frozen scenes that are walked and kept together
 LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
-
-
-class Begun(work.Begun, frozen=True, kw_only=True):
-    """What a run began with, which it keeps when it goes on.
-
-    Attributes:
-        command: what does it again, in words.
-        identity: of the models.
-        latency: of its decisions.
-        versions: of what it may depend on.
-    """
-
-    created: str
-    command: tuple[str, ...]
-    identity: dict[str, Any]
-    tags: tuple[str, ...]
-    latency: Latency
-    versions: dict[str, str]
-
-    def facts(self) -> dict[str, Any]:
-        """What has to be the same for all shards of a run."""
-        versions = {f"version of {name}": of for name, of in self.versions.items() if name != "platform"}
-        latency = msgspec.to_builtins(self.latency)
-        return {**_compared(self.settings), "model": self.identity, "latency": latency, **versions}
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """A finished run: its folder, its manifest and its summary."""
-
-    out: Path
-    manifest: Manifest
-    scores: Sequence[Score]
 
 
 def evaluate(
@@ -93,28 +68,27 @@ def evaluate(
 ) -> Evaluated:
     """Evaluate a model with a prompt and write the run's folder; the same for any workers.
 
-    What was stopped there before goes on. The working folder stays until `work.tidy`, which whoever adds to
-    the run calls at the end.
+    A run that was stopped there resumes. The working folder stays until the caller, which may add to the run,
+    calls `work.tidy`.
 
     Args:
         spec: what is evaluated.
         out: the run's folder.
-        progress: called with the number of new answers, or of episodes just driven, those kept from before
-            included.
+        progress: called with the number of new answers, or of episodes just driven, kept ones included.
         cache: file of completions kept between runs, for language models; None for no cache.
         more: called with the number of answers that are owed next, where scenes are frozen.
-        workers: who drives, each with a backend of its own, or walks the parts of frozen scenes that rules
-            answer in; a language model answers in frozen scenes in this process.
-        opens: in the place of `open_backend`, where scenes are frozen: what it gives may be open already.
-        given: answers that are there already, by request id, where scenes are frozen.
+        workers: processes or a cluster, each worker with a backend of its own: for the closed loop, and for
+            frozen scenes that rules answer. A language model answers frozen scenes in this process.
+        opens: replaces `open_backend` where scenes are frozen; the backend may be open already.
+        given: answers by request id that need no asking, where scenes are frozen.
 
     Raises:
         UserError: the folder holds something else, or the model is not available. Nothing is written then.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
-    _refuse_finished(out)
-    begun = left(spec, out)
+    refuse_finished(out)
+    begun = unfinished(spec, out)
     if not begun and spec.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
@@ -124,22 +98,22 @@ def evaluate(
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gathered(out, _as_now(spec, begun), chunks, place)
+        return _gathered(out, as_finished(spec, begun), chunks, place)
 
 
 def evaluate_shard(
     spec: Spec, out: Path, shard: Shard, progress: Callable[[int], None], more: Callable[[int], None],
     workers: Workers = 1,
 ) -> int:  # fmt: skip
-    """Drive a shard's part of a closed-loop run, for `harness merge`; what was stopped before goes on.
+    """Drive a shard's part of a closed-loop run, for `harness merge`; a stopped shard resumes.
 
     Args:
         spec: the whole run.
         out: the shard's folder.
         shard: which part.
-        progress: called with the number of episodes just driven, those kept from before included.
+        progress: called with the number of episodes just driven, kept ones included.
         more: called with the number of episodes that the shard has.
-        workers: who drives.
+        workers: processes or a cluster.
 
     Returns:
         How many episodes the shard has.
@@ -147,8 +121,8 @@ def evaluate_shard(
     Raises:
         UserError: as of `evaluate`, or the latency is to be measured.
     """
-    _refuse_finished(out)
-    begun, chunks = _begin_driving(spec, out, left(spec, out, str(shard)), workers, str(shard))
+    refuse_finished(out)
+    begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
     mine = shard.part(chunks)
     more(sum(map(len, mine)))
     with work.working(out, begun, "run.json") as place:
@@ -168,8 +142,8 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     of = {_part_of(chunk): chunk for chunk in chunks}
     parts = shards.owners(folders, begun, list(of), lambda part: _named(of[part]))
     if (out / "run.json").exists() and (out / WORK).is_dir():
-        return _finished(begun[0].settings, out)
-    _refuse_finished(out)
+        return finished_with(begun[0].settings, out)
+    refuse_finished(out)
     tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
     created = min(each.created for each in begun)
     whole = msgspec.structs.replace(begun[0], shard="", tags=tags, created=created)
@@ -178,14 +152,6 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     with work.working(out, there or whole, "run.json") as place:
         shards.collect(parts, place)
         return _gathered(out, whole, chunks, place)
-
-
-def _refuse_finished(out: Path) -> None:
-    """Raise UserError where a folder holds a finished run."""
-    if (out / "run.json").exists():
-        raise UserError(
-            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
-        )
 
 
 def _part(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[str, bytes]:
@@ -209,7 +175,7 @@ def _frozen(
     models = open_each(spec.cards, partial(opens, **options))
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
-    begun = _begin(spec, out, begun, identity, latency)
+    begun = begin(spec, out, begun, identity, latency)
     chunks = _chunked(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
         asked, kept = together(spec.cards, models, cache), place / "answers.jsonl"
@@ -236,7 +202,7 @@ def _frozen(
                 count(chunk)
         walked = partial(_walked, spec, begun, None) if apart else here
         each(walked, todo, workers if apart else 1, took, _named)
-        return _gathered(out, _as_now(spec, begun), chunks, place)
+        return _gathered(out, as_finished(spec, begun), chunks, place)
 
 
 def _begin_driving(
@@ -253,7 +219,7 @@ def _begin_driving(
     [(identity, latency)] = spread(
         model, [spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", _exact(spec)
     )
-    return _begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
+    return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
 
 
 def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
@@ -309,7 +275,7 @@ def _walked(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) 
         asked = together(spec.cards, _opened_all(spec), cache)
         if digest(asked.identity()) != digest(begun.identity):
             raise UserError(
-                f"a worker opens {_another_model(spec)} than this run began with; give it the same"
+                f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
         return asked
 
@@ -376,17 +342,7 @@ def _opened_all(spec: Spec) -> list[Backend]:
     return [opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
 
 
-def _as_now(spec: Spec, begun: Begun) -> Begun:
-    """What a run began with, as it is finished: with the tags of both times, and where its world lies now."""
-    spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
-    if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
-        spec = replace(spec, latency=latencies.as_declared(begun.latency))
-    return msgspec.structs.replace(
-        begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
-    )
-
-
-def made(
+def read_or_evaluate(
     spec: Spec, out: Path, progress: Callable[[int], None], cache: Path | None, more: Callable[[int], None],
     opens: Opens, given: Mapping[str, Answer] = NOTHING,
 ) -> folder.Run:  # fmt: skip
@@ -397,60 +353,3 @@ def made(
         evaluate(spec, out, progress, cache, more, opens=opens, given=given)
         work.tidy(out)
     return folder.read(out)
-
-
-def finished(spec: Spec, out: Path) -> Evaluated:
-    """The run that is there already. Raises UserError if it is another run, or damaged."""
-    return _finished(spec.settings(), out)
-
-
-def _finished(settings: Mapping[str, Any], out: Path) -> Evaluated:
-    run = folder.read(out)
-    stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    work.same(out, _compared(settings), _compared({key: stored[key] for key in settings}))
-    return Evaluated(out, run.manifest, run.scores)
-
-
-def left(spec: Spec, out: Path, shard: str = "") -> Begun | None:
-    """What a stopped run in a folder began with. Raises UserError if it, or what is there, is another."""
-    begun = work.begun(out, Begun)
-    if begun:
-        now = {**_compared(spec.settings()), "shard": shard}
-        work.same(out, now, {**_compared(begun.settings), "shard": begun.shard})
-    return begun
-
-
-def goes_on(spec: Spec, out: Path) -> bool:
-    """Whether this was begun in a folder, stopped there, and nobody is at it."""
-    try:
-        return left(spec, out) is not None and not work.held(out)
-    except UserError:
-        return False
-
-
-def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as they are compared: those of the world by name, but for the folder where it lies now."""
-    world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
-    return {**{key: value for key, value in settings.items() if key != "world"}, **world}
-
-
-def _begin(
-    spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency, shard: str = ""
-) -> Begun:
-    """What the run began with. Raises UserError if that was another model."""
-    if begun is None:
-        return Begun(
-            settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=spec.words(), identity=identity, tags=spec.tags, latency=latency, versions=versions(),
-        )  # fmt: skip
-    if digest(begun.identity) != digest(identity):
-        raise UserError(
-            f"--out {printable(out)} was begun with {_another_model(spec)}; delete it, or choose "
-            "another folder"
-        )
-    return begun
-
-
-def _another_model(spec: Spec) -> str:
-    names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
-    return f"another model behind {names} (its files, package versions or device differ)"

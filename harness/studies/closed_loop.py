@@ -13,7 +13,8 @@ import numpy as np
 from harness.coordination.operating_point import POINTS, named_point
 from harness.core.parallel import Workers
 from harness.core.work import tidy
-from harness.evaluate.run import Evaluated, evaluate, finished
+from harness.evaluate.lifecycle import Evaluated, finished
+from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import Score

@@ -21,7 +21,7 @@ from harness.core.errors import UserError, printable
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate, of_resamples, resampled
 from harness.evaluate.agent import Agent
-from harness.evaluate.run import made
+from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.folder import Run
 from harness.runs.metrics import (
@@ -179,7 +179,7 @@ def run_cells(
         folder, name = out / "cells" / f"{i}-{j}", helpers[j - 1].name
         roles = {"ego": egos[i - 1].name, "helper": name, "blind": name}
         given = {k: v for who in roles.items() for k, v in asked.get(who, {}).items()}
-        run = made(of, folder, progress, cache_file, more, opens, given)
+        run = read_or_evaluate(of, folder, progress, cache_file, more, opens, given)
         for answer in run.answers:
             if answer.role in roles:
                 asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer

@@ -19,7 +19,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
-from harness.evaluate.run import made
+from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
@@ -55,7 +55,8 @@ def run_repeats(
     """
     opens = cache(open_backend)
     runs = [
-        made(of, out / name, progress, cache_file, more, opens) for name, of in each(spec, repeats).items()
+        read_or_evaluate(of, out / name, progress, cache_file, more, opens)
+        for name, of in each(spec, repeats).items()
     ]
     return Repeats(out, tuple(runs))
 

@@ -10,7 +10,7 @@ from evaluating import figure, run, spec_of
 
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.evaluate.run import Evaluated
+from harness.evaluate.lifecycle import Evaluated
 from harness.studies.axes import AXES, grid
 from harness.studies.stored import Stored
 from harness.studies.sweep import run_sweep, settings

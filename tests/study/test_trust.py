@@ -14,7 +14,7 @@ from harness.core import resources
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.claims import claims
-from harness.evaluate.run import Evaluated
+from harness.evaluate.lifecycle import Evaluated
 from harness.runs.folder import read
 from harness.runs.listing import runs
 from harness.studies import trust

@@ -1,0 +1,130 @@
+"""The life of a run's folder: begun, stopped, resumed by the same command, finished."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from harness.core import work
+from harness.core.errors import UserError, printable
+from harness.core.files import digest
+from harness.core.versions import versions
+from harness.evaluate import latency as latencies
+from harness.evaluate.spec import Spec
+from harness.runs import folder
+from harness.runs.records import Latency, Manifest, Score
+
+
+class Begun(work.Begun, frozen=True, kw_only=True):
+    """What a run began with, and keeps when it resumes.
+
+    Attributes:
+        created: when it began, UTC, ISO 8601.
+        command: words of the command that repeats it.
+        identity: of the models.
+        tags: of the user.
+        latency: of its decisions.
+        versions: of the packages and the code that it may depend on.
+    """
+
+    created: str
+    command: tuple[str, ...]
+    identity: dict[str, Any]
+    tags: tuple[str, ...]
+    latency: Latency
+    versions: dict[str, str]
+
+    def facts(self) -> dict[str, Any]:
+        """What has to be the same for all shards of a run."""
+        versions = {f"version of {name}": of for name, of in self.versions.items() if name != "platform"}
+        latency = msgspec.to_builtins(self.latency)
+        return {**_comparable(self.settings), "model": self.identity, "latency": latency, **versions}
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """A finished run: its folder, its manifest and its summary."""
+
+    out: Path
+    manifest: Manifest
+    scores: Sequence[Score]
+
+
+def begin(
+    spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency, shard: str = ""
+) -> Begun:
+    """What a run began with: `begun`, or a new record. Raises UserError if it began with another model."""
+    if begun is None:
+        return Begun(
+            settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=spec.words(), identity=identity, tags=spec.tags, latency=latency, versions=versions(),
+        )  # fmt: skip
+    if digest(begun.identity) != digest(identity):
+        raise UserError(
+            f"--out {printable(out)} was begun with {another_model(spec)}; delete it, or choose "
+            "another folder"
+        )
+    return begun
+
+
+def another_model(spec: Spec) -> str:
+    """Words for a model that is not the one a run began with, for an error."""
+    names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
+    return f"another model behind {names} (its files, package versions or device differ)"
+
+
+def as_finished(spec: Spec, begun: Begun) -> Begun:
+    """What a run began with, updated when it finishes: tags of both commands, where its dataset is."""
+    spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
+    if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
+        spec = replace(spec, latency=latencies.as_declared(begun.latency))
+    return msgspec.structs.replace(
+        begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
+    )
+
+
+def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
+    """What a stopped run in a folder began with, if there is one. Raises UserError if it is another run."""
+    begun = work.begun(out, Begun)
+    if begun:
+        now = {**_comparable(spec.settings()), "shard": shard}
+        work.same(out, now, {**_comparable(begun.settings), "shard": begun.shard})
+    return begun
+
+
+def resumable(spec: Spec, out: Path) -> bool:
+    """Whether this run was stopped in a folder, and no process is at work there."""
+    try:
+        return unfinished(spec, out) is not None and not work.held(out)
+    except UserError:
+        return False
+
+
+def refuse_finished(out: Path) -> None:
+    """Raise UserError where a folder holds a finished run."""
+    if (out / "run.json").exists():
+        raise UserError(
+            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
+        )
+
+
+def finished(spec: Spec, out: Path) -> Evaluated:
+    """The finished run in a folder. Raises UserError if it is another run, or damaged."""
+    return finished_with(spec.settings(), out)
+
+
+def finished_with(settings: Mapping[str, Any], out: Path) -> Evaluated:
+    """The same, of a run's settings."""
+    run = folder.read(out)
+    stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
+    work.same(out, _comparable(settings), _comparable({key: stored[key] for key in settings}))
+    return Evaluated(out, run.manifest, run.scores)
+
+
+def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by the names that an error gives them; a dataset's folder may change between two commands."""
+    world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
+    return {**{key: value for key, value in settings.items() if key != "world"}, **world}
