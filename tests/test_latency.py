@@ -5,6 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -326,7 +327,6 @@ def test_a_measured_run_repeated_from_its_manifest_on_a_busy_machine_has_the_sam
             assert same_rows(tmp_path / name, tmp_path / "run")
     times_of = json.loads((tmp_path / "alone/run.json").read_text())["answer_times"]
     said = answers_of(tmp_path / "alone")
-    assert {role: t["n"] for role, t in times_of.items()} == {
-        role: sum(a.role == role for a in said) for role in ("ego", "helper", "merge")
-    }
+    assert {role: t["n"] for role, t in times_of.items()} == Counter(a.role for a in said)
+    assert {"ego", "helper"} <= set(times_of)  # replies that a busy machine made late are not merged
     assert all(0 < t["p5_s"] <= t["median_s"] <= t["p95_s"] for t in times_of.values())
