@@ -19,6 +19,7 @@ from harness.core.seeds import FIRST
 from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.training.answers import sights
+from harness.training.cells import cells
 from harness.training.distill import Curriculum, distill
 from harness.training.examples import Question, alone
 from harness.training.lessons import Lessons, draw
@@ -34,6 +35,7 @@ from harness.training.model import (
 )
 from harness.training.student import Student
 from harness.training.train import STAGES, Plan
+from harness.world.perception.camera import Sight
 from harness.world.scenarios.occluded_intersection import SCENARIO
 
 VERSIONS = (prompts.load("v7"), prompts.load("v8"))
@@ -112,6 +114,22 @@ def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path:
     ]
     assert all(sample.image is not None for sample in samples)
     assert [text[3:].removesuffix(END) for text in said] == [text for text in listed for _ in VERSIONS]
+
+
+def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_is(asked: list[Question]):
+    somebody = 0
+    for q in asked:
+        assert isinstance(q.image, Sight)
+        frame, state, side = q.image.frame, q.image.state, VISION.patch_px * VISION.merge
+        viewer = state.vehicle(q.image.viewer_id)
+        away_m = {v.id: np.hypot(v.x_m - viewer.x_m, v.y_m - viewer.y_m) for v in state.vehicles}
+        shown = cells(q.image).reshape(VISION.height_px // side, VISION.width_px // side)
+        for row, column in np.ndindex(shown.shape):
+            square = frame.owners[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            inside = [away_m[frame.ids[n]] for n in np.unique(square) if n >= 0 and frame.ids[n] in away_m]
+            assert shown[row, column] == (min(9, 1 + int(min(inside) // 7.0)) if inside else 0)
+            somebody += bool(inside)
+    assert somebody > 20
 
 
 def test_an_engine_reads_what_the_model_learnt_from(

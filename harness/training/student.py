@@ -13,6 +13,7 @@ from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts import readout
 from harness.training.answers import answer, evidence, sights
+from harness.training.cells import CLASSES
 from harness.training.examples import Question, alone, excerpts, key, kl_nats, with_messages
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
@@ -40,6 +41,7 @@ class Student:
         self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         most = max((each.scenario.actions for each in lessons), key=len)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
+        self.digits = [self.tokenizer.token_to_id(str(digit)) for digit in range(CLASSES)]
         self.model = new_model(self.tokenizer, plan.seed, sees)
         if base:
             take_over(self.model, base)
@@ -139,7 +141,7 @@ class Student:
             return [tuple(point) for point in state["curve"]]
         going = self.work / f"{name}.going.pt"
         curve = run_stage(
-            self.model, self.samples(name), self.letters, self.plan.samples[name], self.plan,
+            self.model, self.samples(name), self.letters, self.digits, self.plan.samples[name], self.plan,
             lambda n, loss: progress(name, n, loss), going,
         )  # fmt: skip
         save({"model": self.model.state_dict(), "curve": curve}, done)

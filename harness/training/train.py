@@ -9,7 +9,8 @@
    their mode, not their mean.
 
 All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
-numbers in it has to come from somewhere. A batch shares its system message, which is computed once.
+numbers in it has to come from somewhere. For the same reason each token of a picture says what it shows
+(`harness.training.cells`), in every stage. A batch shares its system message, which is computed once.
 """
 
 import math
@@ -28,13 +29,16 @@ from numpy.typing import NDArray
 from harness.core.arrays import Floats
 from harness.core.files import replacing
 from harness.core.image import Image
+from harness.training.cells import cells
 from harness.training.model import image_processor
 from harness.training.muon import Muon
+from harness.world.perception.camera import Sight
 
 STAGES = ("excerpts", "alone", "messages", "answers")
 PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
 TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
 LOG_STEPS = 50  # the loss is averaged over so many steps
+CELLS_WEIGHT = 1.0  # of the cross-entropy of what each token of a picture shows
 KEEP_S = 60.0  # a killed run loses at most so much
 
 
@@ -81,10 +85,12 @@ class Plan:
 
 
 def run_stage(
-    model: Any, samples: Sequence[Sample], letters: Sequence[int], count: int, plan: Plan,
-    progress: Callable[[int, float], None], going: Path,
+    model: Any, samples: Sequence[Sample], letters: Sequence[int], digits: Sequence[int], count: int,
+    plan: Plan, progress: Callable[[int, float], None], going: Path,
 ) -> list[tuple[int, float]]:  # fmt: skip
     """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
+
+    `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are fitted to.
 
     Returns:
         (sequences seen, mean loss since the last) along the way.
@@ -104,7 +110,7 @@ def run_stage(
         for opt, kept in zip(opts, state["opts"], strict=True):
             opt.load_state_dict(kept)
         start, curve = state["step"], [tuple(point) for point in state["curve"]]
-    letter_ids = torch.tensor(letters, device=device)
+    letter_ids, digit_ids = (torch.tensor(ids, device=device) for ids in (letters, digits))
     model.train()
     losses: list[float] = []
     kept_s = time.monotonic()
@@ -112,7 +118,7 @@ def run_stage(
         scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
         for opt, rate in zip(opts, (plan.muon_lr, plan.adam_lr), strict=True):
             opt.param_groups[0]["lr"] = rate * scale
-        loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids)
+        loss = loss_of(model, [samples[i] for i in batches[step]], letter_ids, digit_ids)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         for opt in opts:
@@ -182,12 +188,14 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
     return {**made, "position_ids": places[:, :, batch[0].shared :]}
 
 
-def loss_of(model: Any, batch: Sequence[Sample], letters: Any) -> Any:
-    """KL of the read-out to its target (nats), plus cross-entropy of the answer's tokens, each a mean."""
+def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> Any:
+    """KL of the read-out to its target (nats), plus cross-entropies of text and of pictures, each a mean."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_input_embeddings().weight, hidden.device, batch[0].shared
     picture = getattr(model.config, "image_token_id", None)
     total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, picture)
+    if any(s.image is not None for s in batch):
+        total = total + CELLS_WEIGHT * _cells_loss(hidden, weight[digits], batch, picture)
     targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
     if targets:
         reading = list(targets)
@@ -224,6 +232,17 @@ def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], picture: int
     if picture is not None:
         there &= ids[:, 1:] != picture
     return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
+
+
+def _cells_loss(hidden: Any, of_digits: Any, batch: Sequence[Sample], picture: int | None) -> Any:
+    """Cross-entropy of what the tokens of pictures show, vehicles and nobody weighing alike."""
+    ids = _padded([s.ids[s.shared :] for s in batch])
+    logits = hidden[(ids == picture).to(hidden.device)] @ of_digits.T
+    shown = np.concatenate([cells(s.image) for s in batch if isinstance(s.image, Sight)])
+    target = torch.from_numpy(shown).to(hidden.device)
+    weight = torch.full((len(of_digits),), 1.0 / max(1, int((shown > 0).sum())), device=hidden.device)
+    weight[0] = 1.0 / max(1, int((shown == 0).sum()))
+    return F.cross_entropy(logits, target, weight=weight, reduction="sum") / 2
 
 
 def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> list[Floats]:

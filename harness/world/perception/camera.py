@@ -108,8 +108,13 @@ class Sight(Image):
     size_px: tuple[int, int]
 
     @property
+    def frame(self) -> Frame:
+        """The picture with whose each pixel is."""
+        return _drawn(self.scenario, self.state, self.viewer_id, self.size_px)
+
+    @property
     def pixels(self) -> Pixels:
-        return _drawn(self.scenario, self.state, self.viewer_id, self.size_px).pixels
+        return self.frame.pixels
 
     def __reduce__(self) -> tuple[type[Image], tuple[Pixels]]:
         return Image, (self.pixels,)
