@@ -20,26 +20,34 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
 Dataset = Annotated[
-    str, typer.Argument(help="A dataset's folder, or the name of a shipped one.", metavar="DIR")
+    str, typer.Argument(help="Folder of a dataset, or the name of a shipped one.", metavar="DIR")
 ]
 
 
 @app.command()
 def build(
-    name: str | None = typer.Argument(None, help="Scenario.", show_default=False),
+    name: str | None = typer.Argument(
+        None, help="Scenario to freeze; `harness scenario list` shows them.", show_default=False
+    ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    episodes: int = typer.Option(200, help="Episodes."),
+    episodes: int = typer.Option(200, help="Number of episodes, each on a layout of its own."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = "2",
     lag: float | None = typer.Option(
-        None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
+        None,
+        help="Seconds from the start of a decision to its action. Default: the scenario's, usually 0.145.",
     ),
-    audit: bool = typer.Option(True, help="Audit 100 layouts or more for tells, on the dataset's card."),
-    out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
+    audit: bool = typer.Option(
+        True, help="With 100 layouts or more, audit whether the ego's view gives the danger away."
+    ),
+    out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's name."),
     shard: options.Shard = None,
 ) -> None:
-    """Freeze every course of some layouts. The same command again continues a build that was stopped."""
+    """Build a frozen dataset: drive every sequence of actions on some layouts and keep all scenes.
+
+    If the build is stopped, the same command continues it.
+    """
     name = options.scenario_name(name, env, env_config)
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     if lag is not None:
@@ -64,7 +72,7 @@ def build(
 
 @app.command()
 def check(dataset: Dataset, as_json: options.Json = False) -> None:
-    """Verify every file and every decision point. Exit code 1 if something is wrong."""
+    """Check every file and every decision point of a dataset. Exit code 1 if something is wrong."""
     from harness.dataset import load, verify
 
     path = load.find(dataset)
@@ -89,13 +97,11 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
 def show(
     dataset: Dataset,
     scene: str = typer.Argument(help="Scene id, such as 00003-0."),
-    out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
-    viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
-    camera: bool = typer.Option(
-        False, "--camera", help="What its cameras see, the front above the rear, as a .png."
-    ),
+    out: Path = typer.Option(..., help="Picture to write: .svg or .png; with --camera .png."),
+    viewer: str | None = typer.Option(None, help="Vehicle whose view to draw, such as v2. Default: the ego."),
+    camera: bool = typer.Option(False, "--camera", help="Draw what its cameras see, front above rear."),
 ) -> None:
-    """Draw a scene from above, or as the cameras of a vehicle see it."""
+    """Draw a scene from above, or as a vehicle's cameras see it."""
     from io import BytesIO
 
     from harness.core.files import write_whole
@@ -130,7 +136,7 @@ def show(
 
 @app.command("rank")
 def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
-    """Compare the reference drivers' frozen and closed-loop success. Both are on the same episodes."""
+    """Compare the reference drivers' success on frozen scenes and in closed loop, on the same episodes."""
     from harness.dataset import load
 
     who = options.workers_of(workers)

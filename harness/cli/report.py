@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 def command(
     runs: options.Runs,
-    out: Path | None = typer.Option(None, help="File to write. Default, for one run: RUN/report.html."),
+    out: Path | None = typer.Option(
+        None, help="File to write. Default: RUN/report.html; needed for several runs."
+    ),
 ) -> None:
-    """Write one HTML file about a run or suite, or several. It needs no network."""
+    """Write one HTML page about a run or a suite, or about several side by side. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out)}")

@@ -20,7 +20,7 @@ app = typer.Typer(help="List scenarios, show one, drive or audit it.", no_args_i
 
 @app.command("list")
 def list_scenarios(as_json: options.Json = False) -> None:
-    """List the scenarios."""
+    """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
     rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
@@ -33,7 +33,7 @@ def list_scenarios(as_json: options.Json = False) -> None:
 
 @app.command()
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
-    """Print a scenario's actions and parameters. Each parameter has its meaning and value."""
+    """Print a scenario's actions and parameters, each parameter with its value and meaning."""
     from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
@@ -53,12 +53,12 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     name: options.Scenario,
-    episodes: int = typer.Option(500, help="Episodes to drive, each by every driver."),
+    episodes: int = typer.Option(500, help="Number of episodes; every driver drives each."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Drive the reference drivers and show how episodes end. All drive the same episodes."""
+    """Let the reference drivers drive the same episodes, and show how these end."""
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import reference as live
 
@@ -73,12 +73,15 @@ def check(
 @app.command()
 def audit(
     name: options.Scenario,
-    layouts: int = typer.Option(300, help="Layouts to look at."),
-    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
+    layouts: int = typer.Option(300, help="Number of layouts to look at."),
+    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first layout; the others follow."),
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Try to tell the hidden danger from what the ego sees. Exit code 1 if that can be done."""
+    """Test whether what the ego sees gives the hidden danger away. Exit code 1 if it does.
+
+    A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
+    """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
     if scenario.start:
         raise UserError(f"{printable(name)} is an environment, of which no danger is known: nothing to audit")
