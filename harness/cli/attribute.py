@@ -26,7 +26,9 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show which objects and messages moved the answers, by leaving each out in turn.
+    """Show which objects and messages moved the answers.
+
+    Each is left out of the prompt, or of the fusion, in turn.
 
     The run's model is asked the questions that the run has no answer for, each once. `harness report` then
     shows the result at each decision.
@@ -67,7 +69,8 @@ def command(
         table(HEADS, cells)
         typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
         typer.echo(
-            "of: whose prompt lists it; fusion: a message in time; shift: total variation of\n"
-            "answer or policy; flips: another action is likeliest; fail%: no answer then"
+            "of: the prompt it is left out of; fusion: a message that came in time; shift:\n"
+            "total variation distance of the answers or policies; flips: another action is\n"
+            "most probable; fail%: the answer without it could not be read"
         )
         typer.echo(f"wrote {printable(file)}")

@@ -31,9 +31,9 @@ def paper(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Play the paper's study with the calibrated proxy, and compare with the paper's numbers.
+    """Compare the calibrated proxy with the paper's numbers.
 
-    Writes a page with both, and Figures A and B.
+    It plays the paper's study, and writes a page with both numbers, and Figures A and B.
     """
     from harness.studies.ledger import shown, tally
     from harness.studies.paper import panels, run_paper
@@ -61,7 +61,8 @@ def paper(
     counts = tally(ledger)
     told = (
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
-        f"{counts['unclear']} unclear (?: the interval reaches it); {counts['predicted']} predicted, * fitted"
+        f"{counts['unclear']} unclear (?: the interval reaches the aim); {counts['predicted']} predicted, "
+        "the others (*) fitted"
     )
     typer.echo(fill(told, WIDTH))
     typer.echo(fill(equation_2, WIDTH))
@@ -91,7 +92,10 @@ def closed_loop(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run the paper's panels with a model in closed loop, and draw Figures A and B."""
+    """Run the paper's panels with a model in closed loop.
+
+    It draws Figures A and B.
+    """
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED

@@ -38,7 +38,9 @@ def list_channels(as_json: options.Json = False) -> None:
 
 @app.command()
 def show(name: str = Name, as_json: options.Json = False) -> None:
-    """Print a profile: source, status, settings, and reception by distance.
+    """Print a profile, and its reception by distance.
+
+    It names the profile's source, status and settings.
 
     Reception is the probability that one message arrives, averaged over shadowing.
     """
@@ -74,7 +76,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     for line in beyond:
         typer.echo(textwrap.fill(line, 80, subsequent_indent="  "))
     if not curves:
-        typer.echo("its loss is the same at any distance, behind anything")
+        typer.echo("packet loss is the same at every distance and behind every obstacle")
         return
     heads = ["reception, %", "in sight", "behind a car", "behind a building"]
     shares = zip(DISTANCES_M, *curves.values(), strict=True)
@@ -95,7 +97,9 @@ def check(
     out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
     as_json: options.Json = False,
 ) -> None:
-    """Check a radio: its computed reception against simulated messages, and against published curves.
+    """Check a radio against simulation and published curves.
+
+    Computed reception is compared with that of simulated messages, and with published curves.
 
     Messages are simulated as in a run, with sender and receiver in sight of each other; each message has its
     own shadowing. The waits are those from one received background packet of a vehicle to the next; they take
@@ -163,7 +167,7 @@ def check(
             for m, share in zip(messages, model, strict=True)
         ],
     )
-    typer.echo(f"n = {n} trips a distance, each with shadowing of its own; 95 % intervals")
+    typer.echo(f"n = {n} messages per distance, each with its own shadowing; 95 % intervals")
     if waits:
         typer.echo()
         table(
@@ -220,7 +224,7 @@ def crowd(
     out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
     as_json: options.Json = False,
 ) -> None:
-    """Show packet loss by swarm size: radios beside the paper's line.
+    """Show packet loss by swarm size, beside the paper's line.
 
     The road has the same density of vehicles everywhere as within the radius, and all of them send.
     """

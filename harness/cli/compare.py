@@ -29,7 +29,7 @@ def command(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Show what changed from run A to run B, paired by episode and seed. Exit code 1 if a gate fails."""
+    """Show what changed from run A to B, by episode and seed. Exit code 1 if a gate fails."""
     from harness.report.compare import text
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.gate import gate, judge

@@ -44,7 +44,9 @@ def build(
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's name."),
     shard: options.Shard = None,
 ) -> None:
-    """Build a frozen dataset: drive every sequence of actions on some layouts and keep all scenes.
+    """Build a frozen dataset of some layouts of a scenario.
+
+    It drives every sequence of actions on each layout, and keeps every scene on the way.
 
     If the build is stopped, the same command continues it.
     """
@@ -136,7 +138,10 @@ def show(
 
 @app.command("rank")
 def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
-    """Compare the reference drivers' success on frozen scenes and in closed loop, on the same episodes."""
+    """Compare the reference drivers, frozen and in closed loop.
+
+    Both are on the same episodes.
+    """
     from harness.dataset import load
 
     who = options.workers_of(workers)
@@ -168,5 +173,5 @@ def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
         rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
     text = console()
-    text.print(f"n = {episodes} episodes; same: how many of them end alike, frozen and driven")
-    text.print("so few are no rank correlation: that these scenes rank models takes runs, `harness fidelity`")
+    text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")
+    text.print("these few drivers give no rank correlation: compare runs of models with `harness fidelity`")

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from harness.core.statistics import Estimate
     from harness.runs.records import Constant, Device, DeviceRow
 
-app = typer.Typer(
-    help="List on-board computers, show which answers fit the window, or check one.", no_args_is_help=True
-)
+app = typer.Typer(help="List on-board computers, show or check one, or measure energy.", no_args_is_help=True)
 
 MOST_TOKENS = 1_000_000
 MOST_MS = 60_000
@@ -58,9 +56,10 @@ def show(
     window_ms: float = typer.Option(200.0, help="Decision window, in ms."),
     as_json: options.Json = False,
 ) -> None:
-    """Show which answers fit the decision window on a device, and their time and energy.
+    """Show which answers fit the decision window on a device.
 
-    The time is that of the ego's own answer, without any message. Nothing else runs on the computer.
+    It shows their time and energy, too. The time is that of the ego's own answer, without any message.
+    Nothing else runs on the computer.
     """
     from harness.backends import devices
     from harness.runs.folder import read
@@ -106,9 +105,9 @@ def show(
     if run:
         _say(
             f"{printable(run)}: n = {len(told.prompt)} answers of {printable(told.who)} for the ego; "
-            "tokens and ms are medians, in time and J means with 95 % intervals over episodes; in time: "
-            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are those of its "
-            "own tokenizer"
+            "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; in time: "
+            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are counted by the "
+            "model's own tokenizer"
         )
     _origins(device, rows)
 
@@ -122,7 +121,7 @@ def check(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Compare a device profile with the measured times of a run's answers.
+    """Compare a device profile with a run's measured times.
 
     Run it on the device itself. On another machine, the figures show how far the two are apart.
     """
@@ -169,7 +168,7 @@ def measure(
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Measure the energy of a model's answers with this machine's meters.
+    """Measure the energy of a model's answers on this machine.
 
     The meters are NVML, RAPL and a Jetson's rails; `harness doctor` lists those that can be read here. Each
     measurement first idles, then asks one question after the other for as long.

@@ -173,8 +173,9 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     notes = (
         f"n = {world.episodes} episodes × {len(done.manifest.seeds)} channel seeds; "
         f"{'of ' if of else ''}{stated(world.first_seed, of or world.episodes)};\n"
-        "intervals over episodes; missed: decisions that outlast the window;\n"
-        "gap: the least; clear: seconds to clear, where the ego did; both are means",
+        "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
+        "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
+        "it did; both are means over episodes",
     )
     show(done, "closed loop", COLUMNS, notes)
 

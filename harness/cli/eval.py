@@ -175,7 +175,7 @@ def command(
     notes = (
         f"n = {len(frozen[0].episodes)} episodes × {len(channel_seeds)} channel seeds; "
         f"{'of ' if selection.given else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
-        "intervals over episodes; msgs an episode; gain: over single-local, paired",
+        "95 % intervals over episodes; msgs: per episode; gain: over single-local, paired",
     )
     show(done, frozen[0].name, COLUMNS, notes)
     typer.echo(f"wrote {page}")
@@ -231,11 +231,9 @@ def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     typer.echo(
         f"{spec.source.name}: {counted['requests']} requests{repeated} for the {counted['scenes']} scenes "
         f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
-        "seeds; no model was called"
+        "channel seeds; no model was called"
     )
     for role, s in (counted["prompt_tokens"] or {}).items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
     if not counted["prompt_tokens"]:
-        typer.echo(
-            "prompt tokens: not counted, no tokenizer at hand; give --tokenizer (tokenizer.json or GGUF)"
-        )
+        typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")

@@ -16,7 +16,7 @@ def command(
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
     as_json: options.Json = False,
 ) -> None:
-    """Compare success on frozen scenes with success in closed loop, paired by episode.
+    """Compare frozen with closed-loop success, paired by episode.
 
     Give at least one run of `harness eval` and one of `harness drive`, with the same models and layouts.
     """

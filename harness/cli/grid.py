@@ -78,7 +78,7 @@ def command(
             "--helper-answer": helper_answer or answer,
         })  # fmt: skip
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
-        raise UserError(f"{cells} combinations; vary something, and give {MOST_CELLS} at most")
+        raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
     spec = Spec(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
@@ -133,8 +133,9 @@ def command(
     for sentence in in_a_sentence(grid):
         plain.print(sentence)
     plain.print(
-        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: Holm's, for all "
-        f"{len(grid.effects)} effects; {len(grid.conditions)} conditions are on the page"
+        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: corrected by "
+        f"Holm's method for all {len(grid.effects)} effects; the page has all {len(grid.conditions)} "
+        "conditions"
     )
     typer.echo(f"wrote {printable(page)}")
 

@@ -29,7 +29,7 @@ def command(
     html: Path | None = typer.Option(None, help="Also write a page to this file."),
     as_json: options.Json = False,
 ) -> None:
-    """Show one metric of all runs in a folder, by date, with prompt version and model.
+    """Show a metric over runs, by date, prompt version and model.
 
     Runs on the same scenes are grouped, since only those compare.
     """
@@ -57,7 +57,7 @@ def command(
             who = printable(line.run.manifest.variant, VARIANT)
             typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
     if len(groups) > 1:
-        typer.echo("\nruns of different scenes do not compare: they stand apart")
+        typer.echo("\nruns on different scenes do not compare, so each group has its own table")
 
 
 def _mapping(line: "Line") -> dict[str, object]:

@@ -12,7 +12,7 @@ PROMPT = "v3"  # what one's own prompt begins as
 def command(
     folder: Path = typer.Argument(metavar="DIR", help="Folder to make; it may exist if it is empty."),
 ) -> None:
-    """Make a project folder with a prompt and a model card of your own to edit.
+    """Make a project folder with a prompt and a model card to edit.
 
     Commands that you type in this folder find both by name.
     """

@@ -27,7 +27,10 @@ _WIDTH = 100  # of lines of tokens
 
 @app.command("list")
 def list_models(as_json: options.Json = False) -> None:
-    """List the model cards, with one line per engine, and whether they can run here."""
+    """List the model cards, and whether they can run here.
+
+    Each engine of a card has a line.
+    """
     from harness.backends import cards
     from harness.backends.registry import missing
 
@@ -53,7 +56,10 @@ def pull(
     name: str = typer.Argument(help="Card name or hub id."),
     engine: options.Engine = None,
 ) -> None:
-    """Download a model's weights from the hub, at the revision that its card names."""
+    """Download a model's weights from the hub.
+
+    The card names the revision.
+    """
     from harness.backends.cards import resolve
     from harness.backends.weights import pull as fetch
 
@@ -73,10 +79,10 @@ def check(
     dtype: options.Dtype = None,
     as_json: options.Json = False,
 ) -> None:
-    """Load a model, print a prompt as it reads it, and time one answer in each answer mode.
+    """Load a model, show its prompt and time one answer.
 
-    A model that takes pictures is also asked with a picture and with a blank one. Exit code 1 if it answers
-    in no mode, or if it ignores the picture.
+    It does so in each answer mode. A model that takes pictures is also asked with a picture and with a blank
+    one. Exit code 1 if it answers in no mode, or if it ignores the picture.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities

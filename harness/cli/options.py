@@ -253,7 +253,7 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
         raise UserError("give a scenario or --env, one of the two; `harness scenario list` lists scenarios")
     if name is not None:
         if env_config is not None:
-            raise UserError("--env-config is of an environment; give --env as well")
+            raise UserError("--env-config changes an environment; give --env as well")
         return name
     assert env is not None
     if env_config is None:
@@ -284,7 +284,7 @@ def shard_of(text: str | None) -> "shards.Shard | None":
 def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
     """Say that a shard is done, and what is done with it."""
     echo(
-        f"wrote {printable(out)}: {what}, shard {shard}; put together all {shard.of} with "
+        f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
         "`harness merge FOLDER... --out FOLDER`"
     )
 

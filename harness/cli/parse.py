@@ -26,7 +26,10 @@ def command(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Parse one completion: print its intent, or why it failed, and every repair it took."""
+    """Parse one completion: print its intent, or why it failed.
+
+    It names every repair that the text needed.
+    """
     from harness.parsing.parse import parse
     from harness.world import scenarios
 

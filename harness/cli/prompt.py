@@ -83,9 +83,9 @@ def show(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Print exactly what a model is sent about a scene, before its chat template is applied.
+    """Print exactly what a model is sent about a scene.
 
-    Pictures are drawn if the terminal has colours.
+    Its chat template is not applied yet. Pictures are drawn if the terminal has colours.
     """
     from harness.dataset import load
     from harness.prompts import versions as prompts
@@ -134,7 +134,10 @@ def examples(
         int, typer.Option(help="Layout seed of the first example; train seeds are 100000 to 199999.")
     ] = FIRST["train"],
 ) -> None:
-    """Add examples to a draft: earlier turns of the chat, answered as the decision trees show to be right."""
+    """Add examples to a draft: earlier turns of the chat.
+
+    They are answered as the decision trees show to be right.
+    """
     from harness.prompts import versions as prompts
     from harness.prompts.examples import EXAMPLES, text_of
 
@@ -255,7 +258,7 @@ def diff(
     tokenizer: Tokenizer = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show the differences between two prompt versions, word by word.
+    """Show what differs between two prompt versions, word by word.
 
     It compares their settings, their templates, and what a model is sent about one scene: as the ego, as its
     first helper, and as the ego with a message from every helper.
@@ -309,7 +312,7 @@ def _changed(what: str, text: "TextChange") -> None:
 
 @app.command()
 def lock(version: Version) -> None:
-    """Release a prompt version: pin its text, so that any later change is an error."""
+    """Release a prompt version: any later change of it is an error."""
     from harness.prompts import versions as prompts
 
     if prompts.load(version).released:

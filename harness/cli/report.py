@@ -20,7 +20,7 @@ def command(
         None, help="File to write. Default: RUN/report.html; needed for several runs."
     ),
 ) -> None:
-    """Write one HTML page about a run or a suite, or about several side by side. It works offline."""
+    """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out)}")

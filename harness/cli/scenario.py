@@ -33,7 +33,7 @@ def list_scenarios(as_json: options.Json = False) -> None:
 
 @app.command()
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
-    """Print a scenario's actions and parameters, each parameter with its value and meaning."""
+    """Print a scenario's actions and its parameters, with meanings."""
     from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
@@ -58,7 +58,10 @@ def check(
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Let the reference drivers drive the same episodes, and show how these end."""
+    """Let the reference drivers drive, and show how episodes end.
+
+    All drive the same episodes.
+    """
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import reference as live
 
@@ -78,7 +81,7 @@ def audit(
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Test whether what the ego sees gives the hidden danger away. Exit code 1 if it does.
+    """Test whether the ego's view gives the hidden danger away. Exit code 1 if it does.
 
     A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
     """
@@ -153,7 +156,7 @@ def _print(found: "Audit") -> None:
     from harness.world.audit import MOST_AUC
 
     table(
-        ("can be told", "AUC [95 % CI]"),
+        ("predicted from the ego's view", "AUC [95 % CI]"),
         [(question, interval(auc.value, auc.low, auc.high, 1.0, 2)) for question, auc in found.auc.items()],
     )
     text = console()
@@ -162,6 +165,6 @@ def _print(found: "Audit") -> None:
     if not found.tells:
         text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
         return
-    text.print(f"it tells: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
+    text.print(f"a tell: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
     for name, lost in found.told_by.items():
         text.print(f"  {lost:.2f} {name}")

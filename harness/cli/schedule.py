@@ -32,7 +32,10 @@ def learn(
     ),
     quiet: options.Quiet = False,
 ) -> None:
-    """Learn a schedule: what asking a helper is worth, from runs on train layouts."""
+    """Learn a schedule: what asking a helper is worth.
+
+    It learns from runs on train layouts, and chooses the threshold on tune layouts.
+    """
     from harness.coordination.operating_point import named_point
     from harness.studies.learning import ROUNDS, run_learn
     from harness.studies.stored import Stored
@@ -79,7 +82,9 @@ def compare(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare schedules on stored answers, between asking nobody and an oracle.
+    """Compare schedules (whom to ask, and when) on stored answers.
+
+    The bounds are asking nobody and an oracle, which knows how every course ends.
 
     The model is asked only about decision points that the run did not reach; the run's folder keeps those
     answers.
@@ -142,7 +147,7 @@ def compare(
         for sentence in in_sentences(run):
             text.print(printable(sentence, 400))
     text.print(
-        "helpers asked at most and threshold follow a schedule's name; 95 % intervals over episodes, paired; "
-        "costs, p, areas and random at equal messages are on the page"
+        "after a schedule's name: the most helpers it asks, and its threshold; 95 % intervals over episodes, "
+        "paired; the page also has costs, p, areas, and random with as many messages"
     )
     typer.echo(f"wrote {printable(page)}")

@@ -88,8 +88,8 @@ def command(
         for source in stored:
             if left := source.left_out:
                 typer.echo(
-                    f"{printable(source.name)}: walks to {len(left)} decision points are left out, since the "
-                    "run has no answer for them; without --no-model they are asked"
+                    f"{printable(source.name)}: left out episodes that reach one of {len(left)} decision "
+                    "points without a stored answer; without --no-model the model is asked there"
                 )
         typer.echo(f"wrote {printable(where / 'index.html')}")
 

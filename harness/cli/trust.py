@@ -109,8 +109,8 @@ def command(
         table(HEADS, rows)
     n = bench.price(bench.rules[0]).n
     typer.echo(
-        f"n = {n} episodes × {len(draws)} seeds; intervals over episodes; price: points of\n"
-        "success against linear while nobody attacks, paired"
+        f"n = {n} episodes × {len(draws)} channel seeds; 95 % intervals over episodes; price:\n"
+        "difference in success from linear while nobody attacks, in points, paired"
     )
     typer.echo(f"wrote {printable(page)}")
 

@@ -53,11 +53,11 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Ask each question and its twin, and test that the answers agree as they must.
+    """Test whether answers to a question and its twin agree.
 
     A twin is the same question put otherwise: mirrored, in other units, in other words. So what must hold of
-    both answers is known without knowing the right one. If the command is stopped, the same command
-    continues.
+    both answers is known without knowing the right one. If the study is stopped, the same command
+    continues it.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
@@ -114,8 +114,9 @@ def command(
         table(HEADS, map(_cells, rows))
         typer.echo(
             f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
-            "intervals over episodes\n"
-            "n: questions that the twin changes; fail%: an answer failed, so nothing holds"
+            "95 % intervals over episodes\n"
+            "n: questions that the twin changes; fail%: share with a failed answer, which\n"
+            "count as not holding"
         )
         gated = (judged(verdict, "-") for verdict in verdicts)
         for said in (scoring.headline(rows), *page.notes(study, rows), *gated):

@@ -16,7 +16,10 @@ def command(
         Path("episode.gif"), help="File to write: .gif, or .mp4 if the extra `video` is installed."
     ),
 ) -> None:
-    """Draw an episode of a closed-loop run as a video, with views, messages and the ego's policy."""
+    """Draw an episode of a closed-loop run as a video.
+
+    It shows what is in sight, messages and the ego's policy.
+    """
     from harness.evaluate.replay import find, stills
     from harness.report.drawing.video import check, write_video
 
