@@ -116,7 +116,10 @@ def check(
         raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
     profile, channel = _of(name)
     if not isinstance(channel, Physical):
-        raise UserError(f"{printable(name)} loses the same at any distance; there is no curve to check")
+        raise UserError(
+            f"{printable(name)} loses the same at every distance, so there is no curve to check; give a "
+            "physical radio, such as mode4"
+        )
     _picture(out)
     where = f"channel profile {profile}"
     messages = drawn(channel, DISTANCES_M, n)

@@ -106,7 +106,9 @@ def command(
     purpose(first_seed, episodes)
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video):
-        raise UserError(f"--shard {part}: give --out, a folder of its own, and --save-video to no shard")
+        raise UserError(
+            f"--shard {part}: give --out with a folder for this shard alone, and leave --save-video out"
+        )
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition

@@ -143,7 +143,10 @@ def command(
         suite.check(named, specs)
     if repeat is not None:
         if named:
-            raise UserError(f"--repeats {repeat}: a suite is no one dataset; give one")
+            raise UserError(
+                f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of its "
+                "datasets"
+            )
         repeats.check(specs[0], repeat)
     if dry_run:
         counted = [_counted(*each, tokenizer) for each in zip(specs, frozen, strict=True)]

@@ -52,11 +52,13 @@ def command(
     asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
     [option, *others] = [name for name, given in asked.items() if given] or [""]
     if others or not option:
-        raise UserError(f"{', '.join(asked)}: give one of them")
+        raise UserError(f"{', '.join(asked)}: give exactly one of them")
     if report_seeds_too and not sft:
-        raise UserError("--report-seeds-too is of --sft; give that, or leave it out")
+        raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
     if out and option in files:
-        raise UserError(f"--out is of --csv and --jsonl; {option} names its file")
+        raise UserError(
+            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
+        )
     source, folder = read(run), out or run
     target = files.get(option)
     try:

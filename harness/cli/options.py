@@ -250,7 +250,7 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     from harness.world.environments import environment
 
     if (name is None) == (env is None):
-        raise UserError("give a scenario or --env, one of the two; `harness scenario list` lists scenarios")
+        raise UserError("give either a scenario or --env; `harness scenario list` lists scenarios")
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")

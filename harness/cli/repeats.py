@@ -33,8 +33,8 @@ def check(spec: "Spec", repeats: int) -> None:
         )
     if spec.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: its own first runs would keep the machine busy; measure once without "
-            "--repeats, and give the seconds that its run.json has"
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            "once without --repeats, and give the seconds that its run.json has"
         )
 
 

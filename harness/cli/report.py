@@ -46,7 +46,7 @@ def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:
     from harness.runs.suite import read
 
     if others := [folder for folder in folders if not (folder / SUITE).is_file()]:
-        raise UserError(f"{printable(others[0])} is no suite, and others are; report them apart")
+        raise UserError(f"{printable(others[0])} is no suite, but others are; write separate reports")
     with bar("reading datasets", quiet=quiet):
         suites = [(each, suite.lines(each)) for each in map(read, dict.fromkeys(folders))]
     return suite.write(suites, out or folders[0] / "report.html")

@@ -87,7 +87,10 @@ def audit(
     """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
     if scenario.start:
-        raise UserError(f"{printable(name)} is an environment, of which no danger is known: nothing to audit")
+        raise UserError(
+            f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
+            "give a scenario"
+        )
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:

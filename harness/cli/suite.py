@@ -38,8 +38,8 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     first = specs[0]
     if first.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: its own first runs would keep the machine busy; measure on one dataset, "
-            "and give the seconds that its run.json has"
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            "on one dataset, and give the seconds that its run.json has"
         )
     for agent in first.agents:
         if not agent.can.closed_loop:

@@ -65,7 +65,10 @@ def command(
     axes = [axis_of(name) for name in dict.fromkeys(over or ())]
     given: list[str | None] = [*(grid or ())]
     if len(given) > len(axes):
-        raise UserError(f"--grid: {len(given)} given for {len(axes)} of --over; give one for each, in order")
+        raise UserError(
+            f"--grid: {len(given)} given for {len(axes)} of --over; give one for each --over, in the same "
+            "order"
+        )
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]

@@ -77,7 +77,7 @@ def command(
     chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
     ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
     if (run is None) == (model is None) or (run and prompt):
-        raise UserError("give RUN, a finished run's folder, or a --model with its --prompt: one of the two")
+        raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet) as progress:
         if model is not None:
             spec = _spec(model, prompt, condition, seeds)

@@ -109,7 +109,7 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
         (("--junit", "a.xml", "--out", "there"), "--out is of --csv and --jsonl; --junit names its file"),
         (
             ("--junit", "a.xml", "--report-seeds-too"),
-            "--report-seeds-too is of --sft; give that, or leave it",
+            "--report-seeds-too only goes with --sft; give --sft, or leave it",
         ),
         (("--junit", "run/run.json/a.xml"), "--junit run/run.json/a.xml cannot be written ("),
         (("--junit", "."), "--junit . cannot be written (Is a directory); name another file"),

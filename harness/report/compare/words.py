@@ -230,7 +230,7 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
     if ego != helper:
         who = f"ego's {who}, helper's {' → '.join(helper)}"
     counts = [
-        f"{file} {t.removed} words removed, {t.added} added" if t.hunks else f"{file} unchanged"
+        f"{file} {t.removed} words removed, {t.added} added" if t.hunks else f"{file} the same"
         for file, t in change.texts.items()
     ]
     said = [f"{who}: {', '.join(counts)}"]
