@@ -332,7 +332,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     page = Path("run/report.html").read_text()
     kept = folder.read(tmp_path / "run").attribution
     assert kept
-    assert f"is shown at {kept.decision_points} decision points under 6g:messages=blind, drawn by" in page
+    assert f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind" in page
     for typed, said in {
         ("run", "--sample", "0"): "--sample 0 is out of range; give 1 to 100000",
         ("run", "--condition", "7g"): "unknown condition '7g'",

@@ -192,7 +192,7 @@ def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_pat
     ("options", "said"),
     [
         (("--shard", "1/4", "--out", "shard"), "the work has 3 parts; give 3 shards or fewer"),
-        (("--shard", "1/3"), "--shard 1/3: give --out, a folder of its own"),
+        (("--shard", "1/3"), "--shard 1/3: give --out with a folder for this shard alone"),
         (("--shard", "1/3", "--out", "shard", "--latency", "measured", "--model", "swarm-tiny"),
          "--latency measured is of one machine"),
     ],
