@@ -177,7 +177,9 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
         axes.plot([], [], color=GREY, marker=marker, linestyle="none", label=model)
     for condition, colour in colours.items():
         axes.plot([], [], color=colour, linewidth=3, label=condition)
-    axes.set(xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102))
+    axes.set(
+        xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102)
+    )
     axes.set_aspect("equal")
     _plain(axes, "both")
     figure.legend(loc="outside right upper", frameon=False, fontsize=7)

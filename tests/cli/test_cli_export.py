@@ -106,7 +106,10 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
         ((), "--csv, --jsonl, --junit, --inspect, --sft: give exactly one of them"),
         (("--csv", "--jsonl"), "--csv, --jsonl, --junit, --inspect, --sft: give exactly one of them"),
         (("--csv", "--junit", "a.xml"), "give exactly one of them"),
-        (("--junit", "a.xml", "--out", "there"), "--out only goes with --csv and --jsonl; --junit names its own"),
+        (
+            ("--junit", "a.xml", "--out", "there"),
+            "--out only goes with --csv and --jsonl; --junit names its own",
+        ),
         (
             ("--junit", "a.xml", "--report-seeds-too"),
             "--report-seeds-too only goes with --sft; give --sft, or leave it",
