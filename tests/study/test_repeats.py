@@ -157,7 +157,7 @@ def test_repeats_played_by_hand(small: Dataset, tmp_path: Path, wanderer: Wander
     assert "at temperature 0.7, swarm-tiny · v2 · json decides differently in 55.6 [" in first
     assert [rate for rate in ("83.3 [", "50.0 [", "100.0 [") if rate not in first] == []
     assert others[-1].startswith(
-        "The ego's answers state 0.00 [–, –] nats of entropy, which its repeats neither"
+        "The ego's answers state 0.00 [–, –] nats of entropy, not clearly more or less"
     )
 
 
@@ -282,7 +282,7 @@ def test_the_command_prints_tables_and_json(
         ),
         (
             ("--repeats", "3", "--temperature", "1", "--latency", "measured"),
-            "--latency measured: its own first",
+            "--latency measured: it needs an idle",
         ),
         (
             ("--repeats", "3", "--temperature", "1", "--answer", "readout"),
