@@ -75,7 +75,7 @@ def overview(found: list[tuple[str, Any]]) -> str:
         lines.append(f"| **{panel}** | |")
         for path, command in found:
             if panels[path.split()[1]] == panel:
-                purpose = _cell(command.help.partition(". ")[0].rstrip("."))
+                purpose = _cell(re.split(r"\.\s", command.help)[0].rstrip("."))
                 lines.append(f"| [{path}](#{path.replace(' ', '-')}) | {purpose} |")
     return "\n".join([*lines, ""])
 

@@ -259,7 +259,7 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
     for row in rows(found):
         if row.role != "fusion":
             assert (row.shift.n, row.flips.n, row.failed.value) == (0, 0, 1.0)
-    assert headline(rows(found)).startswith("What moves most is the message of a helper with")
+    assert headline(rows(found)).startswith("The message of a helper with")
 
 
 def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[..., Path]) -> None:
@@ -319,7 +319,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     code, out, _ = harness("attribute", "run", "--sample", "10")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
-    assert out.splitlines()[1].startswith("What moves most is the ")
+    assert out.splitlines()[1].startswith("The ")
     assert "10 of the " in out
     assert "decision points of 6g:loss=0, drawn with sample seed 0" in " ".join(out.split())
     told = json.loads(harness("attribute", "run", "--sample", "10", "--json")[1])
@@ -332,7 +332,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     page = Path("run/report.html").read_text()
     kept = folder.read(tmp_path / "run").attribution
     assert kept
-    assert f"is shown at {kept.decision_points} decision points under 6g:messages=blind, drawn by" in page
+    assert f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind" in page
     for typed, said in {
         ("run", "--sample", "0"): "--sample 0 is out of range; give 1 to 100000",
         ("run", "--condition", "7g"): "unknown condition '7g'",

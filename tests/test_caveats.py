@@ -55,7 +55,7 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
     assert told(share("failed_rate_ego", 0.49)) == []
     assert told(share("failed_rate_ego", 0.5)) == [
         "Only 50.0 % of the ego's 1440 answers could be read: it drives by the fallback, and success says "
-        "little of the model."
+        "little about the model."
     ]
     assert [line.split(":")[0] for line in told(
         share("failed_rate_ego", 1.0), share("failed_rate_helper", 1.0), share("failed_rate_merge", 0.984)
@@ -101,7 +101,7 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert "mute reads no prompt: it decides by the scene graph, whatever v2 says." in said
     assert "None of the helpers' 72 answers could be read: they send no message." in said
     page = unescape(Path("reports/mute/report.html").read_text())
-    assert page.index(UNREAD) < page.index("With 6g mute clears")
+    assert page.index(UNREAD) < page.index("Under 6g, mute clears")
     assert "none of the ego's answers could be read: it drives by the fallback" in harness("ls")[1]
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)
@@ -122,10 +122,10 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
     points = (POINTS["v2x"], *map(named_point, ("6g:messages=shuffled", "6g:messages=blind")))
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
     assert list(of_run(folder.read(done.out))) == [
-        "Only 4 episodes: a rate's interval may reach 49 points to either side.",
-        "6g:messages=shuffled is a control: the ego hears what helpers say in another layout. A decision's "
-        "page shows what its own helpers say.",
+        "Only 4 episodes: the interval of a rate may reach 49 points to either side.",
+        "6g:messages=shuffled is a control: the ego hears what helpers say in another layout, while a "
+        "decision's page shows what its own helpers say.",
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
-        "With v2x most decisions take longer than these frozen scenes allow for: driving may end otherwise "
-        "(harness fidelity).",
+        "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop success may "
+        "differ. harness fidelity compares the two.",
     ]

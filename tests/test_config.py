@@ -113,7 +113,7 @@ def test_what_is_no_toml_is_said_of_the_file(tmp_path: Path) -> None:
     assert toml(file, "r") == {"a": 1}
     for data in (b"[a", b"\xff", b"a = " + b"9" * 5000, b"a = " + b"[" * 3000):
         file.write_bytes(data)
-        with pytest.raises(UserError, match=r"^r is no TOML: .*; mend the file$"):
+        with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):
             toml(file, "r")
 
 
@@ -123,5 +123,5 @@ def test_a_folder_a_pipe_a_dangling_link_and_a_device_are_no_toml(tmp_path: Path
     (tmp_path / "link").symlink_to("nowhere")
     (tmp_path / "device").symlink_to("/dev/zero")
     for name in ("folder", "pipe", "link", "device"):
-        with pytest.raises(UserError, match=r"^r is no TOML: .*; mend the file$"):
+        with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):
             toml(tmp_path / name, "r")

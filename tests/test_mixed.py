@@ -100,7 +100,7 @@ def test_a_stored_run_whose_model_has_changed_is_not_asked_on(
 ) -> None:
     stored = mixed(small, helper(f"replay:{pure['proxy-faulty']}"), model=f"replay:{pure['proxy']}")
     monkeypatch.setattr("harness.backends.proxy.Proxy.identity", lambda self: {"engine": "another"})
-    with pytest.raises(UserError, match="is not the model that it was; run it again"):
+    with pytest.raises(UserError, match="has changed since that run; make the run again"):
         run(stored, tmp_path / "stored")
     assert not (tmp_path / "stored" / "run.json").exists()
 

@@ -107,7 +107,7 @@ def test_the_papers_study_has_no_layouts_to_draw_by():
     intents = Intents(
         np.full((1, 2), 0.5), np.zeros((1, 0, 2)), one > 0, np.ones((1, 1)), one, one, np.ones((1, 1))
     )
-    with pytest.raises(UserError, match="round_trip needs layouts, which the paper's study has not"):
+    with pytest.raises(UserError, match="round_trip needs layouts, and the paper's study has none"):
         coordinate(point, intents, Draws(np.zeros((1, 0, 2)), one))
 
 

@@ -93,7 +93,7 @@ def test_nodes_that_disagree_are_named(cluster: Any) -> None:
     with pytest.raises(UserError) as raised:
         spread(where, range(8), Ray(), lambda done: None, lambda number: f"episode {number}")
     said = str(raised.value)
-    assert " came out otherwise on node " in said
+    assert " came out differently on node " in said
     assert said.startswith("episode ")
     assert all(one["NodeID"][:8] in said for one in ray.nodes() if one["Alive"])
 

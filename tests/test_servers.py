@@ -401,7 +401,7 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
         evaluated(served_spec(small, one, other), tmp_path / "run")
     said = str(caught.value)
     assert f"model 'mine': no server is left: {one} (" in said
-    assert "start one again, and the same command goes on" in said
+    assert "start one again, and type the same command to continue" in said
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
@@ -433,7 +433,7 @@ def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: 
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert f"goes on: harness eval --model mine --server {there.url}" in err
+    assert f"to continue: harness eval --model mine --server {there.url}" in err
 
 
 # -- what is typed ------------------------------------------------------------------------------------------

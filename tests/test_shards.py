@@ -121,7 +121,7 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed
     code, out, _ = harness(*DRIVE[:-1], "--shard", "2/3", "--out", shard)
     assert code == 0
     assert out == (
-        f"wrote {shard}: 16 of 36 episodes, shard 2/3; put together all 3 with "
+        f"wrote {shard}: 16 of 36 episodes, shard 2/3; merge all 3 shards with "
         "`harness merge FOLDER... --out FOLDER`\n"
     )
     for other in (["--shard", "1/3"], []):
@@ -154,7 +154,7 @@ def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
     text = file.read_text()
     file.write_text(text.replace("True", "False"))
     assert re.search(
-        r"episodes 16 to 31 came out otherwise in \S*/again than in \S*/2; find out which is right",
+        r"episodes 16 to 31 came out differently in \S*/again than in \S*/2; find out which is right",
         refused(harness, [*shards, tmp_path / "again"]),
     )
     file.write_text(text)
@@ -192,7 +192,7 @@ def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_pat
     ("options", "said"),
     [
         (("--shard", "1/4", "--out", "shard"), "the work has 3 parts; give 3 shards or fewer"),
-        (("--shard", "1/3"), "--shard 1/3: give --out, a folder of its own"),
+        (("--shard", "1/3"), "--shard 1/3: give --out with a folder for this shard alone"),
         (("--shard", "1/3", "--out", "shard", "--latency", "measured", "--model", "swarm-tiny"),
          "--latency measured is of one machine"),
     ],

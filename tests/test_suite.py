@@ -217,7 +217,7 @@ def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) 
     assert page.index("proxy · v2 and v4 · json on two") < page.index("local-view · v2 and v4 · json on two")
     code, out, err = evaluated("report", DONE, other / "small", "--out", "both.html")
     assert (code, out) == (2, "")
-    assert err == f"harness: {other / 'small'} is no suite, and others are; report them apart\n"
+    assert err == f"harness: {other / 'small'} is no suite, but others are; write separate reports\n"
 
 
 def test_a_command_on_one_run_says_that_a_suite_has_several(evaluated: Harness) -> None:

@@ -477,7 +477,7 @@ def test_the_command_prints_writes_and_gates(
     assert all(len(line) <= 80 for line in out.splitlines())
     assert "FAILED: order:invariance_rate < 0.99 in order ego (0." in out
     assert "passed: ids:tv_distance > 0.5" in out
-    assert "proxy-faulty reads the scene and not the text" in out
+    assert "proxy-faulty reads the scene graph and not the text" in out
     written = json.loads((tmp_path / "faulty" / "twins.json").read_text())
     assert written["decision_points"] == 18
     pairs = [json.loads(line) for line in (tmp_path / "faulty" / "pairs.jsonl").read_text().splitlines()]

@@ -152,7 +152,7 @@ def _plug_in(engine: str) -> Registration | None:
         except Exception as error:  # whatever a package's import may raise
             raise UserError(
                 f"engine {printable(engine)!r}: {printable(entry.value)} does not load ({printable(error)}); "
-                "mend the package that registers it, or uninstall it"
+                "fix the package that registers it, or uninstall it"
             ) from error
         if isinstance(loaded, Registration):
             return loaded

@@ -87,8 +87,8 @@ class Replay:
                 stored = manifest.identity["helpers"][0]
             if digest(model.identity()) != digest(stored):
                 raise UserError(
-                    f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} is not the "
-                    "model that it was; run it again"
+                    f"{shown} holds no answer for {requests[0].id}, and {printable(card.name)} has "
+                    "changed since that run; make the run again"
                 )
             self._models[role] = cached(model, card, default_file())
         return self._models[role]

@@ -73,7 +73,7 @@ def held_to_digest(card: Card, file: Path) -> Path:
     if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
         raise UserError(
             f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {digest}, "
-            f"and the card has {card.sha256}; fetch it again, or mend the card"
+            f"and the card has {card.sha256}; fetch it again, or fix the card"
         )
     return file
 

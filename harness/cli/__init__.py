@@ -101,7 +101,7 @@ def main() -> None:
         if error.errno not in MACHINE:
             raise
         where = f"{printable(error.filename)}: " if error.filename else ""
-        _fail(f"{where}{error.strerror}; mend that, and type the same command again")
+        _fail(f"{where}{error.strerror}; fix that, and type the same command again")
 
 
 def _typed() -> None:
@@ -137,7 +137,7 @@ def _noted(said: str, error: BaseException | None) -> str:
     if not notes:
         return said
     typed = printable(shlex.join(["harness", *sys.argv[1:]]), 2000)
-    return "; ".join((said, *notes, f"the same command goes on: {typed}"))
+    return "; ".join((said, *notes, f"type the same command to continue: {typed}"))
 
 
 def _terminate(number: int, frame: object) -> None:

@@ -18,17 +18,20 @@ HEADS = ("left out", "of", "shift [95 %]", "flips % [95 %]", "fail%", "n")
 
 def command(
     run: Path = typer.Argument(help="Folder of a finished run of `harness eval`.", metavar="RUN"),
-    sample: int = typer.Option(40, help="How many decision points to draw, at most."),
-    sample_seed: int = typer.Option(0, help="Seed of the draw."),
+    sample: int = typer.Option(40, help="Number of decision points to draw at random, at most."),
+    sample_seed: int = typer.Option(0, help="Seed of this draw."),
     condition: str | None = typer.Option(
-        None, help="Operating point whose decision points are drawn. Default: 6g, else the run's last."
+        None, help="Condition to draw decision points from. Default: 6g, or the run's last if it has no 6g."
     ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show what moved answers, by leaving things out one by one.
+    """Show which objects and messages moved the answers.
 
-    The run's model is asked what the run has not, once. `harness report` then shows it at each decision.
+    Each is left out of the prompt, or of the fusion, in turn.
+
+    The run's model is asked the questions that the run has no answer for, each once. `harness report` then
+    shows the result at each decision.
     """
     from harness.studies.attribution import attribute, headline, rows, rule, write
     from harness.studies.stored import Stored
@@ -66,7 +69,8 @@ def command(
         table(HEADS, cells)
         typer.echo(fill(f"{rule(found)}; intervals over episodes", WIDTH))
         typer.echo(
-            "of: whose prompt lists it; fusion: a message in time; shift: total variation of\n"
-            "answer or policy; flips: another action is likeliest; fail%: no answer then"
+            "of: the prompt it is left out of; fusion: a message that came in time; shift:\n"
+            "total variation distance of the answers or policies; flips: another action is\n"
+            "most probable; fail%: the answer without it could not be read"
         )
         typer.echo(f"wrote {printable(file)}")

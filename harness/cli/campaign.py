@@ -20,14 +20,21 @@ MOST_EPISODES = 1_000_000
 
 @app.command("paper")
 def paper(
-    out: Path = typer.Option(Path("reports/paper"), help="Folder to write; replaces a study there."),
-    episodes: int = typer.Option(1500, help="Episodes a seed, to compare operating points."),
-    sweep_episodes: int = typer.Option(300, help="Episodes a seed at each grid point of a sweep."),
-    seeds: str = typer.Option("0:5", help="Seeds of episodes and channel: 0:5 is 0 to 4; or 3,7,9."),
+    out: Path = typer.Option(
+        Path("reports/paper"), help="Folder to write; a study that is there is replaced."
+    ),
+    episodes: int = typer.Option(1500, help="Episodes per seed to compare the operating points."),
+    sweep_episodes: int = typer.Option(300, help="Episodes per seed at each grid point of a sweep."),
+    seeds: str = typer.Option(
+        "0:5", help="Seeds of the episodes and the channel: 0:5 means 0 to 4; 3,7,9 is a list."
+    ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare the calibrated proxy with the paper's numbers. Writes both, and Figures A and B."""
+    """Compare the calibrated proxy with the paper's numbers.
+
+    It plays the paper's study, and writes a page with both numbers, and Figures A and B.
+    """
     from harness.studies.ledger import shown, tally
     from harness.studies.paper import panels, run_paper
 
@@ -54,7 +61,8 @@ def paper(
     counts = tally(ledger)
     told = (
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
-        f"{counts['unclear']} unclear (?: the interval reaches it); {counts['predicted']} predicted, * fitted"
+        f"{counts['unclear']} unclear (?: the interval reaches the aim); {counts['predicted']} predicted, "
+        "the others (*) fitted"
     )
     typer.echo(fill(told, WIDTH))
     typer.echo(fill(equation_2, WIDTH))
@@ -66,17 +74,28 @@ def closed_loop(
     model: options.Model = "swarm-tiny",
     prompt: options.Prompt = "v2",
     answer: options.Answer = "json",
-    episodes: int = typer.Option(300, help="Layouts, each driven under every grid point and seed."),
-    first_seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
+    episodes: int = typer.Option(
+        300, help="Number of layouts; each is driven at every grid point with every seed."
+    ),
+    first_seed: int = typer.Option(
+        FIRST["report"], help="Layout seed of the first layout; the others follow."
+    ),
     seeds: options.Seeds = "0:5",
     workers: options.ModelWorkers = "2",
     batch_size: options.BatchSize = 8,
     latency: options.Latency = None,
-    out: Path | None = typer.Option(None, help="Folder; a study that was stopped there continues."),
+    out: Path | None = typer.Option(
+        None,
+        help="Folder to write; a study that was stopped there continues. Default: "
+        "reports/closed-loop-<model>-<prompt>.",
+    ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run the paper's panels in closed loop, with Figures A and B."""
+    """Run the paper's panels with a model in closed loop.
+
+    It draws Figures A and B.
+    """
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.dataset.schema import LAST_EPISODE, LAST_SEED

@@ -14,15 +14,17 @@ from harness.core.figures import as_mapping, known, shown
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
 
-app = typer.Typer(help="List radios, show one, or hold one against others' curves.", no_args_is_help=True)
+app = typer.Typer(help="List radios, show one, or check one against published curves.", no_args_is_help=True)
 
 MOST_TRIPS = 100_000  # at each distance
-Name = typer.Argument(help="Profile, or a change of one: `mode4:density_per_km=200`.", metavar="NAME")
+Name = typer.Argument(
+    help="Channel profile, or one with changed settings: `mode4:density_per_km=200`.", metavar="NAME"
+)
 
 
 @app.command("list")
 def list_channels(as_json: options.Json = False) -> None:
-    """List the channel profiles. Each is a condition of its name."""
+    """List the channel profiles. Each name is also a condition that --condition takes."""
     from harness.radio.profiles import CHANNELS
 
     profiles = {name: CHANNELS.profile(name) for name in CHANNELS}
@@ -36,9 +38,11 @@ def list_channels(as_json: options.Json = False) -> None:
 
 @app.command()
 def show(name: str = Name, as_json: options.Json = False) -> None:
-    """Print a profile: source, status, settings, and its reception against distance.
+    """Print a profile, and its reception by distance.
 
-    Reception is of one message, averaged over shadowing.
+    It names the profile's source, status and settings.
+
+    Reception is the probability that one message arrives, averaged over shadowing.
     """
     import textwrap
 
@@ -72,7 +76,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     for line in beyond:
         typer.echo(textwrap.fill(line, 80, subsequent_indent="  "))
     if not curves:
-        typer.echo("its loss is the same at any distance, behind anything")
+        typer.echo("packet loss is the same at every distance and behind every obstacle")
         return
     heads = ["reception, %", "in sight", "behind a car", "behind a building"]
     shares = zip(DISTANCES_M, *curves.values(), strict=True)
@@ -84,20 +88,22 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     name: str = Name,
-    n: int = typer.Option(2000, "-n", help="Trips at each distance, 100 to 100000."),
+    n: int = typer.Option(2000, "-n", help="Number of messages to simulate at each distance, 100 to 100000."),
     against: list[Path] | None = typer.Option(
         None,
-        help="Somebody's curves: a CSV with distance_m, reception and, where they had other settings, "
-        "configuration (rate_hz=10,power_dbm=20). Repeatable.",
+        help="CSV file with published curves: columns distance_m, reception (0 to 1) and, where their "
+        "settings differ from the profile's, configuration (such as rate_hz=10,power_dbm=20). Repeatable.",
     ),
-    out: Path | None = typer.Option(None, help="Picture to write: .svg, .pdf or .png."),
+    out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
     as_json: options.Json = False,
 ) -> None:
-    """Hold a radio against what it delivers, and against others' curves.
+    """Check a radio against simulation and published curves.
 
-    Messages are drawn as runs draw them, in sight; each has shadowing of its own. Waits are from one of a
-    vehicle's background packets to the next received, on a tenth as many trips. Curves are taken at their own
-    settings.
+    Computed reception is compared with that of simulated messages, and with published curves.
+
+    Messages are simulated as in a run, with sender and receiver in sight of each other; each message has its
+    own shadowing. The waits are those from one received background packet of a vehicle to the next; they take
+    a tenth as many samples. Each published curve is compared at its own settings.
     """
     import numpy as np
 
@@ -110,7 +116,10 @@ def check(
         raise UserError(f"-n {n}: give 100 to {MOST_TRIPS} trips")
     profile, channel = _of(name)
     if not isinstance(channel, Physical):
-        raise UserError(f"{printable(name)} loses the same at any distance; there is no curve to check")
+        raise UserError(
+            f"{printable(name)} loses the same at every distance, so there is no curve to check; give a "
+            "physical radio, such as mode4"
+        )
     _picture(out)
     where = f"channel profile {profile}"
     messages = drawn(channel, DISTANCES_M, n)
@@ -161,7 +170,7 @@ def check(
             for m, share in zip(messages, model, strict=True)
         ],
     )
-    typer.echo(f"n = {n} trips a distance, each with shadowing of its own; 95 % intervals")
+    typer.echo(f"n = {n} messages per distance, each with its own shadowing; 95 % intervals")
     if waits:
         typer.echo()
         table(
@@ -203,16 +212,24 @@ def check(
 
 @app.command()
 def crowd(
-    names: list[str] | None = typer.Argument(None, help="Radios. Default: all whose load can be set."),
-    distance_m: float = typer.Option(50.0, min=1.0, max=1000.0, help="Between sender and receiver, m."),
-    radius_m: float = typer.Option(100.0, min=10.0, max=1000.0, help="Within which the vehicles stand, m."),
-    sight: str = typer.Option("clear", help="What stands between: clear, vehicle or building."),
-    out: Path | None = typer.Option(None, help="Picture to write: .svg, .pdf or .png."),
+    names: list[str] | None = typer.Argument(
+        None, help="Channel profiles. Default: all whose load can be set."
+    ),
+    distance_m: float = typer.Option(
+        50.0, min=1.0, max=1000.0, help="Distance from sender to receiver, in m."
+    ),
+    radius_m: float = typer.Option(
+        100.0, min=10.0, max=1000.0, help="Radius around the sender within which all vehicles are, in m."
+    ),
+    sight: str = typer.Option(
+        "clear", help="What blocks the line of sight: clear (nothing), vehicle or building."
+    ),
+    out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
     as_json: options.Json = False,
 ) -> None:
-    """Show loss against swarm size: radios beside the paper's line.
+    """Show packet loss by swarm size, beside the paper's line.
 
-    The road is as full everywhere as it is within the radius, and all of them send.
+    The road has the same density of vehicles everywhere as within the radius, and all of them send.
     """
     import numpy as np
 

@@ -10,17 +10,23 @@ from harness.core.errors import UserError, printable
 
 
 def command(
-    a: Path = typer.Argument(help="Folder of the base run.", metavar="A"),
-    b: Path = typer.Argument(help="Folder of the run that is compared with it.", metavar="B"),
+    a: Path = typer.Argument(help="Folder of the run to compare with.", metavar="A"),
+    b: Path = typer.Argument(help="Folder of the run to judge: differences are B - A.", metavar="B"),
     fail_if: list[str] | None = typer.Option(
         None,
-        help="Gate on B - A: '[CONDITION:]METRIC[.low|.high] OP NUMBER', in any condition unless one is "
-        "named; shares from 0 to 1. Repeatable. Exit code 1 if one fails.",
+        help="Gate on the difference B - A: '[CONDITION:]METRIC[.low|.high] OP NUMBER'. It fails where that "
+        "is true: '6g:success_rate < -0.01' fails if 6g lost more than one point of success. Rates are from "
+        "0 to 1; .low and .high are the ends of the 95 % interval; without CONDITION, the gate is on every "
+        "condition. Repeatable. Exit code 1 if a gate fails.",
     ),
-    show: int = typer.Option(10, help="Most episodes and requests to list of each kind."),
-    html: Path | None = typer.Option(None, help="File to write a page to as well."),
-    junit: Path | None = typer.Option(None, help="File to write the gates to, as test cases in JUnit's XML."),
-    as_markdown: bool = typer.Option(False, "--markdown", help="Print Markdown, for a pull request."),
+    show: int = typer.Option(10, help="Number of episodes, decisions and requests to list of each kind."),
+    html: Path | None = typer.Option(None, help="Also write the comparison as a page to this file."),
+    junit: Path | None = typer.Option(
+        None, help="Also write the gates to this file, as test cases in JUnit XML for a CI system."
+    ),
+    as_markdown: bool = typer.Option(
+        False, "--markdown", help="Print Markdown, such as for a comment on a pull request."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Show what changed from run A to B, by episode and seed. Exit code 1 if a gate fails."""

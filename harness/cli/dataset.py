@@ -20,26 +20,36 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Build, check, show and rank frozen datasets.", no_args_is_help=True)
 
 Dataset = Annotated[
-    str, typer.Argument(help="A dataset's folder, or the name of a shipped one.", metavar="DIR")
+    str, typer.Argument(help="Folder of a dataset, or the name of a shipped one.", metavar="DIR")
 ]
 
 
 @app.command()
 def build(
-    name: str | None = typer.Argument(None, help="Scenario.", show_default=False),
+    name: str | None = typer.Argument(
+        None, help="Scenario to freeze; `harness scenario list` shows them.", show_default=False
+    ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    episodes: int = typer.Option(200, help="Episodes."),
+    episodes: int = typer.Option(200, help="Number of episodes, each on a layout of its own."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = "2",
     lag: float | None = typer.Option(
-        None, help="Seconds from a decision's moment to its action. Default: the scenario's, 0.145."
+        None,
+        help="Seconds from the start of a decision to its action. Default: the scenario's, usually 0.145.",
     ),
-    audit: bool = typer.Option(True, help="Audit 100 layouts or more for tells, on the dataset's card."),
-    out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's."),
+    audit: bool = typer.Option(
+        True, help="With 100 layouts or more, audit whether the ego's view gives the danger away."
+    ),
+    out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's name."),
     shard: options.Shard = None,
 ) -> None:
-    """Freeze every course of some layouts. The same command again continues a build that was stopped."""
+    """Build a frozen dataset of some layouts of a scenario.
+
+    It drives every sequence of actions on each layout, and keeps every scene on the way.
+
+    If the build is stopped, the same command continues it.
+    """
     name = options.scenario_name(name, env, env_config)
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     if lag is not None:
@@ -64,7 +74,7 @@ def build(
 
 @app.command()
 def check(dataset: Dataset, as_json: options.Json = False) -> None:
-    """Verify every file and every decision point. Exit code 1 if something is wrong."""
+    """Check every file and every decision point of a dataset. Exit code 1 if something is wrong."""
     from harness.dataset import load, verify
 
     path = load.find(dataset)
@@ -89,13 +99,11 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
 def show(
     dataset: Dataset,
     scene: str = typer.Argument(help="Scene id, such as 00003-0."),
-    out: Path = typer.Option(..., help="Picture to write: .svg or .png."),
-    viewer: str | None = typer.Option(None, help="Whose sight is drawn, such as v2. Default: the ego's."),
-    camera: bool = typer.Option(
-        False, "--camera", help="What its cameras see, the front above the rear, as a .png."
-    ),
+    out: Path = typer.Option(..., help="Picture to write: .svg or .png; with --camera .png."),
+    viewer: str | None = typer.Option(None, help="Vehicle whose view to draw, such as v2. Default: the ego."),
+    camera: bool = typer.Option(False, "--camera", help="Draw what its cameras see, front above rear."),
 ) -> None:
-    """Draw a scene from above, or as the cameras of a vehicle see it."""
+    """Draw a scene from above, or as a vehicle's cameras see it."""
     from io import BytesIO
 
     from harness.core.files import write_whole
@@ -130,7 +138,10 @@ def show(
 
 @app.command("rank")
 def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
-    """Compare the reference drivers' frozen and closed-loop success. Both are on the same episodes."""
+    """Compare the reference drivers, frozen and in closed loop.
+
+    Both are on the same episodes.
+    """
     from harness.dataset import load
 
     who = options.workers_of(workers)
@@ -162,5 +173,5 @@ def _table(episodes: int, standings: dict[str, "Standing"]) -> None:
         rows.append((driver, shown(s.frozen), shown(s.live), shown(s.difference_points, 1.0), agreement))
     table(heads, rows)
     text = console()
-    text.print(f"n = {episodes} episodes; same: how many of them end alike, frozen and driven")
-    text.print("so few are no rank correlation: that these scenes rank models takes runs, `harness fidelity`")
+    text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")
+    text.print("these few drivers give no rank correlation: compare runs of models with `harness fidelity`")

@@ -16,19 +16,21 @@ if TYPE_CHECKING:
     from harness.core.statistics import Estimate
     from harness.runs.records import Constant, Device, DeviceRow
 
-app = typer.Typer(
-    help="List computers, show what fits the window on one, or check one.", no_args_is_help=True
-)
+app = typer.Typer(help="List on-board computers, show or check one, or measure energy.", no_args_is_help=True)
 
 MOST_TOKENS = 1_000_000
 MOST_MS = 60_000
-Name = typer.Argument(help="Device profile.", metavar="NAME")
-Model = typer.Option(None, "--device-model", help="One of its rows, or a size such as 3b. Default: all rows.")
+Name = typer.Argument(help="Device profile; `harness device list` shows them.", metavar="NAME")
+Model = typer.Option(
+    None,
+    "--device-model",
+    help="Row of the profile: a model's name, or a size such as 3b. Default: all rows.",
+)
 
 
 @app.command("list")
 def list_devices(as_json: options.Json = False) -> None:
-    """List the device profiles. Each is a value of --device-profile."""
+    """List the device profiles, which --device-profile takes."""
     from harness.backends import devices
 
     every = [devices.load(name) for name in devices.names()]
@@ -44,15 +46,20 @@ def list_devices(as_json: options.Json = False) -> None:
 def show(
     name: str = Name,
     model: str | None = Model,
-    run: Path | None = typer.Option(None, help="Folder of a run, whose ego's tokens are taken."),
-    prompt_tokens: int = typer.Option(300, help="Tokens of a prompt, without --run."),
-    answer_tokens: int = typer.Option(40, help="Tokens of an answer that is written, without --run."),
-    window_ms: float = typer.Option(200.0, help="Decision window, ms."),
+    run: Path | None = typer.Option(
+        None, help="Folder of a run; take the token counts of its ego's answers."
+    ),
+    prompt_tokens: int = typer.Option(300, help="Without --run: tokens of a prompt."),
+    answer_tokens: int = typer.Option(
+        40, help="Without --run: tokens of an answer in json or constrained mode."
+    ),
+    window_ms: float = typer.Option(200.0, help="Decision window, in ms."),
     as_json: options.Json = False,
 ) -> None:
-    """Show which answers fit the decision window on a device, and what they take.
+    """Show which answers fit the decision window on a device.
 
-    From seeing to having the ego's own answer, without a radio; the ego is alone on its computer.
+    It shows their time and energy, too. The time is that of the ego's own answer, without any message.
+    Nothing else runs on the computer.
     """
     from harness.backends import devices
     from harness.runs.folder import read
@@ -98,9 +105,9 @@ def show(
     if run:
         _say(
             f"{printable(run)}: n = {len(told.prompt)} answers of {printable(told.who)} for the ego; "
-            "tokens and ms are medians, in time and J means with 95 % intervals over episodes; in time: "
-            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are those of its "
-            "own tokenizer"
+            "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; in time: "
+            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are counted by the "
+            "model's own tokenizer"
         )
     _origins(device, rows)
 
@@ -108,13 +115,15 @@ def show(
 @app.command()
 def check(
     name: str = Name,
-    run: Path = typer.Argument(help="Folder of a run with --batch-size 1 --no-cache.", metavar="RUN"),
-    model: str | None = typer.Option(None, "--device-model", help="Row to hold. Default: the run's model."),
+    run: Path = typer.Argument(help="Folder of a run made with --batch-size 1 --no-cache.", metavar="RUN"),
+    model: str | None = typer.Option(
+        None, "--device-model", help="Row of the profile to check. Default: that of the run's model."
+    ),
     as_json: options.Json = False,
 ) -> None:
-    """Hold a device profile against what the answers of a run took.
+    """Compare a device profile with a run's measured times.
 
-    The run's machine is the device's, or the figures say how far the two are apart.
+    Run it on the device itself. On another machine, the figures show how far the two are apart.
     """
     from harness.backends import devices
     from harness.runs.folder import read
@@ -151,18 +160,18 @@ def check(
 
 @app.command()
 def measure(
-    model: str = typer.Option("swarm-tiny", help="Model card, or a folder of weights."),
+    model: str = typer.Option("swarm-tiny", help="Model: a card name, or a folder of weights."),
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
     answer: options.Answer = "json",
-    window_s: float = typer.Option(2.0, help="Least seconds of each of five windows of asking."),
+    window_s: float = typer.Option(2.0, help="Length of each of the five measurements in s, at least."),
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
-    """Measure the joules of a model's answers by this machine's meters.
+    """Measure the energy of a model's answers on this machine.
 
-    NVML, RAPL and a Jetson's rails, as far as they can be read: `harness doctor` lists them. Answers are
-    asked one by one, after as long a time of idling.
+    The meters are NVML, RAPL and a Jetson's rails; `harness doctor` lists those that can be read here. Each
+    measurement first idles, then asks one question after the other for as long.
     """
     from dataclasses import asdict
 

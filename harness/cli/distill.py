@@ -17,26 +17,32 @@ BATCH = 16
 
 
 def command(
-    scenario: list[str] = typer.Argument(help="Scenarios to learn to drive in."),
-    out: Path = typer.Option(..., help="Folder to make; its name becomes the model's."),
+    scenario: list[str] = typer.Argument(help="Scenarios to learn; `harness scenario list` shows them."),
+    out: Path = typer.Option(..., help="Folder to make; its name becomes the model's name."),
     prompt: list[str] = typer.Option(
-        ["v2", "v4"], help="Prompt version to learn, in the scenarios it fits; repeat for several."
+        ["v2", "v4"], help="Prompt version to learn; it is used in the scenarios that it fits. Repeatable."
     ),
     base: Path | None = typer.Option(
-        None, help="Folder of a distilled model of texts to begin as, tokenizer included."
+        None,
+        help="Folder of a distilled text model to start from; its tokenizer is kept. Default: from scratch.",
     ),
-    layouts: int = typer.Option(240, help="Layouts of each scenario."),
-    first_seed: int = typer.Option(FIRST["train"], help="Layout seed of the first."),
-    samples: str = typer.Option(SAMPLES, help="Sequences a stage: excerpts, alone, messages, answers."),
-    seed: int = typer.Option(0, help="Seed of the weights and of the order."),
-    batch: int = typer.Option(BATCH, help="Sequences a step."),
-    device: str = typer.Option("cpu", help="cpu or cuda."),
-    threads: int | None = typer.Option(None, help="Threads on a CPU. Default: PyTorch's choice."),
+    layouts: int = typer.Option(240, help="Number of layouts of each scenario."),
+    first_seed: int = typer.Option(
+        FIRST["train"], help="Layout seed of the first layout; train seeds are 100000 to 199999."
+    ),
+    samples: str = typer.Option(
+        SAMPLES, help="Training sequences of the four stages excerpts, alone, messages and answers."
+    ),
+    seed: int = typer.Option(0, help="Seed of the initial weights and of the order of the sequences."),
+    batch: int = typer.Option(BATCH, help="Sequences per training step."),
+    device: str = typer.Option("cpu", help="Where to train: cpu, cuda or cuda:N."),
+    threads: int | None = typer.Option(None, help="Number of CPU threads. Default: PyTorch's choice."),
     workers: options.Workers = "2",
 ) -> None:
-    """Train a small Qwen3 in some scenarios. The same command again continues training that was stopped.
+    """Train a small Qwen3 to imitate the planner in some scenarios.
 
-    With an image prompt among them it is a Qwen3-VL, which takes pictures and texts.
+    With an image prompt it is a Qwen3-VL, which takes pictures and text. If the training is stopped, the same
+    command continues it.
     """
     from harness.prompts import versions as prompts
 

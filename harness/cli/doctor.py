@@ -25,10 +25,13 @@ GIB = 2**30
 
 
 def command(
-    gpu: bool = typer.Option(False, "--gpu", help="Ask torch for GPUs too; it takes seconds to load."),
+    gpu: bool = typer.Option(False, "--gpu", help="Also ask torch for GPUs, which takes a few seconds."),
     as_json: options.Json = False,
 ) -> None:
-    """Show what can run here: versions, machine, models, cache. Says what the other models lack."""
+    """Show what can run here: versions, machine, models, cache.
+
+    For models that cannot run, it says what to install or fetch.
+    """
     facts = look(gpu)
     if as_json:
         typer.echo(json.dumps(facts, indent=1))

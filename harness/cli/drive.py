@@ -39,14 +39,20 @@ def command(
     attack: options.Attacks = None,
     scenario: str | None = typer.Option(
         None,
-        help="Scenario to drive. NAME:beacon_loss=0.3 has other beacons. Default: occluded-intersection.",
+        help="Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection.",
     ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
-    episodes: int | None = typer.Option(None, help="Layouts to drive. Default: the scenario's dataset's."),
-    first_seed: int | None = typer.Option(None, help="Layout seed of the first. Default: the dataset's."),
-    sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
-    sample_seed: int = typer.Option(0, help="Seed of the draw: those that eval draws of as many."),
+    episodes: int | None = typer.Option(
+        None, help="Number of layouts to drive. Default: as many as the scenario's shipped dataset has."
+    ),
+    first_seed: int | None = typer.Option(
+        None, help="Layout seed of the first episode. Default: that of the scenario's shipped dataset."
+    ),
+    sample: int | None = typer.Option(None, help="Draw this many of these episodes at random."),
+    sample_seed: int = typer.Option(
+        0, help="Seed of this draw; with the same seed, eval draws the same episodes of as many."
+    ),
     seeds: options.Seeds = "0:5",
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
@@ -63,15 +69,22 @@ def command(
     latency: options.Latency = None,
     device_profile: options.DeviceProfile = None,
     device_model: options.DeviceModel = None,
-    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-drive."),
+    out: Path | None = typer.Option(
+        None, help="Folder to write the run to. Default: reports/<model>-<prompt>-drive."
+    ),
     shard: options.Shard = None,
-    save_video: int = typer.Option(0, help="How many of the last condition's failed episodes to draw."),
+    save_video: int = typer.Option(
+        0, help="Number of failed episodes of the last condition to draw as videos."
+    ),
     no_cache: options.NoCache = False,
     tag: options.Tags = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Drive closed-loop episodes in highway-env. The same command continues one that was stopped."""
+    """Drive episodes in closed loop, in highway-env.
+
+    If the run is stopped, the same command continues it.
+    """
     from harness.backends import devices
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS
@@ -93,7 +106,9 @@ def command(
     purpose(first_seed, episodes)
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video):
-        raise UserError(f"--shard {part}: give --out, a folder of its own, and --save-video to no shard")
+        raise UserError(
+            f"--shard {part}: give --out with a folder for this shard alone, and leave --save-video out"
+        )
     if save_video:
         extras.need("--save-video", "matplotlib")
     names = POINTS if condition in (None, [], [ALL]) else condition
@@ -160,8 +175,9 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     notes = (
         f"n = {world.episodes} episodes × {len(done.manifest.seeds)} channel seeds; "
         f"{'of ' if of else ''}{stated(world.first_seed, of or world.episodes)};\n"
-        "intervals over episodes; missed: decisions that outlast the window;\n"
-        "gap: the least; clear: seconds to clear, where the ego did; both are means",
+        "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
+        "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
+        "it did; both are means over episodes",
     )
     show(done, "closed loop", COLUMNS, notes)
 

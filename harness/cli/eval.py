@@ -34,22 +34,31 @@ COLUMNS = (
 
 def command(
     model: str = typer.Option(
-        "proxy", help="Card, checkpoint directory, .gguf file, hub id, or replay:RUN. `harness model list`."
+        "proxy",
+        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
+        "hub id, or replay:RUN, which scores the stored answers of a run again.",
     ),
     engine: options.Engine = None,
     prompt: options.ScenarioPrompt = None,
     dataset: str = typer.Option(
-        resources.DATASET, help="Shipped dataset, a dataset's folder, or suite:NAME."
+        resources.DATASET,
+        help="Name of a shipped dataset, a dataset's folder, or suite:NAME for several datasets at once.",
     ),
     condition: options.Conditions = None,
     control: options.Controls = None,
     attack: options.Attacks = None,
     seeds: options.Seeds = "0:5",
-    limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
-    only: str | None = typer.Option(None, help="Episodes by number: 3,10:20 is 3 and 10 to 19."),
-    danger: str | None = typer.Option(None, help="Sector its danger comes from, such as left; or none."),
-    sample: int | None = typer.Option(None, help="How many episodes to draw of those."),
-    sample_seed: int = typer.Option(0, help="Seed of the draw."),
+    limit: int | None = typer.Option(None, help="Use only this many episodes, from the first. Default: all."),
+    only: str | None = typer.Option(None, help="Use only these episodes: 3,10:20 means 3 and 10 to 19."),
+    danger: str | None = typer.Option(
+        None,
+        help="Use only episodes whose danger comes from this sector, such as left; none means episodes "
+        "without a danger.",
+    ),
+    sample: int | None = typer.Option(
+        None, help="Draw this many episodes at random from those that --only and --danger leave."
+    ),
+    sample_seed: int = typer.Option(0, help="Seed of this draw."),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     image: options.Image = "own",
@@ -60,7 +69,10 @@ def command(
     temperature: options.Temperature = 0.0,
     sampling_seed: options.SamplingSeed = 0,
     repeat: int | None = typer.Option(
-        None, "--repeats", help="Evaluate so many times, with sampling seeds one after the other."
+        None,
+        "--repeats",
+        help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a --temperature "
+        "above 0.",
     ),
     batch_size: options.BatchSize = 8,
     workers: options.RuleWorkers = None,
@@ -70,15 +82,26 @@ def command(
     latency: options.Latency = None,
     device_profile: options.DeviceProfile = None,
     device_model: options.DeviceModel = None,
-    out: Path | None = typer.Option(None, help="Run folder. Default: reports/<model>-<prompt>-<dataset>."),
+    out: Path | None = typer.Option(
+        None, help="Folder to write the run to. Default: reports/<model>-<prompt>-<dataset>."
+    ),
     no_cache: options.NoCache = False,
-    dry_run: bool = typer.Option(False, "--dry-run", help="Render and count, call no model, write nothing."),
-    tokenizer: Path | None = typer.Option(None, help="For --dry-run: tokenizer.json, its folder, or a GGUF."),
+    dry_run: bool = typer.Option(
+        False, "--dry-run", help="Only render the prompts and count requests and tokens; write nothing."
+    ),
+    tokenizer: Path | None = typer.Option(
+        None,
+        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
+        "Default: the model's.",
+    ),
     tag: options.Tags = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Evaluate a model with a prompt on frozen scenes. The same command continues one that was stopped."""
+    """Evaluate a model with a prompt on frozen scenes.
+
+    If the run is stopped, the same command continues it.
+    """
     from harness.backends import devices
     from harness.backends.cache import default_file
     from harness.coordination.operating_point import POINTS
@@ -121,7 +144,10 @@ def command(
         suite.check(named, specs)
     if repeat is not None:
         if named:
-            raise UserError(f"--repeats {repeat}: a suite is no one dataset; give one")
+            raise UserError(
+                f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of its "
+                "datasets"
+            )
         repeats.check(specs[0], repeat)
     if dry_run:
         counted = [_counted(*each, tokenizer) for each in zip(specs, frozen, strict=True)]
@@ -153,7 +179,7 @@ def command(
     notes = (
         f"n = {len(frozen[0].episodes)} episodes × {len(channel_seeds)} channel seeds; "
         f"{'of ' if selection.given else ''}{stated(frozen[0].manifest.seed, seeds_of)};",
-        "intervals over episodes; msgs an episode; gain: over single-local, paired",
+        "95 % intervals over episodes; msgs: per episode; gain: over single-local, paired",
     )
     show(done, frozen[0].name, COLUMNS, notes)
     typer.echo(f"wrote {page}")
@@ -209,11 +235,9 @@ def _show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     typer.echo(
         f"{spec.source.name}: {counted['requests']} requests{repeated} for the {counted['scenes']} scenes "
         f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
-        "seeds; no model was called"
+        "channel seeds; no model was called"
     )
     for role, s in (counted["prompt_tokens"] or {}).items():
         typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
     if not counted["prompt_tokens"]:
-        typer.echo(
-            "prompt tokens: not counted, no tokenizer at hand; give --tokenizer (tokenizer.json or GGUF)"
-        )
+        typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")

@@ -14,27 +14,37 @@ File = Path | None
 
 def command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.", metavar="RUN")],
-    as_csv: Annotated[bool, typer.Option("--csv", help="Write decisions.csv and answers.csv.")] = False,
-    as_jsonl: Annotated[
-        bool, typer.Option("--jsonl", help="Write decisions.jsonl, an object a decision.")
+    as_csv: Annotated[
+        bool,
+        typer.Option("--csv", help="Write decisions.csv and answers.csv, one row per decision and answer."),
     ] = False,
-    out: Annotated[File, typer.Option(help="Folder for --csv and --jsonl. Default: the run's.")] = None,
+    as_jsonl: Annotated[
+        bool, typer.Option("--jsonl", help="Write decisions.jsonl, one object per decision.")
+    ] = False,
+    out: Annotated[
+        File, typer.Option(help="Folder for the files of --csv and --jsonl. Default: the run's.")
+    ] = None,
     junit: Annotated[
-        File, typer.Option(help="JUnit's XML to write: a test case an episode and condition.")
+        File, typer.Option(help="Write a JUnit XML file: one test case per episode and condition.")
     ] = None,
     inspect: Annotated[
-        File, typer.Option(help="Log of Inspect AI to write, NAME.eval: a sample an answer.")
+        File, typer.Option(help="Write an Inspect AI log, NAME.eval: one sample per answer.")
     ] = None,
     sft: Annotated[
         File,
-        typer.Option(help="JSON lines to write: chats to fine-tune on, with what the trees say is right."),
+        typer.Option(
+            help="Write chats to fine-tune on as JSON Lines; their answers are those that the decision "
+            "trees show to be right."
+        ),
     ] = None,
     report_seeds_too: Annotated[
         bool,
-        typer.Option("--report-seeds-too", help="With --sft: also of layouts that numbers are reported of."),
+        typer.Option(
+            "--report-seeds-too", help="With --sft: also allow layouts with report seeds (200000 and above)."
+        ),
     ] = False,
 ) -> None:
-    """Write a run for spreadsheets and other programs."""
+    """Write a run's data for spreadsheets and other programs. Give exactly one format."""
     from harness.runs import export
     from harness.runs.folder import read
 
@@ -42,11 +52,13 @@ def command(
     asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
     [option, *others] = [name for name, given in asked.items() if given] or [""]
     if others or not option:
-        raise UserError(f"{', '.join(asked)}: give one of them")
+        raise UserError(f"{', '.join(asked)}: give exactly one of them")
     if report_seeds_too and not sft:
-        raise UserError("--report-seeds-too is of --sft; give that, or leave it out")
+        raise UserError("--report-seeds-too only goes with --sft; give --sft, or leave it out")
     if out and option in files:
-        raise UserError(f"--out is of --csv and --jsonl; {option} names its file")
+        raise UserError(
+            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
+        )
     source, folder = read(run), out or run
     target = files.get(option)
     try:

@@ -16,7 +16,10 @@ def command(
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
     as_json: options.Json = False,
 ) -> None:
-    """Compare frozen with closed-loop success, by episode. Takes runs of `eval` and of `drive`."""
+    """Compare frozen with closed-loop success, paired by episode.
+
+    Give at least one run of `harness eval` and one of `harness drive`, with the same models and layouts.
+    """
     from harness.studies import fidelity
 
     with bar("comparing frozen with closed loop", quiet=as_json):

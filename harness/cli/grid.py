@@ -18,31 +18,39 @@ MOST_EFFECTS = 8  # that are printed
 
 
 def command(
-    model: str = typer.Option("proxy", help="Models of the ego, such as a,b."),
-    prompt: str | None = typer.Option(None, help="Prompt versions, such as v2,v3. Default: the scenario's."),
-    answer: str = typer.Option("json", help="Answer modes: json, constrained, readout."),
-    helper_model: str | None = typer.Option(None, help="Models of the helpers. Default: the ego's."),
-    helper_prompt: str | None = typer.Option(None, help="Prompts of the helpers. Default: the ego's."),
-    helper_answer: str | None = typer.Option(None, help="Answer modes of helpers. Default: the ego's."),
+    model: str = typer.Option("proxy", help="Models of the ego, separated by commas."),
+    prompt: str | None = typer.Option(
+        None, help="Prompt versions of the ego, such as v2,v3. Default: the scenario's usual one."
+    ),
+    answer: str = typer.Option(
+        "json", help="Answer modes of the ego, separated by commas: json, constrained, readout."
+    ),
+    helper_model: str | None = typer.Option(None, help="Models of the helpers. Default: the ego's models."),
+    helper_prompt: str | None = typer.Option(
+        None, help="Prompt versions of the helpers. Default: the ego's versions."
+    ),
+    helper_answer: str | None = typer.Option(
+        None, help="Answer modes of the helpers. Default: the ego's modes."
+    ),
     dataset: options.Dataset = resources.DATASET,
     condition: options.Conditions = None,
     control: options.Controls = None,
     attack: options.Attacks = None,
     seeds: options.Seeds = "0:5",
-    limit: int | None = typer.Option(None, help="The first so many episodes. Default: all."),
+    limit: int | None = typer.Option(None, help="Use only this many episodes, from the first. Default: all."),
     batch_size: options.BatchSize = 8,
     device: options.Device = None,
     dtype: options.Dtype = None,
     latency: options.Latency = None,
-    out: Path | None = typer.Option(None, help="Folder. Default: reports/grid-<models>-<dataset>."),
+    out: Path | None = typer.Option(None, help="Folder to write. Default: reports/grid-<models>-<dataset>."),
     no_cache: options.NoCache = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Evaluate every combination of ego and helper agents.
 
-    An agent is a model with a prompt and an answer mode; each is asked once in each role. The same command
-    continues one that was stopped.
+    An agent is a model with a prompt version and an answer mode. Each agent is asked once in each role,
+    however many combinations it is in. If the grid is stopped, the same command continues it.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
@@ -70,7 +78,7 @@ def command(
             "--helper-answer": helper_answer or answer,
         })  # fmt: skip
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
-        raise UserError(f"{cells} combinations; vary something, and give {MOST_CELLS} at most")
+        raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
     spec = Spec(
         ego=egos[0],
         source=FrozenSource(frozen, Selection(limit)),
@@ -125,8 +133,9 @@ def command(
     for sentence in in_a_sentence(grid):
         plain.print(sentence)
     plain.print(
-        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: Holm's, for all "
-        f"{len(grid.effects)} effects; {len(grid.conditions)} conditions are on the page"
+        f"n = {len(frozen.episodes)} episodes × {len(spec.seeds)} channel seeds, paired; p: corrected by "
+        f"Holm's method for all {len(grid.effects)} effects; the page has all {len(grid.conditions)} "
+        "conditions"
     )
     typer.echo(f"wrote {printable(page)}")
 

@@ -19,13 +19,20 @@ VARIANT = 32  # columns of model, prompt and answer mode
 
 def command(
     folder: options.Reports = Path("reports"),
-    metric: str = typer.Option(SUCCESS, help="A metric of summary.csv."),
-    condition: str | None = typer.Option(None, help="Default: the last that most of the runs have."),
-    dataset: str | None = typer.Option(None, help="Only runs on this dataset, or driven in this scenario."),
-    html: Path | None = typer.Option(None, help="File to write a page to as well."),
+    metric: str = typer.Option(SUCCESS, help="Metric to show, by its name in summary.csv."),
+    condition: str | None = typer.Option(
+        None, help="Condition to show. Default: the last of those that most runs have."
+    ),
+    dataset: str | None = typer.Option(
+        None, help="Show only runs on this dataset, or driven in this scenario."
+    ),
+    html: Path | None = typer.Option(None, help="Also write a page to this file."),
     as_json: options.Json = False,
 ) -> None:
-    """Show a metric over runs, by date, prompt version and model. Runs of the same scenes stand together."""
+    """Show a metric over runs, by date, prompt version and model.
+
+    Runs on the same scenes are grouped, since only those compare.
+    """
     from harness.report import history
     from harness.runs.metrics import unit
 
@@ -50,7 +57,7 @@ def command(
             who = printable(line.run.manifest.variant, VARIANT)
             typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
     if len(groups) > 1:
-        typer.echo("\nruns of different scenes do not compare: they stand apart")
+        typer.echo("\nruns on different scenes do not compare, so each group has its own table")
 
 
 def _mapping(line: "Line") -> dict[str, object]:

@@ -10,9 +10,12 @@ PROMPT = "v3"  # what one's own prompt begins as
 
 
 def command(
-    folder: Path = typer.Argument(metavar="DIR", help="Folder to make; an empty one will do."),
+    folder: Path = typer.Argument(metavar="DIR", help="Folder to make; it may exist if it is empty."),
 ) -> None:
-    """Make a project with a prompt and a model card to change. Commands typed there find them by name."""
+    """Make a project folder with a prompt and a model card to edit.
+
+    Commands that you type in this folder find both by name.
+    """
     from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory
 

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 
 def command(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
-    """List runs and studies, newest first. Each has the success of its best condition."""
+    """List runs and studies, newest first.
+
+    Each has the success of its best condition.
+    """
     from harness.runs.listing import UNREAD, runs
 
     listed = runs(folder)

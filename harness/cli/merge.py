@@ -13,14 +13,18 @@ from harness.core.errors import printable
 
 
 def command(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of all shards.", metavar="FOLDER...")],
-    out: Path = typer.Option(..., help="Folder to make."),
-    audit: bool = typer.Option(True, help="Audit a dataset of 100 layouts or more for tells."),
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of all shards, in any order.", metavar="FOLDER...")
+    ],
+    out: Path = typer.Option(..., help="Folder to write the whole to."),
+    audit: bool = typer.Option(
+        True, help="Audit a merged dataset of 100 layouts or more, as `harness dataset build` does."
+    ),
     workers: options.Workers = "2",
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Put the shards of a run or a dataset together. It has the bytes of one that was not split."""
+    """Merge the shards of a run or a dataset. The result is byte for byte what one unsplit run writes."""
     from harness.core.shards import read
 
     who, silent = options.workers_of(workers), as_json or quiet

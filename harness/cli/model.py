@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from harness.backends.checkup import Checkup
     from harness.evaluate.spec import Spec
 
-app = typer.Typer(help="List models, fetch one, or look at one before a run.", no_args_is_help=True)
+app = typer.Typer(help="List models, download one, or test one before a run.", no_args_is_help=True)
 
 PROMPT, IMAGE_PROMPT = "v2", "v7"  # what a check asks
 _WIDTH = 100  # of lines of tokens
@@ -27,7 +27,10 @@ _WIDTH = 100  # of lines of tokens
 
 @app.command("list")
 def list_models(as_json: options.Json = False) -> None:
-    """List the model cards and which of them can run here. A card has a line for each of its engines."""
+    """List the model cards, and whether they can run here.
+
+    Each engine of a card has a line.
+    """
     from harness.backends import cards
     from harness.backends.registry import missing
 
@@ -50,10 +53,13 @@ def list_models(as_json: options.Json = False) -> None:
 
 @app.command()
 def pull(
-    name: str = typer.Argument(help="Card or hub id."),
+    name: str = typer.Argument(help="Card name or hub id."),
     engine: options.Engine = None,
 ) -> None:
-    """Fetch a model's weights from its hub. The card names the revision."""
+    """Download a model's weights from the hub.
+
+    The card names the revision.
+    """
     from harness.backends.cards import resolve
     from harness.backends.weights import pull as fetch
 
@@ -66,17 +72,17 @@ def pull(
 
 @app.command()
 def check(
-    name: str = typer.Argument(help="Card, checkpoint directory, .gguf file or hub id."),
+    name: str = typer.Argument(help="Model: a card name, a checkpoint directory, a .gguf file or a hub id."),
     engine: options.Engine = None,
     thinking: options.Thinking = False,
-    device: str | None = typer.Option(None, help="cpu, cuda or cuda:N; CUDA if there is any."),
+    device: options.Device = None,
     dtype: options.Dtype = None,
     as_json: options.Json = False,
 ) -> None:
-    """Load a model, show its prompt and time one decision. Does so in each answer mode.
+    """Load a model, show its prompt and time one answer.
 
-    A model that sees is asked with a picture as well, and with a blank one. Exit code 1 if it answers in no
-    mode, or ignores pictures.
+    It does so in each answer mode. A model that takes pictures is also asked with a picture and with a blank
+    one. Exit code 1 if it answers in no mode, or if it ignores the picture.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities

@@ -19,114 +19,184 @@ else:  # typer takes any text; what is evaluated says which are allowed
 
 MOST_SEEDS = 1000
 
-Runs = Annotated[list[Path], Argument(help="Folders of finished runs.", metavar="RUN...")]
-Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds them.")]
-Model = Annotated[str, Option(help="Card, checkpoint directory, .gguf file or hub id. `harness model list`.")]
-Scenario = Annotated[str, Argument(help="Scenario.")]
+Runs = Annotated[list[Path], Argument(help="One or more folders of finished runs.", metavar="RUN...")]
+Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds the runs.")]
+Model = Annotated[
+    str,
+    Option(
+        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file or "
+        "a hub id."
+    ),
+]
+Scenario = Annotated[str, Argument(help="Scenario name; `harness scenario list` shows them.")]
 Env = Annotated[
     str | None,
-    Option(help="An environment of highway-env in place of a scenario: merge-v0, or my_package:MyEnv-v0."),
+    Option(
+        help="A highway-env environment to use instead of a scenario: merge-v0, or my_package:MyEnv-v0 for "
+        "one of your own."
+    ),
 ]
-EnvConfig = Annotated[Path | None, Option(help="JSON file of what its configuration changes.")]
-Engine = Annotated[str | None, Option(help="Another engine that the card names, such as llama-cpp.")]
-Prompt = Annotated[str, Option(help="Prompt version. `harness prompt list`.")]
+EnvConfig = Annotated[Path | None, Option(help="With --env: JSON file with changes to its configuration.")]
+Engine = Annotated[
+    str | None,
+    Option(
+        help="Engine to run the model on, such as llama-cpp, if its card names several. Default: its main "
+        "one."
+    ),
+]
+Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows them.")]
 ScenarioPrompt = Annotated[
-    str | None, Option(help="Prompt version. Default: the scenario's. `harness prompt list`.")
+    str | None,
+    Option(help="Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
 ]
-Dataset = Annotated[str, Option(help="Shipped dataset, or a dataset's folder.")]
+Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
 Conditions = Annotated[
     list[str] | None,
-    Option(help="Operating point, or a change of one: 6g:consensus=ego-prompt. Repeatable. Default: all."),
+    Option(
+        help="Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
+        "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points."
+    ),
 ]
 Controls = Annotated[
     list[str] | None,
     Option(
         "--control",
-        help="shuffled-messages: beside each condition with a channel, one whose ego hears the helpers of "
-        "another layout; no-messages: one that loses all; blind: one whose helpers see nothing. Repeatable.",
+        help="Beside each condition with a channel, also score a control. shuffled-messages: the ego hears "
+        "the helpers of another layout. no-messages: every message is lost. blind: the helpers see nothing. "
+        "Repeatable.",
     ),
 ]
 Attacks = Annotated[
     list[str] | None,
     Option(
         "--attack",
-        help="Beside each condition with a channel, one whose helpers attack: liar:share=1/3, or several at "
-        "once: liar+spoof. Repeatable. `harness trust --help`.",
+        help="Beside each condition with a channel, also score it under attack: liar:share=1/3 makes a "
+        "third of the helpers lie; liar+spoof combines two attacks. `harness trust --help` lists them. "
+        "Repeatable.",
     ),
 ]
-Seeds = Annotated[str, Option(help="Seeds of the channel: 0:5 is 0 to 4; or 3,7,9.")]
-FirstSeed = Annotated[int, Option(help="Seed of the first episode.")]
-Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think first.")]
-Answer = Annotated[AnswerMode, Option(help="json: free text; constrained: to the schema; readout: letters.")]
+Seeds = Annotated[
+    str,
+    Option(help="Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed."),
+]
+FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
+Thinking = Annotated[bool, Option("--thinking", help="Ask the model to think before it answers.")]
+Answer = Annotated[
+    AnswerMode,
+    Option(
+        help="How the model answers. json: free text with a JSON object. constrained: decoding allows only "
+        "what fits the schema. readout: the intent is read from the probabilities of one letter per action."
+    ),
+]
 Image = Annotated[
     ImageMode,
-    Option(help="Picture of an image prompt: own, blank, another (scene's), or none, which leaves its text."),
+    Option(
+        help="Which picture an image prompt shows: own (the viewer's), blank, another (another scene's), or "
+        "none (text only)."
+    ),
 ]
 HelperModel = Annotated[
     str | None,
-    Option(help="Model of the helpers; several, such as a,b,c, take them in turn. Default: the ego's."),
+    Option(
+        help="Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
+        "Default: the ego's model."
+    ),
 ]
-HelperPrompt = Annotated[str | None, Option(help="Prompt version of the helpers. Default: the ego's.")]
-HelperAnswer = Annotated[AnswerMode | None, Option(help="How helpers answer. Default: as the ego.")]
+HelperPrompt = Annotated[str | None, Option(help="Prompt version of the helpers. Default: the ego's prompt.")]
+HelperAnswer = Annotated[
+    AnswerMode | None,
+    Option(help="How the helpers answer: json, constrained or readout. Default: like the ego."),
+]
 HelperThinking = Annotated[
     bool | None,
-    Option("--helper-thinking/--no-helper-thinking", help="Ask helpers to think first. Default: as the ego."),
+    Option(
+        "--helper-thinking/--no-helper-thinking",
+        help="Ask the helpers to think before they answer. Default: like the ego.",
+    ),
 ]
-BatchSize = Annotated[int, Option(help="Most prompts that go through the engine together.")]
+BatchSize = Annotated[
+    int,
+    Option(help="Number of prompts in one batch; with a served model, of requests to each server at once."),
+]
 Servers = Annotated[
     list[str] | None,
     Option(
-        "--server", help="Base URL of a served model, in place of its card's. Repeatable: any may answer."
+        "--server",
+        help="Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. Repeat "
+        "it to spread the requests over several servers.",
     ),
 ]
 Workers = Annotated[
-    str, Option(metavar="WHO", help="Processes; or a Ray cluster: ray, ray://HOST:PORT, ray:HOST:PORT.")
+    str,
+    Option(
+        metavar="WHO",
+        help="Number of worker processes, or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT.",
+    ),
 ]
 ModelWorkers = Annotated[
     str,
     Option(
         metavar="WHO",
-        help="Processes, each with the model loaded; or a Ray cluster: ray, ray://HOST:PORT, ray:HOST:PORT.",
+        help="Number of worker processes, each of which loads the model, or a Ray cluster: ray, "
+        "ray://HOST:PORT or ray:HOST:PORT.",
     ),
 ]
 RuleWorkers = Annotated[
     str | None,
     Option(
         metavar="WHO",
-        help="Of rules in more than 256 layouts: processes, or a Ray cluster as of drive. Default: 2.",
+        help="Number of worker processes, or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT. For rules "
+        "such as proxy only; used on more than 256 layouts. Default: 2.",
     ),
 ]
 Shard = Annotated[
     str | None,
     Option(
         metavar="I/N",
-        help="Do part I of N, for `harness merge`; auto/N: that of this task of a Slurm or Kubernetes job.",
+        help="Do only part I of N, such as 3/16; `harness merge` joins the parts. auto/N takes I from the "
+        "task number of a Slurm or Kubernetes job.",
     ),
 ]
-Device = Annotated[str | None, Option(help="cpu or cuda.")]
-Dtype = Annotated[str | None, Option(help="float32, bfloat16 or auto, in place of the card's.")]
+Device = Annotated[
+    str | None,
+    Option(
+        help="Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU if there "
+        "is one."
+    ),
+]
+Dtype = Annotated[
+    str | None, Option(help="Number format of the weights: float32, bfloat16 or auto. Default: the card's.")
+]
 Latency = Annotated[
     str | None,
     Option(
-        help="Inference times: paper (145 ms), card, ego=SECONDS,helper=SECONDS,fusion=SECONDS, or measured "
-        "(batch 1, on this machine if it is idle). Default: the card's, else the paper's."
+        help="Inference time of one answer: paper (145 ms), card (what the card states), measured (batch 1 "
+        "on this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. Default: card, or "
+        "paper if the card states none."
     ),
 ]
 DeviceProfile = Annotated[
     str | None,
-    Option(help="Computer of every vehicle, in place of --latency: agx-orin. `harness device list`."),
+    Option(
+        help="Computer in every vehicle, such as agx-orin (`harness device list`). It times each answer by "
+        "its tokens; use it instead of --latency."
+    ),
 ]
 DeviceModel = Annotated[
-    str | None, Option(help="Model whose row of it times all answers. Default: each answer's own model.")
+    str | None,
+    Option(
+        help="With --device-profile: model whose row of the profile times all answers. Default: the model "
+        "that gave the answer."
+    ),
 ]
-Temperature = Annotated[
-    float, Option(help="Draw answers at this temperature, 0 to 2; 0 takes the likeliest token each time.")
+Temperature = Annotated[float, Option(help="Sampling temperature, 0 to 2; 0 is greedy decoding.")]
+SamplingSeed = Annotated[int, Option(help="Seed of the sampling; needs a --temperature above 0.")]
+NoCache = Annotated[
+    bool, Option("--no-cache", help="Ask the model again, even for answers that an earlier run stored.")
 ]
-SamplingSeed = Annotated[int, Option(help="Seed of those draws.")]
-NoCache = Annotated[bool, Option("--no-cache", help="Ask again for answers that an earlier run has.")]
-Tags = Annotated[list[str] | None, Option(help="Word to find the run by. Repeatable.")]
-Json = Annotated[bool, Option("--json", help="Print JSON.")]
-Quiet = Annotated[bool, Option("--quiet", help="Print nothing but errors, and what --json asks for.")]
+Tags = Annotated[list[str] | None, Option(help="Label to find the run by later. Repeatable.")]
+Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
+Quiet = Annotated[bool, Option("--quiet", help="Print only errors, and the JSON of --json.")]
 
 
 CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
@@ -180,10 +250,10 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     from harness.world.environments import environment
 
     if (name is None) == (env is None):
-        raise UserError("give a scenario or --env, one of the two; `harness scenario list` lists scenarios")
+        raise UserError("give either a scenario or --env; `harness scenario list` lists scenarios")
     if name is not None:
         if env_config is not None:
-            raise UserError("--env-config is of an environment; give --env as well")
+            raise UserError("--env-config changes an environment; give --env as well")
         return name
     assert env is not None
     if env_config is None:
@@ -214,7 +284,7 @@ def shard_of(text: str | None) -> "shards.Shard | None":
 def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
     """Say that a shard is done, and what is done with it."""
     echo(
-        f"wrote {printable(out)}: {what}, shard {shard}; put together all {shard.of} with "
+        f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
         "`harness merge FOLDER... --out FOLDER`"
     )
 

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def command(
-    model: str = typer.Argument(help="Card or directory that names a checkpoint and a GGUF file."),
+    model: str = typer.Argument(help="Card or folder with both a checkpoint and a GGUF file."),
     prompt: options.Prompt = "v2",
     dataset: options.Dataset = resources.DATASET,
-    prompts: int = typer.Option(64, help="How many, spread over scenes and viewers."),
+    prompts: int = typer.Option(64, help="Number of prompts to compare, spread over scenes and viewers."),
     as_json: options.Json = False,
 ) -> None:
-    """Compare a model's answers on transformers and llama.cpp. Exit code 1 if they differ too much."""
+    """Compare a model's answers on transformers and on llama.cpp. Exit code 1 if they differ too much."""
     from harness.backends import cards
     from harness.backends.registry import missing
     from harness.dataset import load

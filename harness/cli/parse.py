@@ -14,17 +14,22 @@ FINISH_REASONS = ("stop", "length", "error")
 
 
 def command(
-    file: str = typer.Argument(help="File with one raw completion; - reads standard input."),
-    scenario: str = typer.Option("occluded-intersection", help="Scenario that names the actions."),
-    role: str = typer.Option("ego", help="Who answered: ego or helper."),
-    thinking: bool = typer.Option(False, "--thinking", help="The model was asked to think first."),
+    file: str = typer.Argument(help="File with one raw completion; - means standard input."),
+    scenario: str = typer.Option("occluded-intersection", help="Scenario whose actions the answer is about."),
+    role: str = typer.Option("ego", help="Role that answered: ego or helper."),
+    thinking: bool = typer.Option(False, "--thinking", help="State that the model was asked to think first."),
     reasons_first: bool = typer.Option(
-        False, "--reasons-first", help="The prompt asked for reasons before the answer."
+        False, "--reasons-first", help="State that the prompt asked for reasons before the answer."
     ),
-    finish_reason: str = typer.Option("stop", help="Why the engine stopped: stop, length or error."),
+    finish_reason: str = typer.Option(
+        "stop", help="Why the engine stopped: stop (it was done), length (token limit) or error."
+    ),
     as_json: options.Json = False,
 ) -> None:
-    """Parse one completion: its intent, or why it fails. Names every repair."""
+    """Parse one completion: print its intent, or why it failed.
+
+    It names every repair that the text needed.
+    """
     from harness.parsing.parse import parse
     from harness.world import scenarios
 

@@ -27,17 +27,26 @@ COLOURS = {"same": "", "removed": "red", "added": "green"}
 
 app = typer.Typer(help="List prompt versions; show, check, compare or release them.", no_args_is_help=True)
 
-Version = Annotated[str, typer.Argument(help="Prompt version.")]
-Tokenizer = Annotated[Path | None, typer.Option(help="tokenizer.json, its folder, or a Qwen2 GGUF.")]
+Version = Annotated[str, typer.Argument(help="Prompt version; `harness prompt list` shows them.")]
+Tokenizer = Annotated[
+    Path | None,
+    typer.Option(
+        help="Tokenizer to count with: a tokenizer.json, its folder, or a GGUF file with the tokenizer of "
+        "Qwen2."
+    ),
+]
 Model = Annotated[
     str | None,
-    typer.Option(help=f"Card of the model that takes an image prompt's picture. Default: {pictures.MODEL}."),
+    typer.Option(
+        help="Image prompts only: model whose picture size and picture tokens to use. "
+        f"Default: {pictures.MODEL}."
+    ),
 ]
 
 
 @app.command("list")
 def list_prompts(as_json: options.Json = False) -> None:
-    """List the prompt versions. Exit code 2 if one of them cannot be used."""
+    """List the prompt versions, released or draft. Exit code 2 if one of them cannot be used."""
     from harness.prompts import versions as prompts
 
     fields = ("version", "released", "sha256", "description", "changed", "known_failures")
@@ -64,15 +73,19 @@ def list_prompts(as_json: options.Json = False) -> None:
 def show(
     version: Version,
     scene: str = typer.Option(..., help="Scene id, such as 00003-0."),
-    viewer: str | None = typer.Option(None, help="Vehicle id. Default: every viewer."),
+    viewer: str | None = typer.Option(
+        None, help="Vehicle that is asked, such as v1 (the ego). Default: every viewer."
+    ),
     dataset: options.Dataset = resources.DATASET,
     model: Model = None,
-    out: Path | None = typer.Option(None, help="Folder for an image prompt's pictures, as PNG files."),
+    out: Path | None = typer.Option(
+        None, help="Image prompts only: folder to write the pictures to, as PNG files."
+    ),
     as_json: options.Json = False,
 ) -> None:
-    """Print exactly what a model is sent for a scene. Its own chat template is not applied.
+    """Print exactly what a model is sent about a scene.
 
-    A picture is drawn where the terminal has colours.
+    Its chat template is not applied yet. Pictures are drawn if the terminal has colours.
     """
     from harness.dataset import load
     from harness.prompts import versions as prompts
@@ -113,11 +126,18 @@ def show(
 @app.command()
 def examples(
     version: Version,
-    scenario: Annotated[str, typer.Option(help="Scenario that they are from.")],
-    count: Annotated[int, typer.Option(help="How many for each role, each of a layout of its own.")] = 2,
-    first_seed: Annotated[int, typer.Option(help="Layout seed of the first.")] = FIRST["train"],
+    scenario: Annotated[str, typer.Option(help="Scenario to take the examples from.")],
+    count: Annotated[
+        int, typer.Option(help="Number of examples for each role, each from a layout of its own.")
+    ] = 2,
+    first_seed: Annotated[
+        int, typer.Option(help="Layout seed of the first example; train seeds are 100000 to 199999.")
+    ] = FIRST["train"],
 ) -> None:
-    """Give a draft earlier turns, answered as the trees ask for."""
+    """Add examples to a draft: earlier turns of the chat.
+
+    They are answered as the decision trees show to be right.
+    """
     from harness.prompts import versions as prompts
     from harness.prompts.examples import EXAMPLES, text_of
 
@@ -146,11 +166,12 @@ def check(
     model: Model = None,
     as_json: options.Json = False,
 ) -> None:
-    """Render every prompt of every scene and count tokens. Exit code 1 if one is outside the budget.
+    """Render every prompt of every scene and count its tokens. Exit code 1 if one is outside the budget.
 
-    The ego's fusion call is rendered with the messages of one helper, of two, and of all. A repair turn is
-    counted with the longest answer that a role may give. A picture counts as the model's card says; exit code
-    1, too, if the model's own image processor is here and makes other tokens of it.
+    The ego's fusion call is rendered with the messages of one helper, of two helpers, and so on to all. A
+    repair turn is counted with the longest answer that a role may give. A picture counts as many tokens as
+    the model's card says; the exit code is also 1 if the model's own image processor is installed and makes
+    another number.
     """
     from harness.backends.tokens import counter, spread_of
     from harness.dataset import load
@@ -228,17 +249,19 @@ def check(
 
 @app.command()
 def diff(
-    a: Annotated[str, typer.Argument(help="Prompt version.", metavar="A")],
-    b: Annotated[str, typer.Argument(help="The version that is compared with it.", metavar="B")],
-    scene: str | None = typer.Option(None, help="Scene id, such as 00003-0. Default: the dataset's first."),
+    a: Annotated[str, typer.Argument(help="Prompt version to compare with.", metavar="A")],
+    b: Annotated[str, typer.Argument(help="Prompt version to compare.", metavar="B")],
+    scene: str | None = typer.Option(
+        None, help="Scene to render, such as 00003-0. Default: the dataset's first."
+    ),
     dataset: options.Dataset = resources.DATASET,
     tokenizer: Tokenizer = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show what differs between two versions, word by word.
+    """Show what differs between two prompt versions, word by word.
 
-    Their settings, their templates, and what a model is sent of a scene: the ego, its first helper, and the
-    ego with a message of every helper.
+    It compares their settings, their templates, and what a model is sent about one scene: as the ego, as its
+    first helper, and as the ego with a message from every helper.
     """
     from harness.backends.tokens import counter
     from harness.dataset import load
@@ -289,7 +312,7 @@ def _changed(what: str, text: "TextChange") -> None:
 
 @app.command()
 def lock(version: Version) -> None:
-    """Release a version, so that changing its text is an error."""
+    """Release a prompt version: any later change of it is an error."""
     from harness.prompts import versions as prompts
 
     if prompts.load(version).released:

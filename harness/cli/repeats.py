@@ -33,8 +33,8 @@ def check(spec: "Spec", repeats: int) -> None:
         )
     if spec.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: its own first runs would keep the machine busy; measure once without "
-            "--repeats, and give the seconds that its run.json has"
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            "once without --repeats, and give the seconds that its run.json has"
         )
 
 
@@ -106,7 +106,7 @@ def _show(done: "Repeats") -> None:
         text.print(sentence)
     text.print(
         f"{k} repeats × {len(m.seeds)} channel seeds of {len(done.runs[0].grid.episodes)} episodes; flip: "
-        "share of pairs of repeats that decide otherwise where both came, n decision points; pass^k: all k "
-        "succeed; any@k: one or more; variance between: of success, between episodes; 95 % intervals, over "
-        "episodes"
+        "share of pairs of repeats that decide differently at a decision point that both reached; n: "
+        "decision points; pass^k: all k repeats succeed; any@k: one or more do; variance between: share of "
+        "the variance of success that lies between episodes; 95 % intervals over episodes"
     )

@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 def command(
     runs: options.Runs,
-    out: Path | None = typer.Option(None, help="File to write. Default, for one run: RUN/report.html."),
+    out: Path | None = typer.Option(
+        None, help="File to write. Default: RUN/report.html; needed for several runs."
+    ),
 ) -> None:
-    """Write one HTML file about a run or suite, or several. It needs no network."""
+    """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
     typer.echo(f"wrote {write(runs, out)}")
@@ -44,7 +46,7 @@ def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:
     from harness.runs.suite import read
 
     if others := [folder for folder in folders if not (folder / SUITE).is_file()]:
-        raise UserError(f"{printable(others[0])} is no suite, and others are; report them apart")
+        raise UserError(f"{printable(others[0])} is no suite, but others are; write separate reports")
     with bar("reading datasets", quiet=quiet):
         suites = [(each, suite.lines(each)) for each in map(read, dict.fromkeys(folders))]
     return suite.write(suites, out or folders[0] / "report.html")

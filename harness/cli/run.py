@@ -213,11 +213,11 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterat
     yield from energy(m, lambda condition, metric: figures.get((condition, metric)))
     for role, took in m.answer_times.items():
         low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        yield f"{role} answers took {half} ms (5-95 %: {low} to {high}, n = {took.n}); not used"
+        yield f"{role} answers took {half} ms (5-95 %: {low} to {high}, n = {took.n}); not used as latency"
     if m.cached_answers:
-        yield f"{m.cached_answers} answers came from the cache (--no-cache asks anew)"
+        yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
     if m.engine_errors:
-        yield f"{m.engine_errors} answers are errors of the engine; answers.jsonl has its messages"
+        yield f"{m.engine_errors} answers are engine errors; answers.jsonl has the error messages"
     if m.retries:
         yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
     for role in ("ego", "helper", "merge", "blind"):

@@ -20,7 +20,7 @@ app = typer.Typer(help="List scenarios, show one, drive or audit it.", no_args_i
 
 @app.command("list")
 def list_scenarios(as_json: options.Json = False) -> None:
-    """List the scenarios."""
+    """List the scenarios, each with a summary."""
     from harness.world import scenarios
 
     rows = [{"name": name, "summary": scenarios.get(name).summary} for name in scenarios.names()]
@@ -33,7 +33,7 @@ def list_scenarios(as_json: options.Json = False) -> None:
 
 @app.command()
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
-    """Print a scenario's actions and parameters. Each parameter has its meaning and value."""
+    """Print a scenario's actions and its parameters, with meanings."""
     from harness.cli.docstrings import echo_fields
     from harness.world import scenarios
 
@@ -53,12 +53,15 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     name: options.Scenario,
-    episodes: int = typer.Option(500, help="Episodes to drive, each by every driver."),
+    episodes: int = typer.Option(500, help="Number of episodes; every driver drives each."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Drive the reference drivers and show how episodes end. All drive the same episodes."""
+    """Let the reference drivers drive, and show how episodes end.
+
+    All drive the same episodes.
+    """
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     from harness.world import reference as live
 
@@ -73,15 +76,21 @@ def check(
 @app.command()
 def audit(
     name: options.Scenario,
-    layouts: int = typer.Option(300, help="Layouts to look at."),
-    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first."),
+    layouts: int = typer.Option(300, help="Number of layouts to look at."),
+    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first layout; the others follow."),
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
-    """Try to tell the hidden danger from what the ego sees. Exit code 1 if that can be done."""
+    """Test whether the ego's view gives the hidden danger away. Exit code 1 if it does.
+
+    A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
+    """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
     if scenario.start:
-        raise UserError(f"{printable(name)} is an environment, of which no danger is known: nothing to audit")
+        raise UserError(
+            f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
+            "give a scenario"
+        )
     from harness.world.audit import audit as run
 
     with bar(f"auditing {name}", layouts, as_json) as progress:
@@ -150,7 +159,7 @@ def _print(found: "Audit") -> None:
     from harness.world.audit import MOST_AUC
 
     table(
-        ("can be told", "AUC [95 % CI]"),
+        ("predicted from the ego's view", "AUC [95 % CI]"),
         [(question, interval(auc.value, auc.low, auc.high, 1.0, 2)) for question, auc in found.auc.items()],
     )
     text = console()
@@ -159,6 +168,6 @@ def _print(found: "Audit") -> None:
     if not found.tells:
         text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
         return
-    text.print(f"it tells: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
+    text.print(f"a tell: {found.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
     for name, lost in found.told_by.items():
         text.print(f"  {lost:.2f} {name}")

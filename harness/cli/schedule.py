@@ -13,20 +13,29 @@ from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import shown
 
-app = typer.Typer(help="Compare whom to ask and when, or learn it.", no_args_is_help=True)
+app = typer.Typer(help="Compare schedules (whom to ask, and when), or learn one.", no_args_is_help=True)
 
-TrainRuns = typer.Argument(help="Folders of finished runs on train layouts.", metavar="RUN...")
+TrainRuns = typer.Argument(
+    help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."
+)
 
 
 @app.command()
 def learn(
     runs: list[Path] = TrainRuns,
-    tune: list[Path] = typer.Option(..., help="Run on tune layouts, to choose the threshold on. Repeatable."),
-    condition: str = typer.Option("6g:max_helpers=1", help="Operating point to learn it for."),
-    out: Path = typer.Option(..., help="File to write: schedules/NAME.toml makes it schedule NAME."),
+    tune: list[Path] = typer.Option(
+        ..., help="Run on tune layouts (seeds 0 to 99999), to choose the threshold on. Repeatable."
+    ),
+    condition: str = typer.Option("6g:max_helpers=1", help="Operating point to learn the schedule for."),
+    out: Path = typer.Option(
+        ..., help="File to write; schedules/NAME.toml makes it usable as schedule NAME."
+    ),
     quiet: options.Quiet = False,
 ) -> None:
-    """Learn what asking a helper is worth, from runs on train layouts."""
+    """Learn a schedule: what asking a helper is worth.
+
+    It learns from runs on train layouts, and chooses the threshold on tune layouts.
+    """
     from harness.coordination.operating_point import named_point
     from harness.studies.learning import ROUNDS, run_learn
     from harness.studies.stored import Stored
@@ -51,20 +60,34 @@ def learn(
 def compare(
     runs: options.Runs,
     tune: list[Path] = typer.Option(
-        [], help="Run on tune layouts, to choose settings on; one for each run, in order."
+        [],
+        help="Run on tune layouts (seeds 0 to 99999), to choose each schedule's settings on. Give one for "
+        "each RUN, in the same order.",
     ),
-    condition: str = typer.Option("6g", help="Operating point, whose schedule is replaced."),
-    budget: float = typer.Option(0.5, help="Share of the paper's messages that a setting may take."),
-    schedule: list[str] | None = typer.Option(None, help="Schedule. Repeatable. Default: all."),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
-    latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
-    out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/schedules."),
+    condition: str = typer.Option("6g", help="Operating point to play each schedule in."),
+    budget: float = typer.Option(
+        0.5,
+        help="Most messages that a chosen setting may take, as a share of what the paper's schedule takes.",
+    ),
+    schedule: list[str] | None = typer.Option(
+        None, help="Schedule to compare, such as entropy, margin or learnt. Repeatable. Default: all."
+    ),
+    seeds: str | None = typer.Option(None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's."),
+    latency: str = typer.Option(
+        "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: RUN/schedules, in the first run's folder."
+    ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare schedules on stored answers, between asking nobody and an oracle.
+    """Compare schedules (whom to ask, and when) on stored answers.
 
-    The model is asked only about decision points to which the run has not come; the run keeps the answers.
+    The bounds are asking nobody and an oracle, which knows how every course ends.
+
+    The model is asked only about decision points that the run did not reach; the run's folder keeps those
+    answers.
     """
     from harness.coordination.schedules import SCHEDULES
     from harness.studies.learning import layouts
@@ -124,7 +147,7 @@ def compare(
         for sentence in in_sentences(run):
             text.print(printable(sentence, 400))
     text.print(
-        "helpers asked at most and threshold follow a schedule's name; 95 % intervals over episodes, paired; "
-        "costs, p, areas and random at equal messages are on the page"
+        "after a schedule's name: the most helpers it asks, and its threshold; 95 % intervals over episodes, "
+        "paired; the page also has costs, p, areas, and random with as many messages"
     )
     typer.echo(f"wrote {printable(page)}")

@@ -38,8 +38,8 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     first = specs[0]
     if first.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: its own first runs would keep the machine busy; measure on one dataset, "
-            "and give the seconds that its run.json has"
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            "on one dataset, and give the seconds that its run.json has"
         )
     for agent in first.agents:
         if not agent.can.closed_loop:
@@ -123,9 +123,9 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         ],
     )  # fmt: skip
     text.print(
-        f"n: episodes, each × {len(done.manifest.seeds)} channel seeds; seeds: what the layouts are for; "
-        "intervals over episodes; gains paired; the mean weights families alike, and its interval is of "
-        "other episodes of these families"
+        f"n: episodes, each × {len(done.manifest.seeds)} channel seeds; seeds: what the layout seeds are "
+        "for; 95 % intervals over episodes; gains are paired; the mean gives each family the same weight, "
+        "and its interval is about other episodes of these families, not about other families"
     )
     for note in origins(done.manifest, {(s.condition, s.metric): s for s in done.scores}):
         text.print(note)

@@ -20,26 +20,41 @@ def command(
     runs: options.Runs,
     over: list[str] | None = typer.Option(
         None,
-        help="What varies: tau, loss (share), size (vehicles), latency (ms), window (ms), consensus, or any "
-        "setting of an operating point by its name; repeatable. Default: the paper's panels.",
+        help="Setting to vary: tau (nats), loss (0 to 1), size (vehicles), latency (ms), window (ms), "
+        "consensus, or any other setting of an operating point by its name. Repeatable. Default: the "
+        "paper's panels.",
     ),
     grid: list[str] | None = typer.Option(
-        None, help="Values of each --over in order: 0,10,20 or from:to:step. Default: the usual ones."
+        None,
+        help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same order. "
+        "Default: the axis's usual values.",
     ),
     condition: list[str] = typer.Option(
-        ["6g"], help="Operating point that is varied, or a change of one: 6g:on_demand=true. Repeatable."
+        ["6g"],
+        help="Operating point to vary, or one with changed settings: 6g:on_demand=true. Repeatable.",
     ),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's."),
-    latency: str = typer.Option("run", help="Inference times: the run's own, or paper (145 ms)."),
+    seeds: str | None = typer.Option(None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's."),
+    latency: str = typer.Option(
+        "run", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
+    ),
     no_model: bool = typer.Option(
-        False, "--no-model", help="Leave out walks to decision points that the run has no answer for."
+        False,
+        "--no-model",
+        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
     ),
-    proxy: bool = typer.Option(False, "--proxy", help="Draw the calibrated proxy beside the runs."),
-    out: Path | None = typer.Option(None, help="Folder to write. Default: RUN/sweep-AXES."),
+    proxy: bool = typer.Option(
+        False, "--proxy", help="Also draw the calibrated proxy, which plays the paper's study."
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: RUN/sweep-AXES, in the first run's folder."
+    ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Score stored answers at other operating points. The model is asked only what the run has not."""
+    """Score a run's stored answers at other operating points.
+
+    The model is asked only where the run has no answer.
+    """
     from harness.studies.axes import axis_of
     from harness.studies.axes import grid as values_of
     from harness.studies.calibrated import Calibrated
@@ -50,7 +65,10 @@ def command(
     axes = [axis_of(name) for name in dict.fromkeys(over or ())]
     given: list[str | None] = [*(grid or ())]
     if len(given) > len(axes):
-        raise UserError(f"--grid: {len(given)} given for {len(axes)} of --over; give one for each, in order")
+        raise UserError(
+            f"--grid: {len(given)} given for {len(axes)} of --over; give one for each --over, in the same "
+            "order"
+        )
     if latency not in ("run", "paper"):
         raise unknown("--latency", latency, ("run", "paper"))
     grids = [values_of(axis, text) for axis, text in zip(axes, [*given, *[None] * len(axes)], strict=False)]
@@ -73,8 +91,8 @@ def command(
         for source in stored:
             if left := source.left_out:
                 typer.echo(
-                    f"{printable(source.name)}: walks to {len(left)} decision points are left out, since the "
-                    "run has no answer for them; without --no-model they are asked"
+                    f"{printable(source.name)}: left out episodes that reach one of {len(left)} decision "
+                    "points without a stored answer; without --no-model the model is asked there"
                 )
         typer.echo(f"wrote {printable(where / 'index.html')}")
 

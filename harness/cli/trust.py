@@ -22,19 +22,36 @@ HEADS = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %
 
 def command(
     run: Path | None = typer.Argument(
-        None, help="Folder of a finished run of `harness eval`; or give --model.", metavar="[RUN]"
+        None, help="Folder of a finished run of `harness eval`. Give this or --model.", metavar="[RUN]"
     ),
-    model: str | None = typer.Option(None, help="Model to evaluate first, on the default dataset."),
+    model: str | None = typer.Option(
+        None, help="Model to evaluate first, on the default dataset, instead of RUN."
+    ),
     prompt: options.ScenarioPrompt = None,
     attacks: str = typer.Option(
-        "all", help="Attacks, such as liar,liar+spoof,stale:decisions=2. `harness trust --help` lists them."
+        "all",
+        help="Attacks, separated by commas: liar, stuck, stale, replay, spoof, sybil, flood, brake, silent, "
+        "overconfident, random, injection, jump or absent. + combines some, and a colon changes a setting: "
+        "liar+spoof,stale:decisions=2. all: the usual ones.",
     ),
-    rules: str = typer.Option("all", help="Consensus rules, such as median,trust,linear:weight_cap=0.3."),
-    share: str = typer.Option("0,1/3,2/3", help="Shares of the helpers that attack; 0 is always played."),
-    condition: str = typer.Option("6g", help="Operating point that is attacked, or a change of one."),
-    seeds: str | None = typer.Option(None, help="Seeds of the channel. Default: the run's, else 0:5."),
+    rules: str = typer.Option(
+        "all",
+        help="Consensus rules, separated by commas: linear, log-pool, median, trimmed-mean, trimmed-heads, "
+        "geometric-median, centred-clipping, bayes or trust; linear:weight_cap=0.3 changes a setting.",
+    ),
+    share: str = typer.Option(
+        "0,1/3,2/3", help="Shares of the helpers that attack, 0 to 1; 0 is always played as well."
+    ),
+    condition: str = typer.Option(
+        "6g", help="Operating point to attack, or one with changed settings: 6g:max_helpers=1."
+    ),
+    seeds: str | None = typer.Option(
+        None, help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's, or 0:5 with --model."
+    ),
     no_model: bool = typer.Option(
-        False, "--no-model", help="Leave out walks to decision points that the run has no answer for."
+        False,
+        "--no-model",
+        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
     ),
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/trust, or reports/trust-<model>-<prompt>-<dataset>."
@@ -44,7 +61,8 @@ def command(
 ) -> None:
     """Play every attack against every consensus rule.
 
-    The model is asked only what the run has not. The same command continues a study that was stopped.
+    The model is asked only where the run has no answer. If the study is stopped, the same command continues
+    it.
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
@@ -59,7 +77,7 @@ def command(
     chosen = names_of("--attacks", attacks, USUAL, tuple(ATTACKS))
     ways, parts = names_of("--rules", rules, (*RULES, CAPPED), tuple(RULES)), shares_of(share)
     if (run is None) == (model is None) or (run and prompt):
-        raise UserError("give RUN, a finished run's folder, or a --model with its --prompt: one of the two")
+        raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
     with bar("rules under attack", quiet=as_json or quiet) as progress:
         if model is not None:
             spec = _spec(model, prompt, condition, seeds)
@@ -92,8 +110,8 @@ def command(
         table(HEADS, rows)
     n = bench.price(bench.rules[0]).n
     typer.echo(
-        f"n = {n} episodes × {len(draws)} seeds; intervals over episodes; price: points of\n"
-        "success against linear while nobody attacks, paired"
+        f"n = {n} episodes × {len(draws)} channel seeds; 95 % intervals over episodes; price:\n"
+        "difference in success from linear while nobody attacks, in points, paired"
     )
     typer.echo(f"wrote {printable(page)}")
 

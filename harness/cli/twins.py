@@ -26,12 +26,14 @@ def command(
     engine: options.Engine = None,
     prompt: options.ScenarioPrompt = None,
     dataset: options.Dataset = resources.DATASET,
-    twin: list[str] | None = typer.Option(None, help="Twin to ask about. Repeatable. Default: all."),
-    limit: int | None = typer.Option(None, help="The first so many episodes."),
-    sample: int | None = typer.Option(
-        None, help=f"How many episodes to draw. Default: {EPISODES}, or all there are."
+    twin: list[str] | None = typer.Option(
+        None, help="Twin to ask, such as mirrored or paraphrase. Repeatable. Default: all."
     ),
-    sample_seed: int = typer.Option(0, help="Seed of the draw of episodes and decision points."),
+    limit: int | None = typer.Option(None, help="Use only this many episodes, from the first."),
+    sample: int | None = typer.Option(
+        None, help=f"Number of episodes to draw at random. Default: {EPISODES}, or all if there are fewer."
+    ),
+    sample_seed: int = typer.Option(0, help="Seed of this draw, and of that of their decision points."),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     batch_size: options.BatchSize = 8,
@@ -40,8 +42,9 @@ def command(
     dtype: options.Dtype = None,
     fail_if: list[str] | None = typer.Option(
         None,
-        help="Gate: '[TWIN:]METRIC[.low|.high] OP NUMBER' with invariance_rate, tv_distance or failed_rate, "
-        "in every role; shares from 0 to 1. Repeatable. Exit code 1 if one fails.",
+        help="Gate: '[TWIN:]METRIC[.low|.high] OP NUMBER'. It fails where that is true in any role: "
+        "'mirrored:invariance_rate < 0.9'. METRIC is invariance_rate, tv_distance or failed_rate, each from "
+        "0 to 1; .low and .high are the ends of the 95 % interval. Repeatable. Exit code 1 if a gate fails.",
     ),
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: reports/<model>-<prompt>-twins-<dataset>."
@@ -50,9 +53,11 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Test what must hold of the answers to a question and its twin.
+    """Test whether answers to a question and its twin agree.
 
-    The same command continues one that was stopped.
+    A twin is the same question put otherwise: mirrored, in other units, in other words. So what must hold of
+    both answers is known without knowing the right one. If the study is stopped, the same command
+    continues it.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
@@ -109,8 +114,9 @@ def command(
         table(HEADS, map(_cells, rows))
         typer.echo(
             f"{page.decision_points(study)} decision points of {len(source.dataset.episodes)} episodes; "
-            "intervals over episodes\n"
-            "n: questions that the twin changes; fail%: an answer failed, so nothing holds"
+            "95 % intervals over episodes\n"
+            "n: questions that the twin changes; fail%: share with a failed answer, which\n"
+            "count as not holding"
         )
         gated = (judged(verdict, "-") for verdict in verdicts)
         for said in (scoring.headline(rows), *page.notes(study, rows), *gated):

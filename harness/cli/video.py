@@ -9,12 +9,17 @@ from harness.cli.progress import bar
 
 def command(
     run: Path = typer.Argument(help="Folder of a finished run of `harness drive`."),
-    episode: int = typer.Argument(help="Number of the episode."),
-    condition: str | None = typer.Option(None, help="Operating point. Default: the run's last."),
-    seed: int | None = typer.Option(None, help="Channel seed. Default: the run's first."),
-    out: Path = typer.Option(Path("episode.gif"), help="File: .gif, or .mp4 with the extra `video`."),
+    episode: int = typer.Argument(help="Number of the episode, from 0."),
+    condition: str | None = typer.Option(None, help="Condition to draw. Default: the run's last."),
+    seed: int | None = typer.Option(None, help="Channel seed to draw. Default: the run's first."),
+    out: Path = typer.Option(
+        Path("episode.gif"), help="File to write: .gif, or .mp4 if the extra `video` is installed."
+    ),
 ) -> None:
-    """Draw an episode of a closed-loop run as a video. Shows sight, messages and the ego's policy."""
+    """Draw an episode of a closed-loop run as a video.
+
+    It shows what is in sight, messages and the ego's policy.
+    """
     from harness.evaluate.replay import find, stills
     from harness.report.drawing.video import check, write_video
 

@@ -10,10 +10,10 @@ from harness.cli import options
 
 def command(
     folder: options.Reports = Path("reports"),
-    port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 takes a free one."),
-    open_browser: bool = typer.Option(False, "--open", help="Open it in the browser."),
+    port: int = typer.Option(7654, help="Port on 127.0.0.1; 0 picks a free one."),
+    open_browser: bool = typer.Option(False, "--open", help="Also open the page in the browser."),
 ) -> None:
-    """Show runs and studies in a browser: list, open, compare. Serves this machine only, until Ctrl-C."""
+    """List, open and compare runs and studies in a browser. Only this machine is served, until Ctrl-C."""
     from harness.report.view.serve import serve
     from harness.runs.listing import runs
 

@@ -361,7 +361,7 @@ def _attack(text: str) -> Attack:
         raise UserError(f"attack {printable(text)}: a setting is given twice; give it once")
     usual = ATTACKS[name]
     if "share" not in settable(usual):
-        raise UserError(f"attack {printable(name)} has no share; mend or uninstall the package that has it")
+        raise UserError(f"attack {printable(name)} has no share; fix or uninstall the package that has it")
     return changed(usual, values, f"attack {name}")
 
 

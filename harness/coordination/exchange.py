@@ -252,7 +252,7 @@ def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
         ego_s = point.round_trip_s
     elif point.network:
         if draws.trips is None:
-            raise UserError("round_trip needs layouts, which the paper's study has not; take round_trip_s")
+            raise UserError("round_trip needs layouts, and the paper's study has none; give round_trip_s")
         ego_s = ego_s + point.network.round_trip_s(draws.of(".cloud").wait)
     return np.insert(intents.inference_s[..., 1:], 0, ego_s, axis=-1)
 

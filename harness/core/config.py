@@ -53,7 +53,7 @@ def toml(path: Path, where: str) -> dict[str, Any]:
         return loads(text_of(path), where)
     except (OSError, UnicodeDecodeError) as error:
         reason = printable(getattr(error, "strerror", None) or error)
-        raise UserError(f"{where} is no TOML: {reason}; mend the file") from None
+        raise UserError(f"{where} is no TOML: {reason}; fix the file") from None
 
 
 def loads(text: str, where: str) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def loads(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # too many digits, and brackets, among them
-        raise UserError(f"{where} is no TOML: {printable(error)}; mend the file") from None
+        raise UserError(f"{where} is no TOML: {printable(error)}; fix the file") from None
 
 
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:

@@ -89,8 +89,8 @@ class Tasks:
             self._nodes.pop(next(iter(self._nodes)))
         elif repr(found[2]) != before:
             raise UserError(
-                f"{printable(self._named(place))} came out otherwise on node {name} than on node {found[1]}; "
-                "find out which is right, and leave out the other"
+                f"{printable(self._named(place))} came out differently on node {name} than on node "
+                f"{found[1]}; find out which is right, and leave out the other"
             )
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ def _got(task: Any) -> tuple[str, str, Any] | None:
         if isinstance(cause, Exception) and not isinstance(cause, exceptions.RayError):
             raise cause from error
         said = printable(str(cause or error).partition("\n")[0])  # such as a package that a node lacks
-        raise UserError(f"--workers ray: {said}; mend the cluster's nodes, or use processes") from None
+        raise UserError(f"--workers ray: {said}; fix the cluster's nodes, or use processes") from None
     return found
 
 

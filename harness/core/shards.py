@@ -137,7 +137,7 @@ def owners(
         for name, part in mine.items():
             if name in found and _content(part) != _content(found[name]):
                 raise UserError(
-                    f"{printable(named(name))} came out otherwise in {printable(folder)} than in "
+                    f"{printable(named(name))} came out differently in {printable(folder)} than in "
                     f"{printable(found[name].parents[1])}; find out which is right, and leave out the other"
                 )
             found[name] = part

@@ -56,7 +56,7 @@ class Selection:
             numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
         if not numbers:
             shown = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
-            raise UserError(f"{shown}: no episode of {printable(dataset.name)} is so; give others")
+            raise UserError(f"{shown}: no episode of {printable(dataset.name)} matches; give other values")
         return dataset.of_episodes(frozenset(numbers[: self.limit]))
 
 

@@ -59,7 +59,10 @@ class Agent:
             modes = " or ".join(self.can.answer_modes)
             raise UserError(f"--answer {self.answer}: {name} {reason}; use {modes}")
         if self.answer != "json" and self.thinking:
-            raise UserError(f"--answer {self.answer}: {name} thinks first, which only json leaves room for")
+            raise UserError(
+                f"--answer {self.answer}: {name} thinks first, and only json leaves room for that; use "
+                "--answer json"
+            )
 
     @property
     def can(self) -> Capabilities:
@@ -140,7 +143,7 @@ def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[s
         if said.status is not Status.STRICT or said.intent is None:
             raise UserError(
                 f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "
-                f"model should state it ({said.status}: {said.detail}); mend it"
+                f"model should state it ({said.status}: {said.detail}); fix it"
             )
         found.append(actions[said.intent.index(max(said.intent))])
     return found

@@ -60,7 +60,7 @@ class Attackers:
         if not self._attacks:
             return Said(truth, draws, nobody)
         if draws.trips is None:
-            raise UserError("attacks need layouts, which the paper's study has not; leave attack out")
+            raise UserError("attacks need layouts, and the paper's study has none; leave attack out")
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         first, past = self._remembered(truth, episodes)
         there, said, by = np.isfinite(truth.range_m), truth, nobody

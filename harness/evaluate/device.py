@@ -39,7 +39,7 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
         for rate in devices.RATES:
             if getattr(row, rate) is None:
                 raise UserError(
-                    f"{flag} states no {rate} of {printable(row.model)}, so no time follows; "
+                    f"{flag} states no {rate} of {printable(row.model)}, so it cannot time answers; "
                     "give another device, or another --device-model"
                 )
         found.append(row)

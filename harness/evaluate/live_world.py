@@ -163,7 +163,7 @@ class LiveWorld(Placed):
                 if math.isnan(latency_s):
                     raise UserError(
                         "an answer of the ego is an error of its engine, and no device profile says how long "
-                        "that takes; mend the engine, or use --latency"
+                        "that takes; fix the engine, or use --latency"
                     )
                 course.open = Decision(actions[action], begun + frames(latency_s, hz))
                 self._decisions.append(course.open)

@@ -131,7 +131,7 @@ class Spec:
         if self.helpers and lone:
             raise UserError(
                 f"--helper-model: {printable(lone[0].card.name)} is a driver, which decides for an ego "
-                "alone; give models that are none"
+                "only; give other models"
             )
         if self.latency not in (None, *NAMES):
             several = len(declared(self.latency).helpers_s)

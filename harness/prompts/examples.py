@@ -76,7 +76,7 @@ def read(text: str, where: str) -> Examples:
     try:
         table = msgspec.json.decode(text)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{where} is no JSON: {printable(error)}; mend the file") from None
+        raise UserError(f"{where} is no JSON: {printable(error)}; fix the file") from None
     if not isinstance(table, dict):
         raise UserError(f"{where} is no object; give scenario, ego and helper")
     examples = convert(table, Examples, where)

@@ -15,12 +15,12 @@ FEW = 100  # episodes; with fewer a page warns of wide intervals
 OFF_LAG = 0.5  # least share of decisions that act in another frame of which a page warns
 # By role: whose answers, and what takes their place.
 _FAILED = {
-    "ego": ("the ego's", "it drives by the fallback, and success says little of the model"),
+    "ego": ("the ego's", "it drives by the fallback, and success says little about the model"),
     "helper": ("the helpers'", "they send no message"),
     "merge": ("the fusion calls'", "the ego keeps the policy it had without them"),
 }
 _CONTROLS = {
-    "shuffled": "what helpers say in another layout. A decision's page shows what its own helpers say",
+    "shuffled": "what helpers say in another layout, while a decision's page shows what its own helpers say",
     "blind": "helpers that are shown nothing",
 }
 
@@ -55,16 +55,16 @@ def of_run(run: Run) -> Iterator[str]:
     """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
     n = len(run.grid.episodes)
     if n < FEW:
-        yield f"Only {n} episodes: a rate's interval may reach {98 / n**0.5:.0f} points to either side."
+        yield f"Only {n} episodes: the interval of a rate may reach {98 / n**0.5:.0f} points to either side."
     if run.manifest.temperature:
         yield (
-            f"Answers were drawn at temperature {run.manifest.temperature:g}, with sampling seed "
-            f"{run.manifest.sampling_seed}: another seed has others."
+            f"Answers were sampled at temperature {run.manifest.temperature:g} with sampling seed "
+            f"{run.manifest.sampling_seed}: another seed gives other answers."
         )
     retries = sum(answer.retries for answer in run.answers)
     if run.manifest.engine_errors or retries:
         errors = run.manifest.engine_errors
-        yield f"The engine stumbled: {errors} requests ended in an error, {retries} attempts were repeated."
+        yield f"The engine had errors: {errors} requests ended in one, {retries} attempts were repeated."
     for control, heard in _CONTROLS.items():
         if names := [c["name"] for c in run.manifest.conditions if c.get("messages") == control]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
@@ -73,8 +73,8 @@ def of_run(run: Run) -> Iterator[str]:
     off = [c for c in run.conditions if (s := run.score(c, "off_lag_rate")) and (s.value or 0.0) >= OFF_LAG]
     if off:
         yield (
-            f"With {', '.join(off)} most decisions take longer than these frozen scenes allow for: driving "
-            "may end otherwise (harness fidelity)."
+            f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
+            "closed-loop success may differ. harness fidelity compares the two."
         )
 
 
@@ -87,8 +87,8 @@ def on_device(manifest: Manifest) -> Iterator[str]:
         name = str(agent["model"]["name"])
         if name.partition(":")[0] != speed.model:
             yield (
-                f"Times and energy are conditional: {printable(name, 30)}'s answers, in its own tokens, at "
-                f"the speed of {printable(speed.model)} on {printable(device.name)}."
+                f"Times and energy are conditional: the token counts are those of {printable(name, 30)}, the "
+                f"speed is that of {printable(speed.model)} on {printable(device.name)}."
             )
 
 

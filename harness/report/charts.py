@@ -131,7 +131,7 @@ def replies(rows: Rows) -> Spec:
 
 def energies(rows: Rows) -> Spec:
     """What a decision takes, a stacked bar a run and condition."""
-    return _stacked(rows, "condition", "part", ENERGIES, "J of a decision", amount="joules")
+    return _stacked(rows, "condition", "part", ENERGIES, "J per decision", amount="joules")
 
 
 def reliability(rows: Rows) -> Spec:

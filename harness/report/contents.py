@@ -19,7 +19,7 @@ def size(runs: Runs) -> str:
         [run.grid.episodes for run in runs.runs], [run.grid.seeds for run in runs.runs],
     ))  # fmt: skip
     told = " or ".join(map(str, episodes)), " or ".join(map(str, seeds))
-    return f"{told[0]} episodes × {told[1]} seeds of {first.source}; 95 % intervals over episodes"
+    return f"{told[0]} episodes × {told[1]} channel seeds of {first.source}; 95 % intervals over episodes"
 
 
 def summary(run: Run) -> list[dict[str, Any]]:

@@ -203,8 +203,8 @@ def uneven(runs: Runs) -> str | None:
         f"{name}: {episodes} × {seeds}" for name, (episodes, seeds) in zip(runs.names, sizes, strict=True)
     )
     return (
-        f"The runs have not the same episodes × seeds ({each}): a success rate is over a run's own, and two "
-        "runs are compared on those that they share."
+        f"The runs have different episodes × seeds ({each}): a success rate is over the run's own, and two "
+        "runs are compared on those that both have."
     )
 
 
@@ -226,8 +226,10 @@ def headline(found: Sequence[Line]) -> str:
         if best is not None and (success := best.scores[SUCCESS]):
             close = [line.name for line in of_condition if line.mark == CLOSE]
             others = f"{len(close)} others" if len(close) > 1 else "".join(close)
-            rest = f", not told from {others}" if close else ""
+            rest = f", which cannot be told from {others}" if close else ""
             outcomes.append(f"{condition}: {best.name} {shown(success)['value']}{rest}")
         elif len(of_condition) > 1:
-            outcomes.append(f"{condition}: none, as each is behind another run or shares no episodes with it")
+            outcomes.append(
+                f"{condition}: no run, since each is behind another or shares no episodes with it"
+            )
     return f"Best under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."

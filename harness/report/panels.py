@@ -50,68 +50,75 @@ def panels(runs: Runs) -> Iterator[Panel]:
         references = _references(runs)
         yield Panel(
             "success-latency", "overview", "Success and latency",
-            "Lines through a point: 95 % intervals over episodes. Rings: what the paper reports, of other "
-            "scenes and another model. A reply that comes after the decision window is not fused." + (
-                " Dashed: reference drivers that need no model, in the same episodes." if references else ""
+            "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
+            "the paper reports, with other scenes and another model. A reply that arrives after the "
+            "decision window "
+            "is not fused." + (
+                " Dashed: reference drivers, which need no model, in the same episodes." if references else ""
             ),
             charts.success_latency(rows, references, windows_ms),
         )  # fmt: skip
     if rows := joined(statistics.statuses):
         yield Panel(
             "statuses", "answers", "How answers were read",
-            "Share of the answers of a role. Strict needed no mending, recovered was read after repairs, "
-            "the others gave no distribution.",
+            "Share of each role's answers by status. Strict: the text fits the schema as it is. Recovered: "
+            "it was read after repairs. All others failed and gave no distribution.",
             charts.statuses(rows),
         )  # fmt: skip
     if rows := joined(statistics.reliability):
         yield Panel(
             "reliability", "answers", "Is the policy as safe as it is sure?",
-            "Each point is the decisions whose fused probability of the action taken lies in one tenth: "
-            "how often that action was safe. On the dashed line the two agree; above it the policy is too"
-            " modest. A probability spread over two safe actions is no mistake, so this is not the "
-            "calibration of one label. All seeds; decisions without a safe action are left out; intervals"
-            " are over episodes.",
+            "Decisions are grouped by the probability of the chosen action in the fused policy, in steps of "
+            "a tenth; each point shows how often that action was safe. On the dashed line the two agree; "
+            "above it the policy is less sure than it could be. A probability spread over two safe actions "
+            "is no mistake, so this is not the calibration of a single label. All seeds; decisions without "
+            "a safe action are left out; 95 % intervals over episodes.",
             charts.reliability(rows),
         )  # fmt: skip
     if rows := joined(statistics.entropies):
         yield Panel(
             "entropy", "answers", "Entropy of the ego's own answers",
-            "One count an answer that could be read. Dashed: τ, above which the ego asks for help.",
+            "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, above "
+            "which the ego asks helpers.",
             charts.entropies(rows, tau_nats, statistics.ENTROPY_NATS),
         )  # fmt: skip
     if rows := joined(statistics.errors):
         yield Panel(
             "entropy-error", "answers", "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
-            "fusion. If entropy tells when the ego errs, the condition without V2V rises to the right; "
-            "what the others have less is what helpers mend. All seeds; intervals are over episodes.",
+            "fusion. If high entropy predicts errors, the line of the condition without V2V rises to the "
+            "right. How far the other lines lie below it is what the helpers correct. All seeds; 95 % "
+            "intervals over episodes.",
             charts.errors(rows, tau_nats),
         )  # fmt: skip
     if rows := joined(statistics.tokens):
         yield Panel(
             "tokens", "answers", "Length of prompts",
-            "Tokens as the engine counted them. Shaded: the paper's budget of 200 to 400.",
+            "Number of prompts by length, in tokens as the engine counted them. Shaded: the paper's budget "
+            "of 200 to 400 tokens.",
             charts.tokens(rows, BUDGET, statistics.TOKENS),
         )  # fmt: skip
     if rows := joined(statistics.replies):
         yield Panel(
-            "replies", "communication", "What became of replies",
-            "Replies that were scheduled, all seeds. On time: fused. Late: arrived after the decision "
-            "window. Lost: request or reply did not cross.",
+            "replies", "communication", "Replies on time, late and lost",
+            "Scheduled replies, all seeds. On time: the reply arrived within the decision window and was "
+            "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
             charts.replies(rows),
         )  # fmt: skip
     if rows := joined(statistics.energies):
         yield Panel(
-            "energy", "communication", "What a decision takes",
-            "Joules of inference on the declared device and of sending, mean over decisions; the total's "
-            "interval is over episodes. A helper's inference counts where it was asked. Where the radios' "
-            "part cannot be seen, asking costs energy because helpers think, not because they transmit.",
+            "energy", "communication", "Energy of a decision",
+            "Joules of inference on the declared device and of the radios, as means over decisions; the "
+            "interval is that of the total, over episodes. A helper's inference counts if the helper was "
+            "asked. If the radios' part is too small to see, asking costs energy because helpers infer, not "
+            "because they transmit.",
             charts.energies(rows),
         )  # fmt: skip
     if rows := joined(statistics.arrivals):
         yield Panel(
             "arrivals", "communication", "When replies arrive",
-            "Replies that were not lost, all seeds. Dashed: the end of the decision window.",
+            "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: the end of "
+            "the decision window.",
             charts.arrivals(rows, windows_ms, statistics.ARRIVAL_MS),
         )  # fmt: skip
 

@@ -47,18 +47,18 @@ def headline(run: Run | SuiteRun) -> str:
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    text = f"With {best} {model} clears {_success(run, best)} of the episodes"
+    text = f"Under {best}, {model} clears {_success(run, best)} of the episodes"
     if isinstance(run, SuiteRun):
         text += f" (mean over {len(run.runs)} families)"
     if not base:
         several = len(run.conditions) > 1
         return text + (", and no other condition does better." if several else ".")
-    text += f", with {base} {_success(run, base)}"
+    text += f"; under {base}, {_success(run, base)}"
     gain = run.score(best, GAIN + base)
     if gain is not None and interval(gain):
         p = p_values(run, base)
         corrected = dict(zip(p, holm(list(p.values())), strict=True))[best]
-        clear = "a clear difference" if corrected <= LEVEL else "this may be chance"
+        clear = "a clear difference" if corrected <= LEVEL else "the difference may be chance"
         text += f": {clear}"
     return text + "."
 
@@ -79,11 +79,11 @@ def figures(run: Run) -> list[dict[str, str]]:
     """The few numbers of a run that are read first, each with what it is and its interval."""
     best, base = compared(run)
     wanted = [
-        (f"success with {best}", run.score(best, SUCCESS)),
-        (f"more than with {base}", run.score(best, GAIN + base) if base else None),
-        (f"end unsafe with {best}", run.score(best, "unsafe_rate")),
-        (f"latency of a decision with {best}", run.score(best, LATENCY)),
-        ("of the ego's answers could not be read", run.score(metrics.ALL, "failed_rate_ego")),
+        (f"success under {best}", run.score(best, SUCCESS)),
+        (f"gain over {base}", run.score(best, GAIN + base) if base else None),
+        (f"unsafe episodes under {best}", run.score(best, "unsafe_rate")),
+        (f"latency of a decision under {best}", run.score(best, LATENCY)),
+        ("ego's answers that could not be read", run.score(metrics.ALL, "failed_rate_ego")),
     ]
     return [{"what": what, **shown(score)} for what, score in wanted if score is not None]
 
@@ -115,11 +115,11 @@ def _success(run: Run | SuiteRun, condition: str) -> str:
 def latency_source(latency: Latency) -> str:
     """Where the inference time comes from, and how long it is."""
     source = {
-        "measured": "measured where it ran, before the run",
+        "measured": "measured on the machine of the run, before it",
         "card": "stated by the model card, not measured here",
         "paper": "the paper's, not measured here",
-        "declared": "declared by who ran it, not measured here",
-        "device": "each answer's own, by its tokens, on a declared device",
+        "declared": "declared by the user, not measured here",
+        "device": "computed for each answer from its tokens, on a declared device",
     }[latency.source]
     if latency.ego_s is None or latency.fusion_s is None:
         return f"{source} ({latency.basis})"
@@ -142,8 +142,8 @@ def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[s
         if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
             joules = with_interval(total.value, total.low, total.high)
             yield (
-                f"{printable(name)}: {joules} J a decision; helpers think for {helpers.value:.1f} J, "
-                f"radios send for {radio.value:.3g} mJ"
+                f"{printable(name)}: {joules} J per decision, of which the helpers' inference takes "
+                f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
             )
 
 
@@ -153,7 +153,7 @@ def answer_times(times: Mapping[str, Times]) -> str:
     for role, took in times.items():
         low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
         told.append(f"{role} {half} ms (5 to 95 %: {low} to {high}; n = {took.n})")
-    return ", ".join(told) or "not known, since no answer was asked alone"
+    return ", ".join(told) or "unknown, since no answer was asked alone"
 
 
 def pace(m: Manifest) -> Iterator[str]:

@@ -121,7 +121,7 @@ def _one(path: str, root: str) -> Listed | None:
         try:
             begun = _json(path, WORK, CONFIG)
             kind = KINDS[begun["settings"]["world"]["kind"]]
-            made = Listed("", kind, "unfinished", _date(begun["created"]), "the same command goes on")
+            made = Listed("", kind, "unfinished", _date(begun["created"]), "the same command continues it")
             return _described(made, {**begun["settings"], "tags": begun["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")

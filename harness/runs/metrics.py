@@ -78,83 +78,93 @@ def _column(name: str) -> Callable[[Columns], Floats]:
 METRICS = {
     metric.name: metric
     for metric in (
-        _ends(SUCCESS, "episodes in which the ego clears the intersection, no later than the allowance",
+        _ends(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
               _field("success")),
-        _ends("unsafe_rate", "episodes that end in a collision, by time-out or off the road",
+        _ends("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
               lambda e: not e.success and e.failure != "late"),
-        _ends("collision_rate", "episodes that end in a collision", _fails("collision")),
-        _ends("at_fault_rate", "episodes that end in a collision in which the ego should have given way",
+        _ends("collision_rate", "share of episodes that end in a collision", _fails("collision")),
+        _ends("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
               lambda e: e.fault == "ego"),
-        _ends("late_rate", "episodes cleared, but too long after the full-view driver", _fails("late")),
-        _ends("time_out_rate", "episodes in which the ego does not clear the intersection in time",
+        _ends("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
+              _fails("late")),
+        _ends("time_out_rate", "share of episodes in which time runs out before the ego clears the "
+              "intersection",
               _fails("time_out")),
-        _ends("off_road_rate", "episodes in which the ego leaves the road", _fails("off_road")),
-        Metric("regret_rate", "decisions that gave success away, of those in which it was still possible",
+        _ends("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
+        Metric("regret_rate", "share of decisions that gave success away, of those in which it was still "
+               "possible",
                _column("regret"), world="frozen"),
-        Metric("delay_s", "by which a decision that is safe puts off the earliest success",
+        Metric("delay_s", "time that a safe decision adds to the earliest possible success",
                _column("delay_s"), world="frozen"),
-        Metric("off_lag_rate", "decisions that would act in another frame than the dataset's lag",
+        Metric("off_lag_rate", "share of decisions so fast or slow that they would act in another frame "
+               "than the dataset assumes",
                _column("off_lag"), world="frozen"),
-        Metric("time_to_clear_s", "until the ego has cleared the intersection, where it does, late or not",
+        Metric("time_to_clear_s", "time until the ego has cleared the intersection; only episodes in which "
+               "it does, late or not",
                episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
         Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision",
                episodes=_field("least_gap_m")),
-        Metric("hard_brakings_per_episode", "times the ego begins to brake harder than 4 m/s²",
+        Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",
                episodes=_field("hard_brakings")),
-        Metric("other_crashes_per_episode", "vehicles that crash without the ego",
+        Metric("other_crashes_per_episode", "number of vehicles that crash without the ego",
                episodes=_field("other_crashes")),
-        Metric("decisions_per_episode", "decisions begun", episodes=_field("decisions")),
-        Metric("skipped_per_episode", "decisions not begun, since the one before was still open",
+        Metric("decisions_per_episode", "number of decisions begun", episodes=_field("decisions")),
+        Metric("skipped_per_episode", "number of decisions not begun because the one before was still open",
                episodes=_field("skipped"), world="closed-loop"),
-        Metric("never_acted_per_episode", "decisions that were not ready before the episode ended",
+        Metric("never_acted_per_episode", "number of decisions that were not ready when the episode ended",
                episodes=_field("never_acted"), world="closed-loop"),
-        Metric("messages_per_episode", "replies scheduled; the request is none", _column("messages"),
+        Metric("messages_per_episode", "number of scheduled replies; requests do not count",
+               _column("messages"),
                total=True),
-        Metric("requests_per_episode", "requests broadcast, one for all helpers that are asked together",
+        Metric("requests_per_episode", "number of broadcast requests; one request asks several helpers",
                _column("requests"), total=True),
-        Metric("bits_per_episode", "requests and scheduled replies together",
+        Metric("bits_per_episode", "bits of all requests and scheduled replies",
                lambda d: d["request_bits"] + d["reply_bits"], total=True),
-        Metric("airtime_ms", "how long an episode's requests and scheduled replies occupy the medium in all",
+        Metric("airtime_ms", "total time on air of an episode's requests and scheduled replies",
                _column("airtime_ms"), total=True),
         Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
                _column("busy_ratio"), optional=True),
-        Metric("energy_j", "of a decision: inference of the ego, of the helpers asked and of a fusion call, "
-               "and what their radios draw; known with a device profile",
+        Metric("energy_j", "energy of a decision: inference of the ego, of the asked helpers and of a "
+               "fusion call, and their radios; known only with a device profile",
                lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
-        Metric("helpers_j", "part of it that the helpers' inference takes", _column("helpers_j"),
+        Metric("helpers_j", "energy of a decision: the part of the helpers' inference", _column("helpers_j"),
                optional=True),
-        Metric("radio_mj", "part of it that the radios draw", _column("radio_mj"), optional=True),
-        Metric("waiting_j", "what the ego's computer draws besides, while it waits for messages",
+        Metric("radio_mj", "energy of a decision: the part of the radios",
+               _column("radio_mj"), optional=True),
+        Metric("waiting_j", "energy that the ego's computer draws while it waits for messages; not part of "
+               "energy_j",
                _column("waiting_j"), optional=True),
-        Metric(LATENCY, "start of the decision to the end of the whole exchange and of fusion, inference "
-               "included", _column("latency_ms")),
-        Metric("deadline_miss_rate", "decisions that took longer than the decision window",
+        Metric(LATENCY, "time from the start of a decision to the end of the exchange and of fusion, with "
+               "all inference", _column("latency_ms")),
+        Metric("deadline_miss_rate", "share of decisions that took longer than the decision window",
                _column("deadline_missed")),
-        Metric("trigger_rate", "decisions in which the ego asked", _column("triggered")),
-        Metric("effective_loss", "probability that one crossing was lost", _column("effective_loss")),
-        Metric("observed_reply_loss", "scheduled replies that did not arrive; request and reply must both "
-               "cross", _column("observed_loss")),
-        Metric("entropy_nats", "of the ego's own intent", _column("entropy_nats")),
-        Metric("normalised_entropy", "of the ego's own intent; 1 is undecided",
+        Metric("trigger_rate", "share of decisions in which the ego asked helpers", _column("triggered")),
+        Metric("effective_loss", "packet loss: probability that one transmission was lost",
+               _column("effective_loss")),
+        Metric("observed_reply_loss", "share of scheduled replies that did not arrive; the request or the "
+               "reply was lost", _column("observed_loss")),
+        Metric("entropy_nats", "entropy of the ego's own intent", _column("entropy_nats")),
+        Metric("normalised_entropy", "entropy of the ego's own intent from 0 (sure) to 1 (undecided)",
                _column("normalised_entropy")),
-        Metric("brier", "of the fused policy against the safe actions; 0 best, 2 worst",
+        Metric("brier", "Brier score of the fused policy against the safe actions; 0 best, 2 worst",
                lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0)),
                world="frozen"),
-        Metric("negative_log_likelihood", "of the safe actions in the fused policy; 0 best",
+        Metric("negative_log_likelihood", "negative log-likelihood of the safe actions in the fused policy; "
+               "0 best",
                lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0),
                world="frozen"),
-        Metric("fallback_rate", "decisions in which the ego's own answer could not be read",
+        Metric("fallback_rate", "share of decisions in which the ego's own answer could not be read",
                _column("own_failed")),
-        Metric("fusion_ms", "part of it that fusion takes: 0 for a rule, which is arithmetic; ego-prompt "
-               "infers again", _column("fusion_ms")),
-        Metric("merge_failed_rate", "answers to fusion calls that could not be read; the ego kept its own "
-               "intent", _column("fusion_failed")),
+        Metric("fusion_ms", "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
+               "ego-prompt calls the model again", _column("fusion_ms")),
+        Metric("merge_failed_rate", "share of answers to fusion calls that could not be read; the ego then "
+               "kept its own intent", _column("fusion_failed")),
     )
 }  # fmt: skip
 # What a summary has besides, and what it means.
 DERIVED = {
-    "message_count": "replies scheduled in the whole run; the request is none",
-    **{f"latency_p{p}_ms": f"{p} % of all decisions are as fast" for p in PERCENTILES},
+    "message_count": "number of scheduled replies in the whole run; requests do not count",
+    **{f"latency_p{p}_ms": f"{p} % of all decisions are at most this slow" for p in PERCENTILES},
 }
 
 

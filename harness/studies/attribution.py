@@ -242,8 +242,8 @@ def headline(table: Sequence[Row]) -> str:
         "fusion": f"message of a {most.kind} of a {HIDDEN}",
     }[most.role]
     return (
-        f"What moves most is the {what}: without it {figure(most.shift, 1, 2)} of the probability is "
-        f"elsewhere, and {figure(most.flips)} % of likeliest actions are others (n = {most.shift.n})."
+        f"The {what} moves answers most: without it, {figure(most.shift, 1, 2)} of the probability moves to "
+        f"other actions, and {figure(most.flips)} % of the most probable actions change (n = {most.shift.n})."
     )
 
 

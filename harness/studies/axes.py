@@ -61,7 +61,7 @@ AXES = {
     axis.name: axis
     for axis in (
         Axis("tau", "entropy threshold τ, nats", *SHORT["tau"], "0.3:1.05:0.05"),
-        Axis("loss", "loss of one crossing", "loss", 1.0, "0:0.5:0.05"),
+        Axis("loss", "packet loss", "loss", 1.0, "0:0.5:0.05"),
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
         Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),

@@ -155,7 +155,7 @@ def headline(result: Fidelity) -> list[str]:
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
     sentences = [
-        f"Largest difference, frozen minus closed: {points:+.1f} points [{low:+.1f}, {high:+.1f}], "
+        f"Largest difference, frozen minus closed loop: {points:+.1f} points [{low:+.1f}, {high:+.1f}], "
         f"{worst['model']} {worst['prompt']} under {worst['condition']}, n = {worst['n']} episodes."
     ]
     if not np.isnan(result.rank):
@@ -163,8 +163,8 @@ def headline(result: Fidelity) -> list[str]:
         sentences.insert(0, f"Spearman's rank correlation of {models}: {result.rank:.2f}.")
     elif result.ranked < LEAST_RANKED:
         sentences.append(
-            f"No rank correlation: {result.ranked} different models and conditions are too few, it takes "
-            f"{LEAST_RANKED}."
+            f"No rank correlation: {result.ranked} different models and conditions are too few; at least "
+            f"{LEAST_RANKED} are needed."
         )
     return sentences
 

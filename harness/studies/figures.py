@@ -23,7 +23,7 @@ PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: its panel of s
 SHORT = 13  # characters of a name that fit under a bar
 BEST_BAND = (0.65, 0.70)  # the paper's
 # What is drawn beside success along an axis.
-BESIDE = {"size": ("effective_loss", "loss of one crossing"), "tau": ("trigger_rate", "trigger rate")}
+BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}
 
 
 @styled
@@ -43,7 +43,7 @@ def composite_a(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Fi
     for axes, metric, scale, label, bars, margin in (
         (latency, "latency_proxy_ms", 1.0, "latency of a decision, ms", names, 0.14),
         (success, "success_rate", 100.0, "success, %", names, 0.14),
-        (talk, "messages_per_episode", 1.0, "messages an episode (bars)", talking, 0.25),
+        (talk, "messages_per_episode", 1.0, "messages per episode (bars)", talking, 0.25),
     ):
         ticks = ["cloud"] if axes is latency else []
         for x, name in enumerate(bars, len(ticks)):
@@ -177,7 +177,9 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
         axes.plot([], [], color=GREY, marker=marker, linestyle="none", label=model)
     for condition, colour in colours.items():
         axes.plot([], [], color=colour, linewidth=3, label=condition)
-    axes.set(xlabel="success on frozen scenes, %", ylabel="success driving, %", xlim=(0, 102), ylim=(0, 102))
+    axes.set(
+        xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102)
+    )
     axes.set_aspect("equal")
     _plain(axes, "both")
     figure.legend(loc="outside right upper", frameon=False, fontsize=7)
@@ -294,7 +296,7 @@ def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], line: Floats, 
     axes.set(
         xscale="log",
         xlabel="vehicles in the radius, the ego included",
-        ylabel="lost crossings, %",
+        ylabel="packet loss, %",
         ylim=(-2, 102),
     )
     axes.set_xticks(vehicles, [str(n) for n in vehicles])

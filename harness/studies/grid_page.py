@@ -38,21 +38,21 @@ def _range(grid: Grid, condition: str) -> str:
     rates = [100 * cell.estimate(SUCCESS, condition).value for cell in grid.cells]
     effects = [effect for effect in grid.effects if effect.condition == condition]
     return (
-        f"With {condition} the {len(rates)} combinations succeed in {min(rates):.1f} to {max(rates):.1f} % "
-        f"of the episodes; {sum(e.clear for e in effects) or 'none'} of {len(effects)} effects is more than "
-        f"chance explains (n = {grid.cells[0].estimate(SUCCESS, condition).n})."
+        f"Under {condition}, the {len(rates)} combinations succeed in {min(rates):.1f} to {max(rates):.1f} % "
+        f"of the episodes; {sum(e.clear for e in effects)} of {len(effects)} effects are more than chance "
+        f"explains (n = {grid.cells[0].estimate(SUCCESS, condition).n})."
     )
 
 
 def _said(grid: Grid, h: Halves) -> str:
-    verdict = "neither half clearly matters more"
+    verdict = "neither choice clearly matters more"
     if h.apart.low > 0:
-        verdict = "the ego's half matters more"
+        verdict = "the choice of the ego matters more"
     elif h.apart.high < 0:
-        verdict = "the helpers' half matters more"
+        verdict = "the choice of the helpers matters more"
     return (
-        f"With {h.condition} {verdict}: of the differences between the {len(grid.cells)} combinations, which "
-        f"of {grid.rows} egos decides explains {shown(h.ego)} %, which of {grid.columns} helpers answers "
+        f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains {shown(h.ego)} % of the "
+        f"differences between the {len(grid.cells)} combinations, the choice among {grid.columns} helpers "
         f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
     )
 

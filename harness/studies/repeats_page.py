@@ -40,8 +40,8 @@ def _flips(of: Repeats) -> str:
     flips, once = of.estimate(c, FLIPS), of.estimate(c, SUCCESS)
     everywhere, anywhere = of.estimate(c, f"pass^{k}"), of.estimate(c, f"any@{k}")
     return (
-        f"Asked again at temperature {m.temperature:g}, {m.variant} decides otherwise in {shown(flips)} % "
-        f"of decisions under {c} (n = {flips.n} decision points): {shown(once)} % of its episodes succeed, "
+        f"Asked again at temperature {m.temperature:g}, {m.variant} decides differently in {shown(flips)} % "
+        f"of decisions under {c} (n = {flips.n} decision points). {shown(once)} % of its episodes succeed, "
         f"{shown(everywhere)} % in all {k} repeats and {shown(anywhere)} % in at least one "
         f"(n = {once.n} episodes)."
     )
@@ -53,7 +53,7 @@ def _between(of: Repeats) -> Iterator[str]:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
             f"Under {c}, {shown(shares[c])} % of the variance of success lies between episodes "
-            f"(n = {shares[c].n}); the rest is chance between repeats of one."
+            f"(n = {shares[c].n}); the rest is chance between repeats of one episode."
         )
 
 
@@ -61,14 +61,14 @@ def _doubt(of: Repeats) -> Iterator[str]:
     stated, sampled, more = (of.estimate(ALL, name) for name in (STATED, SAMPLED, DOUBT))
     if math.isnan(more.value):
         return
-    verdict = "which its repeats neither bear out nor refute"
+    verdict = "not clearly more or less than its repeats show"
     if more.low > 0:
-        verdict = "more doubt than its repeats show"
+        verdict = "more than its repeats show"
     elif more.high < 0:
-        verdict = "less doubt than its repeats show"
+        verdict = "less than its repeats show"
     yield (
-        f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: the actions that they rank "
-        f"first have {nats(sampled)} (difference {nats(more)}; n = {more.n} decision points)."
+        f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: over repeats, the most probable "
+        f"action has {nats(sampled)} nats (difference {nats(more)}; n = {more.n} decision points)."
     )
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SLACK = 1.1  # by which messages may exceed on these layouts what they were on tune layouts
-BUDGETS = {"messages": "messages an episode", "energy_j": "joules an episode"}
+BUDGETS = {"messages": "messages per episode", "energy_j": "joules per episode"}
 TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -37,18 +37,18 @@ def in_sentences(compared: Compared) -> list[str]:
     regret, bound = compared.regret, compared.oracle.means["messages"]
     paper = compared.paper.means["messages"]
     found = [
-        f"{compared.name}, {compared.point.name}: the oracle succeeds in {shown(regret)} points more of "
-        f"{regret.n} episodes than entropy above {compared.point.tau_nats:g}, with {bound:.1f} in place of "
-        f"{paper:.1f} messages an episode."
+        f"{compared.name}, {compared.point.name}: the oracle succeeds {shown(regret)} points more often than "
+        f"entropy above {compared.point.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} instead of "
+        f"{paper:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
         best = max(within, key=lambda row: row.success.value)
         found.append(
             f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
-            f"{said(best)} succeeds most, in {shown(best.success)} %, {shown(best.over_paper)} points from "
-            f"the paper's: it closes {shown(best.closed)} % of that gap at {shown(best.messages)} % of the "
-            "messages."
+            f"{said(best)} succeeds most often, in {shown(best.success)} %, a difference of "
+            f"{shown(best.over_paper)} points from the paper's schedule: it closes {shown(best.closed)} % "
+            f"of that gap with {shown(best.messages)} % of the messages."
         )
     return found
 

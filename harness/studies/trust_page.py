@@ -33,15 +33,15 @@ def in_a_sentence(bench: Bench) -> list[str]:
     alone, worst = over_episodes(SUCCESS, bench.alone), bench.worst(BASE, share)
     said = [
         f"While nobody attacks, {shown(peace)} % of episodes succeed under the linear pool, and "
-        f"{shown(alone)} % of an ego that never asks.",
-        f"With {100 * share:.0f} % of the helpers attackers {worst} takes most from it: "
-        f"{shown(bench.success(BASE, worst, share))} % are left.",
+        f"{shown(alone)} % with an ego that never asks.",
+        f"If {100 * share:.0f} % of the helpers attack, {worst} harms the linear pool most: "
+        f"{shown(bench.success(BASE, worst, share))} % succeed.",
     ]
     best = max(bench.rules, key=lambda rule: bench.mean(rule, share).value)
     said.append(
-        f"Over all {len(bench.attacks)} attacks {best} keeps most, {shown(bench.mean(best, share))} % on "
-        f"average (linear {shown(bench.mean(BASE, share))}); its price in peace, in points: "
-        f"{price(bench, best)}."
+        f"On average over all {len(bench.attacks)} attacks, {best} succeeds most often, in "
+        f"{shown(bench.mean(best, share))} % (linear: {shown(bench.mean(BASE, share))}); its price in "
+        f"peace, in points: {price(bench, best)}."
     )
     if "liar+spoof" in bench.attacks:
         stand = [
@@ -50,8 +50,8 @@ def in_a_sentence(bench: Bench) -> list[str]:
             and 100 * bench.loss(rule, "liar+spoof", share).value >= -LOSES
         ]  # fmt: skip
         said.append(
-            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} or "
-            f"less in peace: {', '.join(stand) or 'none'}."
+            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} "
+            f"point or less in peace: {', '.join(stand) or 'none'}."
         )
     return said
 

@@ -108,7 +108,7 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         (("show", "mode4:density=3"), "did you mean 'density_per_km'?"),
         (("show", "mode4:density_per_km=-1"), "density_per_km is -1"),
         (("show", "single-local"), "has no channel; `harness channel list` shows"),
-        (("check", "6g"), "loses the same at any distance"),
+        (("check", "6g"), "loses the same at every distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
         (("check", "mode4", "--against", "bad.csv"), "bad.csv, line 3: Expected `float` <= 1.0"),
         (("check", "mode4", "--against", "other.csv"), "did you mean 'rate_hz'"),

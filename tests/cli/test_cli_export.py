@@ -103,13 +103,16 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--csv, --jsonl, --junit, --inspect, --sft: give one of them"),
-        (("--csv", "--jsonl"), "--csv, --jsonl, --junit, --inspect, --sft: give one of them"),
-        (("--csv", "--junit", "a.xml"), "give one of them"),
-        (("--junit", "a.xml", "--out", "there"), "--out is of --csv and --jsonl; --junit names its file"),
+        ((), "--csv, --jsonl, --junit, --inspect, --sft: give exactly one of them"),
+        (("--csv", "--jsonl"), "--csv, --jsonl, --junit, --inspect, --sft: give exactly one of them"),
+        (("--csv", "--junit", "a.xml"), "give exactly one of them"),
+        (
+            ("--junit", "a.xml", "--out", "there"),
+            "--out only goes with --csv and --jsonl; --junit names its own",
+        ),
         (
             ("--junit", "a.xml", "--report-seeds-too"),
-            "--report-seeds-too is of --sft; give that, or leave it",
+            "--report-seeds-too only goes with --sft; give --sft, or leave it",
         ),
         (("--junit", "run/run.json/a.xml"), "--junit run/run.json/a.xml cannot be written ("),
         (("--junit", "."), "--junit . cannot be written (Is a directory); name another file"),

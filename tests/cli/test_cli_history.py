@@ -72,7 +72,7 @@ def test_the_table_fits_and_says_what_does_not_compare(reports: Path, harness: H
         ["made-up", "·", "v3", "·", "json", "75.0", "[30.1,", "95.4]", "n", "4"],
         ["made-up", "·", "v4", "·", "json", "25.0", "[4.6,", "69.9]", "n", "4"],
     ]
-    assert out.endswith("runs of different scenes do not compare: they stand apart\n")
+    assert out.endswith("runs on different scenes do not compare, so each group has its own table\n")
 
 
 def test_another_metric_condition_and_dataset(reports: Path, harness: Harness) -> None:

@@ -105,10 +105,10 @@ def test_an_unfinished_run_says_that_the_same_command_goes_on(
     assert (one.kind, one.state, one.why, one.model) == (
         "drive",
         "unfinished",
-        "the same command goes on",
+        "the same command continues it",
         "proxy",
     )
-    assert "unfinished: the same command goes on\n" in harness("ls", folder)[1]
+    assert "unfinished: the same command continues it\n" in harness("ls", folder)[1]
 
 
 @pytest.mark.parametrize(

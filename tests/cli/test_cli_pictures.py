@@ -156,7 +156,7 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
         assert "128 tokens with agrees, as its processor says\n" in harness(*args, "agrees")[1]
         assert harness(*args, "differs") == (
             1, "model 'differs': its processor makes 128 tokens of 448 x 224 pixels, and its card says 98; "
-            "mend [vision]\n", "",
+            "fix [vision]\n", "",
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """What typer does otherwise: commands in groups, and plain values read without pydantic."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +13,8 @@ from typer.main import get_command
 
 from harness.cli import PANELS, app
 from harness.cli.shell import UNREAD, plain
+from harness.coordination.attacks import ATTACKS
+from harness.coordination.rules import RULES
 
 Said = tuple[int, str, str]
 VALUES = ("", "x", "7", "007", "-7", "7.5", "٣", "9" * 30, "/", "/nowhere", None)
@@ -64,7 +67,9 @@ def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: 
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
-@pytest.mark.parametrize("group", ["", "campaign", "dataset", "model", "prompt", "scenario"])
+@pytest.mark.parametrize(
+    "group", ["", "campaign", "channel", "dataset", "device", "model", "prompt", "scenario", "schedule"]
+)
 def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., Said], group: str) -> None:
     code, out, err = harness(*group.split(), "--help")
     assert (code, err) == (0, "")
@@ -77,3 +82,8 @@ def test_the_map_has_every_command_under_its_panel(harness: Callable[..., Said])
     shown = {head: {line.split()[0] for line in lines} for head, *lines in blocks if lines}
     for panel, commands in PANELS.items():
         assert shown[f"{panel}:"] == set(commands)
+
+
+def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Said]) -> None:
+    said = set(re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("trust", "--help")[1])))
+    assert {*ATTACKS, *RULES} <= said

@@ -35,7 +35,7 @@ def test_who_stops_a_command_hears_that_the_same_one_goes_on(
     os.kill(process.pid, number)
     _, said = process.communicate(timeout=60)
     assert process.returncode == code
-    how = f"the same command goes on: harness {' '.join(EVAL)}"
+    how = f"type the same command to continue: harness {' '.join(EVAL)}"
     assert said.splitlines()[-1] == f"harness: {word}; stopped keeps what is done; {how}"
 
 

@@ -218,7 +218,7 @@ def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Pat
     for text in (*printed[:2], unescape(Path("page.html").read_text())):
         said = " ".join(text.split())
         assert "< 0.001" in said
-        assert f"Holm's method for the {len(of)} differences that have one" in said
+        assert f"Holm's method corrects it for the {len(of)} differences that have an interval" in said
     assert not [line for line in printed[0].splitlines() if line.endswith((" 0.000", "= 0.000"))]
 
 

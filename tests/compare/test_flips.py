@@ -112,15 +112,15 @@ def test_the_text_that_changed_stands_beside_the_flips(
     for part in (
         "prompt v2 → v3: ego.j2 3 words removed, 12 added",
         "id risk {{ actions | join(\" \") }} {+(%)+} evidence",
-        "decisions: 6 flipped of the", "success given away by B alone in 3, by A alone in 1",
-        f"given away by B alone: {both} IDLE → FASTER, {one} IDLE → FASTER (seeds 0)",
-        f"given away by A alone: {other} FASTER → IDLE (seeds 1)",
+        "decisions: 6 flipped of the", "B alone gave success away in 3, A alone in 1",
+        f"B alone gave success away: {both} IDLE → FASTER, {one} IDLE → FASTER (seeds 0)",
+        f"A alone gave success away: {other} FASTER → IDLE (seeds 1)",
     ):  # fmt: skip
         assert part in said, part
     page = unescape(Path("page.html").read_text())
     assert "<ins> {+(%)+}</ins>" in page
     assert '<del> [-"%.2f"-]</del>' in page
-    assert f"{both} IDLE → FASTER: B alone gives success away" in page
+    assert f"{both} IDLE → FASTER: B alone gave success away" in page
     assert page.index(both) < page.index(f"{other} FASTER → IDLE")
     links = re.findall(r'<a href="([^"]+)">([AB])', page)
     assert {name for href, name in links if f"scene={both}" in href} == {"A", "B"}
@@ -130,7 +130,7 @@ def test_the_text_that_changed_stands_beside_the_flips(
     assert (flips["count"], [flip["scene"] for flip in flips["listed"]]) == (6, [both])
     markdown = harness("compare", *runs, "--markdown")[1]
     assert "- `prompt v2 → v3: ego.j2 3 words removed, 12 added, helper.j2 the same`" in markdown
-    assert f"- given away by A alone: `{other} FASTER → IDLE (seeds 1)`" in markdown
+    assert f"- A alone gave success away: `{other} FASTER → IDLE (seeds 1)`" in markdown
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
             ('revision = "2"', "gated = true"),
             "gated goes with engine = transformers or llama-cpp, and only with",
         ),
-        (('"echo"', '"gone"'), "engine 'gone': no_such_module:ECHO does not load .*; mend the package"),
+        (('"echo"', '"gone"'), "engine 'gone': no_such_module:ECHO does not load .*; fix the package"),
         (('"echo"', '"odd"'), "engine 'odd': echoing:answer is a function; it must be a .*Registration"),
     ],
 )

@@ -117,7 +117,7 @@ def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     assert len(best) == len(both.conditions)
     bare = [replace(line, mark="", behind=None) for line in lines]
     assert matrix.figures(bare) == []
-    assert "6g: none, as each is behind another run" in matrix.headline(bare)
+    assert "6g: no run, since each is behind another" in matrix.headline(bare)
 
 
 def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
@@ -128,7 +128,7 @@ def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path):
     ]
     runs = gather(paths)
     assert matrix.uneven(gather([run])) is None
-    assert matrix.uneven(runs).startswith("The runs have not the same episodes × seeds (")
+    assert matrix.uneven(runs).startswith("The runs have different episodes × seeds (")
     assert "4 × 3" in matrix.uneven(runs)
     assert "2 × 3" in matrix.uneven(runs)
     page = render(runs)

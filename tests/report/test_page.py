@@ -184,7 +184,7 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
         score = read(run).score(name, "success_rate")
         assert score.interval == "episodes"
         assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
-    assert "2 episodes × 3 seeds of two; 95 % intervals over episodes" in page.text
+    assert "2 episodes × 3 channel seeds of two; 95 % intervals over episodes" in page.text
     for metric in ("latency proxy", "trigger rate", "entropy"):
         assert metric in page.text
 
@@ -299,7 +299,8 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ended=ENDED,
     )
     assert headline(found) == (
-        "With 6g rule-of-thumb clears 94.0 % of the episodes, with single-local 68.0 %: a clear difference."
+        "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: a clear "
+        "difference."
     )
     told = [(figure["value"], figure["interval"]) for figure in figures(found)]
     assert told == [
@@ -318,7 +319,7 @@ def test_a_gap_whose_interval_holds_zero_is_said_to_be_chance_perhaps(run, tmp_p
         ("v2x", "success_gain_over_single-local", 0.02, -0.03, 0.07),
         ended=ENDED,
     )
-    assert headline(found).endswith("with single-local 68.0 %: this may be chance.")
+    assert headline(found).endswith("under single-local, 68.0 %: the difference may be chance.")
 
 
 def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
@@ -328,7 +329,7 @@ def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
         ("single-local", "success_rate", 0.7, None, None),
         ("6g", "success_rate", 0.7, None, None),
     )
-    alone = "With single-local rule-of-thumb clears 70.0 % of the episodes"
+    alone = "Under single-local, rule-of-thumb clears 70.0 % of the episodes"
     assert headline(found) == f"{alone}, and no other condition does better."
 
 
@@ -343,7 +344,7 @@ def test_where_nothing_beats_driving_alone_the_headline_says_so(run, tmp_path):
         (
             Latency("measured", "batch 1", 0.1, 0.1, 0.1),
             "ego 100 ms, helper 100 ms, ego with messages 100 ms; "
-            "measured where it ran, before the run (batch 1)",
+            "measured on the machine of the run, before it (batch 1)",
         ),
     ],
 )
@@ -352,7 +353,7 @@ def test_the_source_of_latency_in_words(latency, words):
 
 
 def test_what_answers_took_in_words():
-    assert answer_times({}) == "not known, since no answer was asked alone"
+    assert answer_times({}) == "unknown, since no answer was asked alone"
     told = answer_times({"ego": Times(240, 0.0312, 0.0281, 0.0403), "merge": Times(1, 0.2, 0.2, 0.2)})
     assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), merge 200 ms (5 to 95 %: 200 to 200; n = 1)"
 

@@ -74,8 +74,8 @@ def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
         assert of["frozen"]["value"] == of["live"]["value"]
         assert (of["difference_points"]["value"], of["agreement"]["value"]) == (0.0, 1.0)
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1)
-    assert "n = 2 episodes; same: how many of them end alike" in out
-    assert "so few are no rank correlation" in out
+    assert "n = 2 episodes; same: share of them that end alike" in out
+    assert "these few drivers give no rank correlation" in out
     assert max(map(len, out.splitlines())) <= 80
 
 

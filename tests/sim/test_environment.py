@@ -323,9 +323,9 @@ def test_a_road_of_another_seed_is_refused():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "give a scenario or --env, one of the two"),
-        (("do-not-pass", "--env", "merge-v0"), "give a scenario or --env, one of the two"),
-        (("do-not-pass", "--env-config", "c.json"), "--env-config is of an environment"),
+        ((), "give either a scenario or --env"),
+        (("do-not-pass", "--env", "merge-v0"), "give either a scenario or --env"),
+        (("do-not-pass", "--env-config", "c.json"), "--env-config changes an environment"),
         (("--env", "merge-v0", "--env-config", "missing.json"), "--env-config missing.json cannot be read"),
         (("--env", "merge-v0", "--env-config", "list.json"), "its config is no JSON object"),
         (("--env", "merge-v0:decisions=0"), "decisions is 0; it must be from 1 to 9"),

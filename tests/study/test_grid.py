@@ -130,14 +130,14 @@ def test_the_half_that_matters_is_named() -> None:
     assert halves.helpers.value > 0.9
     assert halves.apart.high < 0
     [said] = in_a_sentence(made_up(of))
-    assert said.startswith("With 6g the helpers' half matters more: of the differences between the 4")
+    assert said.startswith("Under 6g, the choice of the helpers matters more: the choice among 2 egos")
 
 
 def test_cells_that_do_not_differ_have_no_half_that_matters() -> None:
     of = {(ego, helper): [1.0, 0.0, 1.0] for ego in ("v1", "v2") for helper in ("v1", "v2")}
     [said] = in_a_sentence(made_up(of))
     assert said == (
-        "With 6g the 4 combinations succeed in 66.7 to 66.7 % of the episodes; none of 3 effects is more "
+        "Under 6g, the 4 combinations succeed in 66.7 to 66.7 % of the episodes; 0 of 3 effects are more "
         "than chance explains (n = 3)."
     )
 

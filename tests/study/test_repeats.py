@@ -154,10 +154,10 @@ def test_repeats_played_by_hand(small: Dataset, tmp_path: Path, wanderer: Wander
         ("00000-1", 1.0, {"SLOWER": 2, "IDLE": 2}),
     ]
     first, *others = in_sentences(of)
-    assert "at temperature 0.7, swarm-tiny · v2 · json decides otherwise in 55.6 [" in first
+    assert "at temperature 0.7, swarm-tiny · v2 · json decides differently in 55.6 [" in first
     assert [rate for rate in ("83.3 [", "50.0 [", "100.0 [") if rate not in first] == []
     assert others[-1].startswith(
-        "The ego's answers state 0.00 [–, –] nats of entropy, which its repeats neither"
+        "The ego's answers state 0.00 [–, –] nats of entropy, not clearly more or less"
     )
 
 
@@ -230,7 +230,7 @@ def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, w
     (of.path / "repeat-2/report.html").write_text("what `harness report` wrote")
     page = write_repeats(of).read_text()
     assert '<a href="repeat-2/report.html">Report of repeat-2</a>' in page
-    assert page.index("decides otherwise in 55.6 [") < page.index("<table")
+    assert page.index("decides differently in 55.6 [") < page.index("<table")
     assert "pass^3" in page
     assert "2 × SLOWER, 2 × IDLE" in page
     lines = (tmp_path / "repeats/repeats.csv").read_text().splitlines()
@@ -282,7 +282,7 @@ def test_the_command_prints_tables_and_json(
         ),
         (
             ("--repeats", "3", "--temperature", "1", "--latency", "measured"),
-            "--latency measured: its own first",
+            "--latency measured: it needs an idle",
         ),
         (
             ("--repeats", "3", "--temperature", "1", "--answer", "readout"),
@@ -294,7 +294,7 @@ def test_the_command_prints_tables_and_json(
         ),
         (
             ("--repeats", "3", "--temperature", "1", "--dataset", "suite:v2v-safety"),
-            "--repeats 3: a suite is no one dataset; give one",
+            "--repeats 3: needs one dataset, and --dataset names a suite; give one of its datasets",
         ),
     ],
 )

@@ -135,7 +135,7 @@ def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path
     (reports / "paper").mkdir()
     (reports / "paper/study.json").write_text("{}")
     (reports / "paper/index.html").symlink_to(outside / "index.html")
-    assert "It has no page and no picture" in browser.get("/run?path=paper").text
+    assert "This folder has no page and no picture to show" in browser.get("/run?path=paper").text
 
 
 def test_links_within_are_followed_but_not_to_what_is_hidden(browser: TestClient, hiding: Path) -> None:

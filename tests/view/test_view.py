@@ -37,7 +37,7 @@ def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestC
     assert opened == {"first", "second", "first%2Fsweep-tau"}
     rows = {name: row for row in re.findall("<tr class.*?</tr>", page, re.S) for name in names(row)}
     assert all(word in rows["first"] for word in ("tag of first", "proxy", "v2", "json", "2026-01-01", " %"))
-    assert "unfinished</strong> <small>the same command goes on" in rows["killed"]
+    assert "unfinished</strong> <small>the same command continues it" in rows["killed"]
     assert "half" in rows["killed"]
     assert 'class="bad">broken</strong> <small>summary.csv' in rows["spoilt"]
 
@@ -161,7 +161,7 @@ def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
         ("/compare?path=first&path=other", "first and "),
         ("/report", "no run is picked"),
         ("/report?path=first&path=other", "first and "),
-        ("/run?path=killed", "killed is unfinished (the same command goes on); it has no page yet"),
+        ("/run?path=killed", "killed is unfinished (the same command continues it); it has no page yet"),
         ("/run?path=cut", "cut has no decisions.parquet of its own; make the run again"),
         ("/run?path=garbled", "decisions.parquet is broken ("),
     ],

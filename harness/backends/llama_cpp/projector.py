@@ -103,7 +103,7 @@ class Projector:
         if found != vision.tokens:
             raise UserError(
                 f"{shown} makes {found} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
-                f"card's [vision] {vision.tokens}; mend the card, or give the model's own projector"
+                f"card's [vision] {vision.tokens}; fix the card, or give the model's own projector"
             )
 
     def tokens(self, image: Image) -> list[int]:

@@ -126,7 +126,7 @@ class Farm:
         there = {place: model for place, model in zip(self._places, looked, strict=True) if model}
         if not there:
             raise UserError(
-                f"nobody answers at {self._faults()}; start the server, or mend base_url in the model's card"
+                f"nobody answers at {self._faults()}; start the server, or fix base_url in the model's card"
             )
         self._first, self.model = next(iter(there.items()))
         for place, model in there.items():
@@ -282,7 +282,7 @@ class Farm:
                     self._end(
                         UserError(
                             f"model {self._name!r}: no server is left: {self._faults()}; start one again, "
-                            "and the same command goes on"
+                            "and type the same command to continue"
                         )
                     )
             self._agree(place, model)
@@ -347,7 +347,7 @@ class Farm:
         if self._server.any_may_answer and model.listed is None:
             raise UserError(
                 f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so that nobody can "
-                "tell whether it has the same model as others; mend weights in the card, or what is served"
+                "tell whether it has the same model as others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
             first = f"server {printable(self._first.url)} has {_shown(self.model)}"

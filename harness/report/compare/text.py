@@ -55,7 +55,7 @@ def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> It
         yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
     yield words.many(comparison)
     if not comparison.answers:
-        yield "answers: none changed its verdict"
+        yield "answers: no answer changed its verdict"
     for turned, requests in words.answers_flipped(comparison, most):
         yield f"answers: {turned}"
         yield f"  {requests}"

@@ -135,7 +135,7 @@ def paired(pair: Pair) -> str:
         if conditions:
             said += f"; only {name} has {', '.join(conditions)}"
         if episodes:
-            said += f"; only {name} has {episodes} more episodes"
+            said += f"; {name} has {episodes} more episodes"
     return said
 
 
@@ -163,10 +163,10 @@ def many(comparison: Comparison) -> str:
     p_values = [p for c in comparison.conditions for d in c.differences if (p := d.p_corrected) is not None]
     held = sum(p <= LEVEL for p in p_values)
     return (
-        "p goes with the interval (1 less the level at which that would just touch 0) and is corrected by "
-        f"Holm's method for the {len(p_values)} differences that have one: one or more of them is below "
-        f"{LEVEL} by chance in {100 * LEVEL:.0f} % of comparisons at most. {held} are. Intervals, the tests "
-        "of success and gates are of one difference each, not corrected. "
+        "p comes from the interval: it is 1 minus the confidence level at which the interval would just "
+        f"touch 0. Holm's method corrects it for the {len(p_values)} differences that have an interval: the "
+        f"chance that one or more of them is at most {LEVEL} without a real difference is {100 * LEVEL:.0f} "
+        f"% at most. {held} are at most {LEVEL}. Intervals, tests of success and gates are not corrected. "
         f"{SIGNS[BETTER]} better, {SIGNS[WORSE]} worse: p is at most {LEVEL}"
     )
 
@@ -189,10 +189,10 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
 def decisions(c: InCondition, pair: Pair) -> str:
     """How many decisions flipped, and in how many one run alone gave success away."""
     n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
-    said = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both had"
+    said = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both runs have"
     if not c.flips or pair.a.run.world == "closed-loop":  # which knows no regret
         return said
-    return f"{said}; success given away by B alone in {n['B']}, by A alone in {n['A']}"
+    return f"{said}; B alone gave success away in {n['B']}, A alone in {n['A']}"
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
@@ -200,7 +200,7 @@ def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
     kinds = {by: [flip for flip in c.flips if flip.lost_by == by] for by in ("B", "A")}
     return [
         (
-            f"given away by {by} alone",
+            f"{by} alone gave success away",
             _listed([decision_flip(flip, pair) for flip in some[:most]], len(some), most),
         )
         for by, some in kinds.items() if some

@@ -53,18 +53,18 @@ function answerSection(answer, detail, actions, meanings, leftOut) {
     h("p", { class: "quiet" }, facts),
     h("div", { class: "pair" },
       h("div", {},
-        h("small", {}, answer.spans.length ? "raw answer; marked: what was read" : "raw answer"),
+        h("small", {}, answer.spans.length ? "raw answer; marked: what was parsed" : "raw answer"),
         highlighted(answer.raw, answer.spans),
         answer.first_status ? [h("small", {}, `before the repair turn: ${answer.first_status}`), h("pre", {}, answer.first_raw)] : null),
       h("div", {},
-        h("small", {}, "as read"), h("p", {}, distribution(actions, answer.intent)),
+        h("small", {}, "as parsed"), h("p", {}, distribution(actions, answer.intent)),
         answer.mass != null && Math.abs(answer.mass - 1) > 1e-3
           ? h("p", { class: "quiet" }, `the model's numbers sum to ${answer.mass.toFixed(3)}`) : null,
         message.length ? h("dl", {}, message.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])) : null,
-        moved(leftOut, "what moved it: one object left out of the prompt at a time"))),
+        moved(leftOut, "effect of leaving out one object of the prompt at a time"))),
     sent
       ? h("details", {},
         h("summary", {}, `prompt, ${sent.length} messages`),
         sent.map((m) => [h("small", {}, m.role), h("pre", {}, m.content)]))
-      : h("p", { class: "quiet" }, "prompt: not here as it was sent"));
+      : h("p", { class: "quiet" }, "prompt: its text is not available as it was sent"));
 }

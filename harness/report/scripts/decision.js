@@ -13,8 +13,8 @@ function outcomes(actions) {
   return [
     h("h3", {}, "What each action leads to"),
     table("outcomes", ["action", "outcome", "delay", "at"], rows),
-    h("p", { class: "quiet" }, "Safe: success is still possible. The outcome is that of the full-view driver, who takes "
-      + "the rest. Delay is by how much the action puts off the earliest success."),
+    h("p", { class: "quiet" }, "Safe: success is still possible after the action. The outcome is how the episode ends "
+      + "if the full-view driver takes over then. Delay is the time that the action adds to the earliest possible success."),
   ];
 }
 
@@ -30,7 +30,7 @@ function endings(ends) {
     `${number(e.least_gap_m, 1)} m`,
   ]);
   return [
-    h("h3", {}, "What became of the episode"),
+    h("h3", {}, "How the episode ended"),
     table("ends", ["condition", "result", "at", "least gap"], rows),
   ];
 }
@@ -44,7 +44,7 @@ function reply(m) {
 }
 
 const acted = (d) => d.acts_at_s != null
-  && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "was not ready in time");
+  && h("small", {}, d.acted ? `acts at ${d.acts_at_s.toFixed(2)} s` : "not ready before the episode ended");
 
 // Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing.
 const first = (answers, point) => answers.filter((a) =>
@@ -57,7 +57,7 @@ function policyRows(told, chosen, actions, run) {
     const message = chosen.messages.find((m) => m.from === sender(a));
     const weight = a.role === "ego" ? chosen.own_weight : message?.weight;
     const before = weight == null ? "before fusion" : `before fusion; weight ${weight.toFixed(3)}`;
-    const what = message?.attacker ? "what it intends; what it sent is the attack's" : before;
+    const what = message?.attacker ? "what it intends; the attack changed what it sent" : before;
     if (a.intent) add(who(a), what, a.intent);
   }
   add(`fused, ${chosen.condition}`, "after fusion", chosen.fused);
@@ -123,7 +123,7 @@ class DecisionPage {
       const policies = h("div", { class: "chart" }), timeline = h("div", { class: "chart" });
       this.show(
         this.steps(), this.title(), this.controls(),
-        this.told ? null : h("p", { class: "bad" }, "This run did not come to this scene."),
+        this.told ? null : h("p", { class: "bad" }, "This run did not reach this scene."),
         h("div", { class: "pair" },
           this.picture(),
           h("div", {}, this.came(), h("h3", {}, "Distributions before and after fusion"), policies)),
@@ -184,8 +184,8 @@ class DecisionPage {
   picture() {
     const { world } = this.detail, { ground } = this.about, [id] = this.index.scenes[this.n];
     if (!world) {
-      return h("p", { class: "picture" }, "No picture: this moment was not played again, or playing it again here does "
-        + "not come to it. `harness video` draws the whole episode.");
+      return h("p", { class: "picture" }, "No picture: the page has pictures of the most telling moments only, and only "
+        + "of those that could be played again here. `harness video` draws the whole episode.");
     }
     const [drawing, said] = birdsEye(world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"));
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
@@ -198,7 +198,7 @@ class DecisionPage {
     if (!world) return null;
     if (!cameras) {
       const drawn = live ? "`harness video` draws them" : "`harness dataset show --camera` draws any other";
-      return h("p", { class: "quiet" }, `What the cameras saw is in this page for ${framed} of ${scenes.length} `
+      return h("p", { class: "quiet" }, `This page has camera pictures of ${framed} of ${scenes.length} `
         + `${live ? "moments" : "decisions, those that lost an episode first"}; ${drawn}.`);
     }
     const boxes = h("input", { type: "checkbox", checked: this.boxes !== false, onchange: () => { this.boxes = boxes.checked; } });
@@ -223,14 +223,14 @@ class DecisionPage {
       d.messages.length ? d.messages.map((m) => h("div", {}, reply(m))) : "none",
       distribution(this.index.actions, d.fused),
       [d.action, " ", mark(d.end, this.index.live), acted(d)],
-      `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", outlasts the window" : ""}`,
+      `${number(d.latency_ms, 1)} ms${d.deadline_missed ? ", longer than the window" : ""}`,
     ]));
   }
 
   messages() {
     const leftOut = this.told?.left_out?.filter((each) => each.role === "fusion") ?? [], [one] = leftOut;
     return one && moved(leftOut,
-      `what moved it: one message left out at a time, under ${one.condition} with seed ${one.seed}`);
+      `effect of leaving out one message at a time, under ${one.condition} with seed ${one.seed}`);
   }
 
   inEveryRun() {

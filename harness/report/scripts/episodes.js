@@ -42,7 +42,7 @@ class Episodes {
     place.replaceChildren();
     fill(place, {}, [
       h("form", { class: "filters" }, pick),
-      h("p", { class: "quiet" }, `${lossy} of ${found.length} episodes are lost with a seed or more.`),
+      h("p", { class: "quiet" }, `${lossy} of ${found.length} episodes are lost with at least one seed.`),
       table("episodes", ["episode", "danger", ...conditions], rows),
       found.length > shown.length
         && small(`Show all ${found.length}`, () => { this.every = true; this.show(); }),
@@ -52,7 +52,7 @@ class Episodes {
   // With the first seed that loses the episode, where there is one.
   strip(of, run, condition) {
     const lost = of.filter((one) => one.lost), one = lost[0] ?? of[0];
-    const said = lost.length ? `lost with ${lost.length} of ${of.length} seeds` : one.slow ? "slow" : "kept";
+    const said = lost.length ? `lost with ${lost.length} of ${of.length} seeds` : one.slow ? "slow" : "not lost";
     return one.path.length ? [
       h("span", { class: "strip" }, one.path.map((n, k) => this.cell(n, k, one, run, condition))),
       h("small", { class: lost.length ? "bad" : "" }, said),
@@ -65,7 +65,7 @@ class Episodes {
     const end = !index.live ? ends[k] : lost && list.run.first.includes(n) ? "u" : "s";
     const [colour, text] = this.colours[action];
     const asked = list.letter("asked", n, run, condition, seed) === "1";
-    const words = { s: "safe", d: "safe, slower than the best", u: "the answer that lost this episode", n: "nothing to lose any more" };
+    const words = { s: "safe", d: "safe, slower than the best", u: "the answer that lost this episode", n: "success was lost before" };
     const told = `step ${index.scenes[n][2]}: ${action}${asked ? ", asked" : ""}${index.live && end === "s" ? "" : `, ${words[end]}`}`;
     return h("a", {
       class: `cell end-${end}`, href: list.link(n, { run, seed, condition }), title: told, "aria-label": told,

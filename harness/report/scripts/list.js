@@ -41,7 +41,7 @@ class List {
     const filter = (label, name, options) => choice(label, name, [["", "any"], ...options], "", change);
     const met = index.runs.flatMap((run) => run.statuses).reduce((all, mask) => all | mask, 0);
     const outcomes = ["s", "d", "u", "n"].filter((end) => words[end]).map((end) => [end, words[end]]);
-    const search = { type: "search", name: "q", placeholder: "scene; Enter: also in answers" };
+    const search = { type: "search", name: "q", placeholder: "scene; Enter: also in texts" };
     return h("form", { class: "filters" },
       h("label", {}, "search ",
         h("input", { ...search, oninput: change, onkeydown: (event) => this.pressed(event) })),
@@ -54,7 +54,7 @@ class List {
       filter("differ", "differ", [
         ["conditions", "conditions disagree"], ...(several ? [["runs", "runs disagree"]] : []),
       ]),
-      filter("help", "asked", [["1", "asked for"], ["0", "not asked for"]]),
+      filter("helpers", "asked", [["1", "asked"], ["0", "not asked"]]),
       h("button", { type: "reset", onclick: () => setTimeout(change) }, "Clear"));
   }
 
@@ -127,7 +127,7 @@ class List {
     this.rows.replaceChildren(table("decisions", heads, shown.map((n) => this.row(n, state))));
     const to = (n, text) => h("a", { href: `#${new URLSearchParams({ ...this.kept(state), decisions: "", page: n })}` }, text);
     this.pages.replaceChildren();
-    fill(this.pages, {}, [page > 0 && to(page - 1, "← before"), " ", page < last && to(page + 1, "next →")]);
+    fill(this.pages, {}, [page > 0 && to(page - 1, "← previous"), " ", page < last && to(page + 1, "next →")]);
   }
 
   row(n, state) {

@@ -127,8 +127,8 @@ function birdsEye(world, ground, viewer, messages, zoom) {
   return [picture, told];
 }
 
-const KEY = "Purple: the ego; light: helpers; pink with a ring: the dangerous vehicle; dashed: hidden from the viewer, and so is "
-  + "all that is shaded. An arrow is the way in 1 s, × where paths cross and when who is there. Thick lines: replies to the ego.";
+const KEY = "Purple: the ego. Light: helpers. Pink with a ring: the dangerous vehicle. Dashed, and all that is shaded: hidden from the "
+  + "viewer. Arrow: the way in 1 s. ×: where paths cross, and when each vehicle is there. Thick lines: replies to the ego.";
 const LOOKS = [
   "fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linejoin", "vector-effect", "opacity", "font-family",
   "font-weight", "text-anchor", "dominant-baseline", "paint-order",

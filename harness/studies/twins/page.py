@@ -75,9 +75,11 @@ def notes(study: Study, rows: Sequence[Row]) -> list[str]:
     who, by_need = printable(study.spec.ego.card.name), dict[str, list[str]]()
     for name, need in missing(study, rows).items():
         by_need.setdefault(need, []).append(name)
-    said = [f"left out, since there is none here: {', '.join(of)} ({need})" for need, of in by_need.items()]
+    said = [
+        f"left out, since no question has it: {', '.join(of)} (needs {need})" for need, of in by_need.items()
+    ]
     if not study.spec.ego.can.language_model:
-        said.insert(0, f"{who} reads the scene and not the text, so this says nothing about the prompt")
+        said.insert(0, f"{who} reads the scene graph and not the text, so this says nothing about the prompt")
     return said
 
 

@@ -113,11 +113,12 @@ def headline(table: Sequence[Row]) -> str:
     whole = sum(not row.broken for row in table)
     least = min(table, key=lambda row: row.invariance_rate.value)
     if not least.broken:
-        return f"All {len(table)} twins and roles hold in every question."
+        return f"All {len(table)} pairs of twin and role hold in every question."
     rate = least.invariance_rate
     return (
-        f"{whole} of {len(table)} twins and roles hold in every question. Least often {least.twin.name}, "
-        f"{least.role}: {100 * rate.value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}."
+        f"{whole} of {len(table)} pairs of twin and role hold in every question. Least often holds "
+        f"{least.twin.name}, {least.role}: {100 * rate.value:.1f} % "
+        f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}."
     )
 
 

@@ -1,4 +1,4 @@
-"""Scenario `do-not-pass`: a slow truck to pass, and what comes towards the ego hidden by it.
+"""Scenario `do-not-pass`: the ego follows a slow truck that hides the oncoming lane.
 
 The ego follows a slow truck on a two-way road. It may change to the oncoming lane, pass the truck and come
 back. The truck hides that lane: from behind it the ego sees no farther than some forty metres. In part of the

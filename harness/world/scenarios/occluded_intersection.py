@@ -1,4 +1,4 @@
-"""Scenario `occluded-intersection`: who stands where at the start of an episode.
+"""Scenario `occluded-intersection`: the ego crosses where buildings and a truck hide what comes.
 
 The ego comes from the south at 14 m/s and goes straight. Buildings on the four corners hide the crossing
 road, and a truck that comes towards the ego hides what follows it. At most one vehicle is dangerous: timed to
