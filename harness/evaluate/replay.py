@@ -61,6 +61,7 @@ class Still:
         since_s: how long ago it began.
         open: whether it does not act yet.
         outcome: how the episode ended; empty until then.
+        danger: id of the dangerous vehicle, or None.
     """
 
     state: WorldState
@@ -69,6 +70,7 @@ class Still:
     since_s: float
     open: bool
     outcome: str
+    danger: str | None
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:
@@ -156,7 +158,8 @@ def stills(played: Played, progress: Callable[[int], None] = lambda done: None) 
         ending += f" with {outcome.partner}" if outcome.partner else ""
         since_s = (world.frame - begins[place]) / p.simulation_hz
         progress(1)
-        yield Still(world.state(), seen, decision, since_s, thinking and not outcome.ended, ending)
+        is_open = thinking and not outcome.ended
+        yield Still(world.state(), seen, decision, since_s, is_open, ending, world.layout.danger_id)
         if outcome.ended:
             return
         until = world.frame + (1 if thinking else max(1, round(p.simulation_hz / STILLS_HZ)))

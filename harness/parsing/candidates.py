@@ -191,7 +191,8 @@ def _name(action: str) -> str:
 def _nothing(text: str, objects: bool, actions: tuple[str, ...]) -> Failure:
     """Why a text without a candidate has none."""
     lone = text.strip("".join(_STRAY) + "!?# \t\r\n").casefold()
-    named = [a for a in actions if re.search(_name(a), text) or lone == a.casefold()]
+    # Where a name stands nowhere, no look at what is around it is needed.
+    named = [a for a in actions if (a in text and re.search(_name(a), text)) or lone == a.casefold()]
     if len(named) == 1:
         return Failure(Status.LABEL_ONLY, f"only {named[0]} is named, without probabilities")
     if objects:

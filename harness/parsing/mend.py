@@ -39,8 +39,9 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     import json_repair
 
     source = text[: text.rfind("}") + 1]
-    once = all(len(re.findall(rf"\b{re.escape(name)}\W?\s*:", source)) <= 1 for name in names)
-    if cut or not source or len(source) > _MAX_CHARS or _AMBIGUOUS.search(source) or not once:
+    if cut or not source or len(source) > _MAX_CHARS or _AMBIGUOUS.search(source):
+        raise unreadable()
+    if any(len(re.findall(rf"\b{re.escape(name)}\W?\s*:", source)) > 1 for name in names):
         raise unreadable()
     try:
         value = DECODER.decode(json.dumps(json_repair.loads(source, skip_json_loads=True)))

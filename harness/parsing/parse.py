@@ -21,11 +21,17 @@ from harness.prompts.answer_schema import ROLES
 __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
 
 _SAME = 1e-9  # two renderings of one distribution (0.5, 50%) differ by less
+# What all begin with stands first, so that the search passes over all else at once.
 _SPECIAL = re.compile(
-    r"<\|im_start\|>assistant|<start_of_turn>model|<\|start_header_id\|>assistant<\|end_header_id\|>"
-    r"|<[|｜][^<>{}\n]{1,40}[|｜]>|</?s>|<eos>|<bos>|<pad>|<unk>|<end_of_turn>|\[/?INST\]"
+    r"[<\[](?=[|｜/sebpuI])(?:(?<=<)(?:\|im_start\|>assistant|start_of_turn>model"
+    r"|\|start_header_id\|>assistant<\|end_header_id\|>|[|｜][^<>{}\n]{1,40}[|｜]>"
+    r"|/?s>|eos>|bos>|pad>|unk>|end_of_turn>)|(?<=\[)/?INST\])"
 )
-_INVISIBLE = re.compile(r"[\u200b-\u200f\u2060-\u2064\u202a-\u202e\ufeff\u00ad]|[^\S \t\r\n]")
+# Listed, not worked out from \s, so that a search passes over all else at once.
+_NO_WIDTH = r"\u200b-\u200f\u2060-\u2064\u202a-\u202e\ufeff\u00ad"
+_SPACES = r"\x0b\x0c\x1c-\x1f\x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"  # not JSON's
+_INVISIBLE = re.compile(rf"[{_NO_WIDTH}{_SPACES}]")
+_NO_WIDTHS, _SPACE = re.compile(rf"[{_NO_WIDTH}]+"), re.compile(rf"[{_SPACES}]")
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,8 @@ def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reason
     text, special = _SPECIAL.subn(" ", text)
     # A narrow space between a number and its unit is good typography in prose, and none of JSON's.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
-    text = _INVISIBLE.sub(lambda match: " " if match.group().isspace() else "", text)
+    if zero_width or (reasons_first and _INVISIBLE.search(text)):
+        text = _SPACE.sub(" ", _NO_WIDTHS.sub("", text))
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
     offered = candidates.candidates(text, role, actions, cut, reasons_first)

@@ -9,15 +9,19 @@ import re
 
 from harness.parsing.status import Failure, Status
 
-_NAMES = r"(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analysis|scratchpad)"
-# `<think` may lack its bracket: rather read too much as a thought than too little.
+_NAMES = r"(?=[tras])(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analysis|scratchpad)"
+# `<think` may lack its bracket: rather read too much as a thought than too little. What all tags begin with
+# stands first, so that the search passes over all else at once.
+_LEFT = r"(?:(?<=[<＜])|(?<=&)lt;)"
 _TAG = re.compile(
     rf"""
-    (?P<close> (?:<|&lt;|＜)\|?\s*\\?/\s*{_NAMES}\s*\|?(?:>|&gt;|＞) | \[\s*/\s*think\s*\]
-             | <\|channel\|>\s*final | <channel\|> )
-  | (?P<open>  (?:<|&lt;|＜)\|?\s*(?:{_NAMES}\b[^<>&＞{{}}\n]*(?:>|&gt;|＞) | think(?:ing)?\b)
-             | \[\s*think\s*\]
-             | <\|channel\|?>\s*(?:analysis|thought|commentary) )
+    [<&＜\[] (?=[\s|\\/lctras]) (?:
+    (?P<close> {_LEFT}\|?\s*\\?/\s*{_NAMES}\s*\|?(?:>|&gt;|＞) | (?<=\[)\s*/\s*think\s*\]
+             | (?<=<)\|channel\|>\s*final | (?<=<)channel\|> )
+  | (?P<open>  {_LEFT}\|?\s*(?:{_NAMES}\b[^<>&＞{{}}\n]*(?:>|&gt;|＞) | think(?:ing)?\b)
+             | (?<=\[)\s*think\s*\]
+             | (?<=<)\|channel\|?>\s*(?:analysis|thought|commentary) )
+    )
     """,
     re.IGNORECASE | re.VERBOSE,
 )

@@ -177,11 +177,13 @@ class Decisions:
 
     def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
         sent: dict[str, Any] = {}
+        runs = [self._of_run(n, name, scene, sent) for n in range(len(self._runs.runs))]
+        asked = {tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]}
         return {
-            "world": scene and scenes.world(scene),
+            "world": scene and scenes.world(self._runs.scenario, scene, asked),
             "cameras": scene and name in self._framed and scenes.cameras(self._runs.scenario, scene),
             "outcomes": forest and scenes.outcomes(forest, name),
-            "runs": [self._of_run(n, name, scene, sent) for n in range(len(self._runs.runs))],
+            "runs": runs,
             "prompts": list(sent.values()),
         }
 

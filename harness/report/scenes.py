@@ -1,5 +1,6 @@
 """What a page knows of a scene itself: who is where, what each viewer sees, where each action leads."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -9,18 +10,25 @@ from harness.core.image import Image
 from harness.dataset.forest import Forest
 from harness.dataset.load import Scene
 from harness.report.drawing.geometry import conflict_points
+from harness.report.drawing.view import spots, view_of
 from harness.report.library import picture
 from harness.world.perception.camera import frame
+from harness.world.perception.graph import Graph
 from harness.world.scenario import Scenario
+from harness.world.state import WorldState
 
 # A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of each colour.
 FRAME_PX = 256, 128
 SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 
 
-def world(scene: Scene) -> dict[str, Any]:
-    """What is where, in m to the east and to the north, and what each viewer sees of it."""
+def world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -> dict[str, Any]:
+    """What is where, in m to the east and to the north, and what each viewer sees of it.
+
+    Of each viewer, too, the part that is shown of it: for whom the ego asked in each of some decisions.
+    """
     state, danger = scene.state, scene.record["danger"]["vehicle"]
+    zone_m, heard = scenario.road().zone_m, sorted({(), *asked})
     return {
         "time_s": round(state.time_s, 3),
         "vehicles": [
@@ -40,7 +48,11 @@ def world(scene: Scene) -> dict[str, Any]:
                 "role": graph["role"],
                 "seen": [node["id"] for node in graph["nodes"]],
                 "occluded": [s["sector"] for s in graph["sectors"] if s["occluded"]],
-                "conflicts": _conflicts(scene, viewer),
+                "conflicts": _conflicts(state, graph),
+                "views": {
+                    " ".join(ids): [round(view.west_m, 1), round(view.south_m, 1), round(view.width_m, 1)]
+                    for ids in heard for view in [view_of(spots(state, zone_m, graph, (danger, *ids)))]
+                },
             }
             for viewer, graph in scene.record["graphs"].items()
         },
@@ -61,8 +73,8 @@ def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
     return shown
 
 
-def _conflicts(scene: Scene, viewer: str) -> list[dict[str, Any]]:
-    conflicts, points = conflict_points(scene, viewer)
+def _conflicts(state: WorldState, graph: Graph) -> list[dict[str, Any]]:
+    conflicts, points = conflict_points(state, graph)
     return [
         {"x": x, "y": y, "with": c["with"]} | {who: c[who]["time_s"] for who in ("ego", "other")}
         for c, (x, y) in zip(conflicts, points.round(1).tolist(), strict=True)

@@ -19,6 +19,7 @@ from harness.report.drawing.colours import ROLES
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.scene import draw
+from harness.report.drawing.view import View
 
 
 def picture(scene, format="svg", viewer=None):
@@ -99,7 +100,7 @@ def placed(points):
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(-80, 80), ylim=(-80, 80))
-    labels = Labels(axes, pt_per_m=6 * 72 / 160, size_pt=6.5, view_m=80.0)
+    labels = Labels(axes, pt_per_m=6 * 72 / 160, size_pt=6.5, view=View(-80.0, -80.0, 160.0, 160.0))
     for n, point in enumerate(points):
         labels.add(np.array(point), 2.5, f"v{n + 1} truck\nhelper, hidden", bold=n == 0)
     labels.place()

@@ -114,6 +114,10 @@ def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, 
             for action in dataset.actions
         ]
         assert set(detail["world"]["viewers"]) == set(answers)
+        asked = {" ".join(m["from"] for m in d["messages"]) for d in found["decisions"]}
+        for sees in detail["world"]["viewers"].values():
+            assert {"", *asked} <= set(sees["views"]), "a picture for each condition"
+            assert all(60 <= width <= 160 for _, _, width in sees["views"].values())
 
 
 def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, text, dataset):

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.dataset.load import Scene
+from harness.world.perception.graph import Graph
 from harness.world.road import Ground
 from harness.world.scenario import Scenario
+from harness.world.state import VehicleState, WorldState
 
 VIEW_M = 80.0  # from the origin to the edge of a picture
-BEYOND_M = 5.0  # roads are drawn so far beyond the edge
+LOW_M, LOW_SHAPE = 40.0, 0.6  # roads that reach no farther north to south; height by width of their pictures
+BEYOND_M = 80.0  # roads are drawn so far beyond the edge, for who is there
 
 
 def north_up(points: Floats) -> Floats:
@@ -21,15 +23,14 @@ def north_up(points: Floats) -> Floats:
     return points * [1.0, -1.0]
 
 
-def conflict_points(scene: Scene, viewer: str) -> tuple[list[dict[str, Any]], Floats]:
-    """Conflicts that a viewer sees, and where, (n, 2) m to the east and north.
+def conflict_points(state: WorldState, graph: Graph) -> tuple[list[dict[str, Any]], Floats]:
+    """Conflicts of a viewer's graph, and where, (n, 2) m to the east and north.
 
     Not of who is ahead or behind: there the other vehicle itself is the place.
     """
-    eye = scene.state.vehicle(viewer)
+    eye = state.vehicle(graph["viewer"])
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
-    every = scene.record["graphs"][viewer]["conflicts"]
-    conflicts = [c for c in every if c.get("kind") not in ("ahead", "behind")]
+    conflicts = [c for c in graph["conflicts"] if c.get("kind") not in ("ahead", "behind")]
     relative = np.array([(c["point"]["forward_m"], c["point"]["left_m"]) for c in conflicts]).reshape(-1, 2)
     points = north_up(np.array([eye.x_m, eye.y_m]) + relative @ np.array([[cos, sin], [sin, -cos]]))
     return conflicts, points
@@ -38,3 +39,25 @@ def conflict_points(scene: Scene, viewer: str) -> tuple[list[dict[str, Any]], Fl
 def ground_of(scenario: Scenario) -> Ground:
     """What is drawn of a scenario's road, to beyond the edge."""
     return scenario.road().ground(VIEW_M + BEYOND_M)
+
+
+def shape_of(scenario: Scenario) -> float:
+    """Height by width of a picture of where it is decided: a road from west to east needs no square."""
+    outlines = scenario.road().ground(VIEW_M).outlines
+    return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
+
+
+def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
+    """What lies behind walls and vehicles as seen from the middle of one: quadrangles (n, 4, 2) up to far_m.
+
+    All go round the same way, so that together they are one shape by the nonzero rule.
+    """
+    shapes = [b.corners() for b in state.buildings]
+    shapes += [v.corners() for v in state.vehicles if v.id != eye.id]
+    a = north_up(np.array(shapes).reshape(-1, 4, 2))
+    b, at = np.roll(a, -1, axis=1).reshape(-1, 2), north_up(np.array([eye.x_m, eye.y_m]))
+    a = a.reshape(-1, 2)
+    beyond = [at + (p - at) * far_m / np.maximum(np.hypot(*(p - at).T), 1e-9)[:, None] for p in (b, a)]
+    found = np.stack([a, b, *beyond], axis=1)
+    across = (b - a)[:, 0] * (at - a)[:, 1] - (b - a)[:, 1] * (at - a)[:, 0]
+    return np.where((across > 0)[:, None, None], found[:, ::-1], found)

@@ -1,48 +1,60 @@
 """What stands still in a picture of a scene: its roads and the buildings around them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Polygon
+from matplotlib.artist import Artist
+from matplotlib.collections import LineCollection
+from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from harness.core.arrays import Floats
 from harness.core.errors import printable
-from harness.report.drawing.colours import INK
-from harness.report.drawing.geometry import VIEW_M, ground_of, north_up
+from harness.report.drawing.geometry import VIEW_M, ground_of, north_up, shadows
+from harness.report.drawing.view import View
 from harness.world.scenario import Scenario
-from harness.world.state import Building
+from harness.world.state import Building, VehicleState, WorldState
 
 TEXT_PT = 6.5
 ROAD, WALL, PAPER = "#C9CCD1", "#EAE4D6", "#F7F7F4"
+BUILDING, SHADE = "#877E68", "#3A4047"
+FAR_M = 4 * VIEW_M  # from an eye to the end of what is in shadow
 
 
-def ground(
-    figure: Figure,
-    place: tuple[float, float, float, float],
-    scenario: Scenario,
-    buildings: Iterable[Building],
-) -> Axes:
-    """Axes at a place of the figure, with roads, lane marks, buildings, a scale and where north is."""
-    axes = figure.add_axes(place)
-    axes.set(xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), xticks=[], yticks=[], facecolor=PAPER)
+def roads(scenario: Scenario) -> Iterator[Artist]:
+    """Roads with their lane marks."""
+    surface = ground_of(scenario)
+    yield PathPatch(_closed(surface.outlines), facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8)
+    yield LineCollection(surface.marks, colors="white", linewidths=1.0, linestyles=[(0, (5, 4))])
+    yield LineCollection(surface.stops, colors="white", linewidths=2.0, capstyle="butt")
+
+
+def shade(state: WorldState, eye: VehicleState) -> Artist:
+    """All that walls and vehicles hide from one."""
+    return PathPatch(_closed(shadows(state, eye, FAR_M)), facecolor=SHADE, edgecolor="none", alpha=0.22)
+
+
+def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
+    """Buildings; of those that overlap the outline of the whole."""
+    outlines = _closed([north_up(building.corners()) for building in buildings])
+    yield PathPatch(outlines, facecolor="none", edgecolor="#A79F8A", linewidth=1.6)
+    yield PathPatch(outlines, facecolor=WALL, edgecolor="none")
+
+
+def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[tuple[str, float, float]]:
+    """The name of each building with room for one, and the north-west corner of what is in view of it."""
     for building in buildings:
         corners = north_up(building.corners())
-        if np.abs(corners).min(axis=0).max() > VIEW_M:
-            continue
-        axes.add_patch(Polygon(corners, facecolor=WALL, edgecolor="#A79F8A", linewidth=0.8))
-        x, y = np.sign(corners.mean(axis=0)) * (VIEW_M - 13.0)
-        axes.text(x, y, printable(building.id), color="#877E68", size=TEXT_PT, ha="center", va="center")
-    surface = ground_of(scenario)
-    edges = Path.make_compound_path(*(Path(edge, closed=True) for edge in surface.outlines))
-    axes.add_patch(PathPatch(edges, facecolor=ROAD, edgecolor="#8A8F98", linewidth=0.8))
-    for mark in surface.marks:
-        axes.plot(*mark.T, color="white", linewidth=1.0, dashes=(5, 4))
-    for stop in surface.stops:
-        axes.plot(*stop.T, color="white", linewidth=2.0, solid_capstyle="butt")
-    axes.plot([-76, -56], [-76, -76], color=INK, linewidth=1.5, solid_capstyle="butt")
-    axes.text(-66, -74.8, "20 m", size=TEXT_PT, ha="center", va="bottom")
-    arrow = {"arrowstyle": "-|>", "color": INK}
-    axes.annotate("N", (75, 76), (75, 67), size=8, ha="center", va="center", arrowprops=arrow)
-    return axes
+        low, high = np.array([corners.min(axis=0), corners.max(axis=0)]).clip(*view.edges)
+        if np.all(high - low > tall_m):
+            yield printable(building.id), float(low[0]), float(high[1])
+
+
+def scale_m(view: View) -> int:
+    """How long the bar is that tells a picture's scale."""
+    return 20 if view.width_m > 100 else 10
+
+
+def _closed(outlines: Iterable[Floats]) -> Path:
+    paths = [Path(np.concatenate([o, o[:1]]), closed=True) for o in outlines]
+    return Path.make_compound_path(*paths) if paths else Path(np.empty((0, 2)))

@@ -1,13 +1,50 @@
 """Labels beside what they name, moved aside until they cover nothing."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 
 from harness.core.arrays import Floats
+from harness.report.drawing.view import View
 
 DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
-DISTANCES_M = (1.0, 4.0, 8.0, 13.0, 19.0, 26.0, 34.0, 44.0)
+DISTANCES_M = (1.0, 4.0, 8.0, 13.0, 19.0, 26.0, 34.0, 44.0)  # in a picture of the whole world
 NOWHERE = np.zeros(2)
+
+
+def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
+    """How many boxes (2, 2) a label of half that size would cover at each spot (n, 2)."""
+    if not boxes:
+        return np.zeros(len(spots))
+    low, high = np.swapaxes(np.array(boxes), 0, 1)
+    over = (spots[:, None] - half < high) & (spots[:, None] + half > low)
+    many: Floats = over.all(axis=-1).sum(axis=1).astype(float)
+    return many
+
+
+def cut(spots: Floats, half: Floats, view: View) -> Floats:
+    """How far a label at each spot (n, 2) would stick out of the view, m."""
+    low, high = view.edges
+    out: Floats = np.maximum(low - (spots - half), spots + half - high).max(axis=1).clip(0.0)
+    return out
+
+
+def crossed(at: Floats, ends: Floats, lines: Sequence[Floats]) -> Floats:
+    """How many lines (2, 2) a line from (2,) to each end (n, 2) would cross."""
+    if not lines:
+        return np.zeros(len(ends))
+    a, b = np.swapaxes(np.array(lines), 0, 1)
+
+    def side(p: Floats, q: Floats, r: Floats) -> Floats:
+        (x, y), (u, v) = np.moveaxis(q - p, -1, 0), np.moveaxis(r - p, -1, 0)
+        sign: Floats = np.sign(x * v - y * u)
+        return sign
+
+    end = ends[:, None]
+    apart = (side(at, end, a) == side(at, end, b)) | (side(a, b, at) == side(a, b, end))
+    many: Floats = (~apart).sum(axis=1).astype(float)
+    return many
 
 
 class Labels:
@@ -17,13 +54,14 @@ class Labels:
         axes: where they go; its data are metres.
         pt_per_m: scale of the picture.
         size_pt: font size.
-        view_m: labels stay within ±view_m.
+        view: labels stay within it.
     """
 
-    def __init__(self, axes: Axes, pt_per_m: float, size_pt: float, view_m: float) -> None:
-        self.axes, self.pt_per_m, self.size_pt, self.view_m = axes, pt_per_m, size_pt, view_m
+    def __init__(self, axes: Axes, pt_per_m: float, size_pt: float, view: View) -> None:
+        self.axes, self.pt_per_m, self.size_pt, self.view = axes, pt_per_m, size_pt, view
         self._taken: list[Floats] = []
         self._unloved: list[Floats] = []
+        self._leaders: list[Floats] = []
         self._waiting: list[tuple[Floats, float, str, bool, str, Floats]] = []
 
     def block(self, points: Floats) -> None:
@@ -33,6 +71,13 @@ class Labels:
     def discourage(self, points: Floats) -> None:
         """Keep labels off the box around points (n, 2) m unless they would have to go far."""
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
+
+    def free(self, boxes: Sequence[Floats]) -> Floats:
+        """The first of some boxes (2, 2) that covers nothing so far, else the first; labels keep off it."""
+        half = (boxes[0][1] - boxes[0][0]) / 2
+        taken = covered(np.array([box.mean(axis=0) for box in boxes]), half, self._taken)
+        self.block(boxes[int(taken.argmin())])
+        return boxes[int(taken.argmin())]
 
     def add(
         self,
@@ -50,15 +95,14 @@ class Labels:
         """Put every label at the nearest free place, with a line to what it names if that is far."""
         for at, radius_m, text, bold, colour, toward in self._waiting:
             half = self._half_size(text, bold)
-            spots = np.array(
-                [at + d * (half + gap) for gap in radius_m + np.array(DISTANCES_M) - 1 for d in DIRECTIONS]
-            )
-            cost = np.array([self._cost(spot, half, at, toward) for spot in spots])
-            spot = spots[int(cost.argmin())]
+            gaps = radius_m + self.view.scale * (np.array(DISTANCES_M) - 1)
+            spots = np.array([at + d * (half + gap) for gap in gaps for d in DIRECTIONS])
+            spot = spots[int(self._cost(spots, half, at, toward).argmin())]
             self._taken.append(np.array([spot - half, spot + half]))
             edge = at.clip(spot - half, spot + half)
-            if np.hypot(*(edge - at)) > radius_m + 3.0:
+            if np.hypot(*(edge - at)) > radius_m + 3.0 * self.view.scale:
                 self.axes.plot(*np.array([at, edge]).T, color=colour, linewidth=0.6, zorder=4)
+                self._leaders.append(np.array([at, edge]))
             self.axes.text(
                 spot[0], spot[1], text, size=self.size_pt, weight="bold" if bold else "normal", color=colour,
                 ha="center", va="center", linespacing=1.1, zorder=5,
@@ -67,18 +111,17 @@ class Labels:
 
     def _half_size(self, text: str, bold: bool) -> Floats:
         lines = text.split("\n")
-        width_em = max(map(len, lines)) * (0.66 if bold else 0.58)
-        return np.array([width_em, 1.2 * len(lines)]) * self.size_pt / self.pt_per_m / 2 + 0.6
+        size_em = np.array([max(map(len, lines)) * (0.66 if bold else 0.58), 1.2 * len(lines)])
+        return size_em * self.size_pt / self.pt_per_m / 2 + 0.6 * self.view.scale
 
-    def _cost(self, spot: Floats, half: Floats, at: Floats, toward: Floats) -> float:
-        """Metres away, and far more than any distance for what would be covered or cut."""
-
-        def covered(boxes: list[Floats]) -> int:
-            return sum(bool(np.all((spot - half < box[1]) & (spot + half > box[0]))) for box in boxes)
-
-        cut = np.maximum(np.abs(spot) + half - self.view_m, 0.0).max()
-        away_m = np.hypot(*(at.clip(spot - half, spot + half) - at))
-        wrong_side_m = 10.0 if (spot - at) @ toward < 0 else 0.0
-        return float(
-            away_m + wrong_side_m + 12.0 * covered(self._unloved) + 1000.0 * (covered(self._taken) + cut)
+    def _cost(self, spots: Floats, half: Floats, at: Floats, toward: Floats) -> Floats:
+        """How far away each is, and far more than any distance for what would be covered or cut."""
+        edges = at.clip(spots - half, spots + half)
+        away: Floats = np.hypot(*(edges - at).T) / self.view.scale
+        away += np.where((spots - at) @ toward < 0, 10.0, 0.0) + 20.0 * crossed(at, edges, self._leaders)
+        beyond = cut(spots, half, self.view) / self.view.scale
+        return (
+            away
+            + 12.0 * covered(spots, half, self._unloved)
+            + 1000.0 * (covered(spots, half, self._taken) + beyond)
         )

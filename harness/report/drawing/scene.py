@@ -1,4 +1,7 @@
-"""A scene from above, north up: who is where, and what one vehicle sees of it."""
+"""A scene from above, north up: who is where, and what one vehicle sees of it.
+
+It shows where it is decided (`view`); who is beyond that is named at its edge.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,15 +16,16 @@ from matplotlib.patches import Patch, Polygon
 from harness.core.errors import printable, unknown
 from harness.dataset.load import Scene
 from harness.report.drawing.colours import GREY, INK, ROLES
-from harness.report.drawing.geometry import VIEW_M, conflict_points, north_up
-from harness.report.drawing.ground import TEXT_PT, ground
+from harness.report.drawing.geometry import conflict_points, north_up, shape_of
+from harness.report.drawing.ground import BUILDING, PAPER, TEXT_PT, named, roads, scale_m, shade, walls
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
+from harness.report.drawing.view import View, spots, view_of
 from harness.world import scenarios
 from harness.world.state import VehicleState
 
-SIDE_IN = 5.8  # of the square that shows it
-PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
+SIDE_IN = 5.8  # how wide the picture is
+RING_M = 4.6  # from the middle of the dangerous vehicle to the corners of its diamond
 
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
@@ -57,18 +61,30 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     graph = scene.record["graphs"][viewer]
     seen = {node["id"] for node in graph["nodes"]} | {viewer}
 
-    figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN + 1.12))
+    scenario, state = scenarios.get(scene.state.scenario), scene.state
+    road, shape = scenario.road(), shape_of(scenario)
+    held = spots(state, road.zone_m, graph, (scene.record["danger"]["vehicle"], *scene.viewers))
+    view = view_of(held, shape)
+    figure = Figure(figsize=(SIDE_IN + 0.2, SIDE_IN * shape + 1.12))
     height = figure.get_figheight()
-    place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN / height
-    scenario = scenarios.get(scene.state.scenario)
-    axes = ground(figure, place, scenario, scene.state.buildings)
-    labels = Labels(axes, PT_PER_M, TEXT_PT, VIEW_M)
-    for box in scenario.road().ground(VIEW_M).boxes:
+    place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN * shape / height
+    low, high = view.edges
+    axes = figure.add_axes(place)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[], facecolor=PAPER)
+    axes.set_autoscale_on(False)
+    # All of it lies under what is plotted, whatever its kind.
+    hidden = shade(state, state.vehicle(viewer))
+    for order, artist in enumerate([*roads(scenario), hidden, *walls(state.buildings)]):
+        artist.set_zorder(0.1 * (1 + order))
+        axes.add_artist(artist)
+    labels = Labels(axes, SIDE_IN * 72 / view.width_m, TEXT_PT, view)
+    for box in road.ground(float(np.abs(view.edges).max())).boxes:
         labels.discourage(box)
     _sight_lines(axes, scene, viewer, seen)
-    for vehicle in scene.state.vehicles:
-        _vehicle(axes, labels, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
-    _conflicts(axes, labels, scene, viewer)
+    for vehicle in state.vehicles:
+        _vehicle(axes, labels, view, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
+    _conflicts(axes, labels, view, scene, viewer)
+    _signs(axes, labels, view, scene)
     labels.place()
     _words(figure, scene, viewer, seen)
     save(figure, out, format)
@@ -92,20 +108,23 @@ def _sight_lines(axes: Axes, scene: Scene, viewer: str, seen: set[str]) -> None:
             axes.plot([eye.x_m, v.x_m], [-eye.y_m, -v.y_m], color=SIGHT, linewidth=0.7, alpha=0.75)
 
 
-def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidden: bool) -> None:
-    marks = [look] if look != "other" else []
+def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look: str, hidden: bool) -> None:
+    marks = [f"{vehicle.speed_mps:.0f} m/s"]
+    marks += [look] if look != "other" else []
     marks += ["hidden"] if hidden else []
     marks += ["crashed"] if vehicle.crashed else []
-    text = f"{printable(vehicle.id)} {vehicle.kind}" + (f"\n{', '.join(marks)}" if marks else "")
-    centre = north_up(np.array([vehicle.x_m, vehicle.y_m]))
-    beyond_m = float(np.abs(centre).max()) - (VIEW_M - 3.0)
+    text = f"{printable(vehicle.id)} {vehicle.kind}\n{', '.join(marks)}"
+    centre, (low, high) = north_up(np.array([vehicle.x_m, vehicle.y_m])), view.edges
+    one, half = view.scale, (high - low) / 2
+    away = centre - (low + half)
+    beyond_m = float((np.abs(away) - half).max()) + 3.0 * one
     if beyond_m > 0:
-        edge = centre.clip(1.5 - VIEW_M, VIEW_M - 1.5)
-        east, north = centre / np.abs(centre).max()
+        edge = centre.clip(low + 1.5 * one, high - 1.5 * one)
+        east, north = away / half
         horizontal, vertical = "<" if east < 0 else ">", "v" if north < 0 else "^"
-        marker = horizontal if abs(east) == 1 else vertical
+        marker = horizontal if abs(east) > abs(north) else vertical
         axes.plot(*edge, marker=marker, color=ROLES["danger"] if look == "danger" else GREY, markersize=5)
-        labels.add(edge, 1.5, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
+        labels.add(edge, 1.5 * one, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
     style = style_of(look, hidden)
@@ -124,28 +143,54 @@ def _vehicle(axes: Axes, labels: Labels, vehicle: VehicleState, look: str, hidde
             "shrinkA": 0, "shrinkB": 0,
         }  # fmt: skip
         tip = nose + along * vehicle.speed_mps
-        axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow)
+        way = axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow, annotation_clip=False)
+        if way.arrow_patch:
+            way.arrow_patch.set_clip_path(axes.patch)
         labels.block(np.array([nose, tip]))
     radius_m = vehicle.length_m / 2
     if look == "danger":
-        axes.plot(*centre, markersize=15, **DIAMOND)
-        radius_m = max(radius_m, 4.2)
-        labels.block(centre + np.array([[-4.0, -4.0], [4.0, 4.0]]))
+        ring = centre + RING_M * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+        axes.add_patch(Polygon(ring, facecolor="none", edgecolor=ROLES["danger"], linewidth=1.4, zorder=3))
+        radius_m = max(radius_m, RING_M)
+        labels.block(ring)
     labels.block(corners)
     labels.add(centre, radius_m, text, bold=look in ("ego", "danger"))
 
 
-def _conflicts(axes: Axes, labels: Labels, scene: Scene, viewer: str) -> None:
+def _conflicts(axes: Axes, labels: Labels, view: View, scene: Scene, viewer: str) -> None:
     ego = printable(scene.state.ego.id)
-    conflicts, points = conflict_points(scene, viewer)
+    conflicts, points = conflict_points(scene.state, scene.record["graphs"][viewer])
     for conflict, point in zip(conflicts, points, strict=True):
-        if np.abs(point).max() > VIEW_M:
+        if not view.holds(point):
             continue
         axes.plot(*point, markeredgewidth=0.7, zorder=4, **CROSS)
-        labels.block(point + np.array([[-1.5, -1.5], [1.5, 1.5]]))
+        labels.block(point + 1.5 * view.scale * np.array([[-1, -1], [1, 1]]))
         text = f"{ego} {_when(conflict['ego'])}, {printable(conflict['with'])} {_when(conflict['other'])}"
         # Labels of two points go apart, or their lines would cross.
         labels.add(point, 2.0, text, colour=INK, toward=point - points.mean(axis=0))
+
+
+def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
+    """The scale and where north is, each in a corner that no vehicle is in, and the names of buildings."""
+    (west, south), (east, north) = view.edges
+    one = view.scale
+    long_m, pad, wide, high, half = scale_m(view), 4 * one, 24 * one, 6 * one, 3 * one
+    low, up, left, right = south + pad, north - pad - high, west + pad, east - pad - wide
+    box = labels.free([np.array([[x, y], [x + wide, y + high]]) for x in (left, right) for y in (low, up)])
+    start, foot = box[0]
+    bar = [start, start + long_m]
+    axes.plot(bar, [foot, foot], color=INK, linewidth=1.5, solid_capstyle="butt", zorder=5)
+    axes.text(start + long_m / 2, foot + one, f"{long_m} m", size=TEXT_PT, ha="center", va="bottom", zorder=5)
+    tall = 13 * one
+    low, up, left, right = south + half, north - half - tall, west + half, east - half - 2 * half
+    box = labels.free(
+        [np.array([[x, y], [x + 2 * half, y + tall]]) for x, y in ((right, up), (left, up), (right, low))]
+    )
+    x, (y, top) = box[:, 0].mean(), box[:, 1]
+    arrow = {"arrowstyle": "-|>", "color": INK}
+    axes.annotate("N", (x, top), (x, y + 2 * one), size=8, ha="center", va="center", arrowprops=arrow)
+    for name, left, up in named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
+        axes.text(left + one, up - one, name, color=BUILDING, size=TEXT_PT, ha="left", va="top")
 
 
 def _when(arrival: Mapping[str, Any]) -> str:

@@ -1,9 +1,9 @@
 """One still of a driven episode: from above, and as the cameras of the ego and of one helper see it.
 
-What moves is drawn over a ground that was drawn once.
+Words are drawn when they change, what lies on the ground each time: the view from above follows the action.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -16,37 +16,49 @@ from matplotlib.patches import PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
 
+from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.image import Pixels
 from harness.evaluate.replay import Played, Still
 from harness.report.drawing.colours import BAD, GOOD, GREY, INK, LATE, ROLES
 from harness.report.drawing.colours import actions as colours_of
-from harness.report.drawing.geometry import VIEW_M, north_up
-from harness.report.drawing.ground import TEXT_PT, ground
+from harness.report.drawing.geometry import north_up, shape_of
+from harness.report.drawing.ground import BUILDING, PAPER, named, roads, scale_m, shade, walls
+from harness.report.drawing.labels import covered, cut
 from harness.report.drawing.scene import style_of
+from harness.report.drawing.view import View
 from harness.world.perception.camera import SIZE_PX, frame
 from harness.world.state import Building, VehicleState, WorldState
 
-SIDE_IN, BARS_IN, DPI = 5.0, 1.2, 90
+SIDE_IN, HEIGHT_IN, DPI = 5.0, 6.2, 90
 WIDTH, HEIGHT = SIZE_PX
 CAMERA_IN, CAPTION_PX = WIDTH / DPI, 23
-PT_PER_M = SIDE_IN * 72 / (2 * VIEW_M)
+NAME_PT = 7.0
+SIDES = np.array([[0, 1], [0, -1], [1, 0], [-1, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
+GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 
 
 class Canvas:
     """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
 
-    def __init__(self, played: Played, buildings: Iterable[Building]) -> None:
-        self.played, self.actions = played, played.scenario.actions
-        height, width = SIDE_IN + BARS_IN, SIDE_IN + CAMERA_IN
+    def __init__(self, played: Played, buildings: Sequence[Building]) -> None:
+        self.played, self.actions, self.buildings = played, played.scenario.actions, buildings
+        height, width = HEIGHT_IN, SIDE_IN + CAMERA_IN
         self.figure = Figure(figsize=(width, height), dpi=DPI)
-        place = 0.0, BARS_IN / height, SIDE_IN / width, SIDE_IN / height
-        self.axes = ground(self.figure, place, played.scenario, buildings)
-        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, 1.75 / width, 0.8 / height))
+        above = SIDE_IN * shape_of(played.scenario)
+        below = self.below = height - above
+        self.axes = self.figure.add_axes((0.0, below / height, SIDE_IN / width, above / height))
+        self.axes.set(xticks=[], yticks=[], facecolor=PAPER, autoscale_on=False)
+        self.roads, self.walls = list(roads(played.scenario)), list(walls(buildings))
+        for artist in (*self.roads, *self.walls):
+            self.axes.add_artist(artist)
+        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, 1.75 / width, (below - 0.4) / height))
         self.bars.set(xlim=(0, 1), ylim=(len(self.actions) - 0.5, -0.5), xticks=[0, 0.5, 1])
         self.bars.set_yticks(range(len(self.actions)), labels=self.actions, size=7)
         self.bars.tick_params(labelsize=6, length=2)
-        self.lines = [self.figure.text(0.1 / width, (0.9 - 0.22 * n) / height, "", size=8) for n in range(4)]
+        self.lines = [
+            self.figure.text(0.1 / width, (below - 0.4 - 0.22 * n) / height, "", size=8) for n in range(4)
+        ]
         self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
         self.lines[1].set_text(printable(played.condition, 34))
         self.captions = [
@@ -57,37 +69,108 @@ class Canvas:
         ]
         self.canvas = FigureCanvasAgg(self.figure)
         self.canvas.draw()  # type: ignore[no-untyped-call]
-        self.fixed = self.canvas.copy_from_bbox(self.figure.bbox)  # type: ignore[no-untyped-call]
+        self.fixed = self.worded = self._copy()
+        self.words: tuple[object, ...] = ()
+        self.sides: dict[str, int] = {}
 
-    def picture(self, still: Still, seen: dict[str, list[str]]) -> Pixels:
+    def picture(self, still: Still, seen: dict[str, list[str]], view: View) -> Pixels:
         """One still, with what each viewer saw when the decision began."""
-        self.canvas.restore_region(self.fixed)  # type: ignore[no-untyped-call]
-        ego = still.state.ego
-        self._over(*_sight(still.state, seen))
-        for vehicle in still.state.vehicles:
-            self._over(_vehicle(vehicle, vehicle.id in (*seen[ego.id], ego.id)))
-        attackers = {message.sender for message in still.decision.messages if message.attacker}
-        self._over(_names(still.state.vehicles, attackers))
-        self._over(*_messages(self.played, still))
-        for bar in _bars(still, self.actions):
-            self.bars.add_artist(bar)
-            self.bars.draw_artist(bar)
-            bar.remove()
-        slow = ", thinking (slowed)" if still.open else ""
-        self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
-        decision = f"decision {still.decision.action} at {still.decision.acts_at_s:.2f} s"
-        self.lines[3].set(text=still.outcome or decision, weight="bold" if still.outcome else "normal")
         viewers = _watched(still.state, seen)
-        for viewer, caption in zip(viewers, self.captions, strict=False):
-            whose = "ego" if viewer == ego.id else "helper"
-            caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")
-        for line in (*self.lines[2:], *self.captions[: len(viewers)]):
-            self.figure.draw_artist(line)
+        self._words(still, viewers)
+        self._above(still, seen, view)
         pixels = np.ascontiguousarray(np.asarray(self.canvas.buffer_rgba())[..., :3])  # type: ignore[no-untyped-call]
         for n, viewer in enumerate(viewers):
             top = CAPTION_PX + n * (CAPTION_PX + HEIGHT)
             pixels[top : top + HEIGHT, -WIDTH:] = frame(self.played.scenario, still.state, viewer).pixels
         return pixels
+
+    def _words(self, still: Still, viewers: Sequence[str]) -> None:
+        """The policy and what is said of it, drawn again if it is not as in the last still; and the time."""
+        decision, ego = still.decision, still.state.ego
+        said = still.outcome or f"decision {decision.action} at {decision.acts_at_s:.2f} s"
+        words = (decision.step, still.open, said, *viewers)
+        if words != self.words:
+            self.words = words
+            self.canvas.restore_region(self.fixed)  # type: ignore[no-untyped-call]
+            for bar in _bars(still, self.actions):
+                self.bars.add_artist(bar)
+                self.bars.draw_artist(bar)
+                bar.remove()
+            self.lines[3].set(text=said, weight="bold" if still.outcome else "normal")
+            for viewer, caption in zip(viewers, self.captions, strict=False):
+                whose = "ego" if viewer == ego.id else "helper"
+                caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")
+            for line in (self.lines[3], *self.captions[: len(viewers)]):
+                self.figure.draw_artist(line)
+            self.worded = self._copy()
+        self.canvas.restore_region(self.worded)  # type: ignore[no-untyped-call]
+        slow = ", thinking (slowed)" if still.open else ""
+        self.lines[2].set_text(f"{still.state.time_s:5.2f} s, ego {ego.speed_mps:4.1f} m/s{slow}")
+        self.figure.draw_artist(self.lines[2])
+
+    def _above(self, still: Still, seen: dict[str, list[str]], view: View) -> None:
+        """The view from above."""
+        low, high = view.edges
+        self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ego, draw = still.state.ego, self.axes.draw_artist
+        draw(self.axes.patch)
+        for road in self.roads:
+            draw(road)
+        self._over(shade(still.state, ego))
+        for wall in self.walls:
+            draw(wall)
+        pt_per_m = SIDE_IN * 72 / view.width_m
+        self._over(_buildings(self.buildings, view, pt_per_m), *_sight(still.state, seen))
+        for vehicle in still.state.vehicles:
+            look = "danger" if vehicle.id == still.danger else vehicle.part
+            self._over(_vehicle(vehicle, look, vehicle.id in (*seen[ego.id], ego.id)))
+        self._over(*_messages(self.played, still), *self._names(still, view, pt_per_m))
+        for spine in self.axes.spines.values():
+            draw(spine)
+        start, foot = 0.1, self.below - 0.14  # not in the picture, and so over nobody
+        long_m = scale_m(view)
+        long_in = long_m / view.width_m * SIDE_IN
+        beside = np.array([start + long_in + 0.08, foot - 0.035])
+        words = _moved(_outline(f"{long_m} m, north is up"), beside, 1 / 72)
+        at = self.figure.dpi_scale_trans
+        bar = Line2D([start, start + long_in], [foot, foot], color=INK, linewidth=1.5, transform=at)
+        for artist in (bar, PathPatch(words, facecolor=INK, edgecolor="none", transform=at)):
+            artist.set_figure(self.figure)
+            self.figure.draw_artist(artist)
+
+    def _names(self, still: Still, view: View, pt_per_m: float) -> Iterator[Artist]:
+        """Every vehicle's id and speed beside it, over nobody: where it was in the last still if it can."""
+        shown = [v for v in still.state.vehicles if view.holds(north_up(np.array([v.x_m, v.y_m])))]
+        attackers = {message.sender for message in still.decision.messages if message.attacker}
+        taken = [_around(v) for v in still.state.vehicles]
+        outlines, leaders = list[Outline](), list[Floats]()
+        for v in shown:
+            text = f"{v.id} {v.speed_mps:.0f} m/s{' attacks' if v.id in attackers else ''}"
+            outline, size = _outline(text), _size(text) / pt_per_m
+            box = _around(v)
+            at, reach = box.mean(axis=0), (box[1] - box[0]) / 2
+            gaps = np.repeat(GAPS_PT, len(SIDES))[:, None] / pt_per_m
+            places = at + np.tile(SIDES, (len(GAPS_PT), 1)) * (reach + size / 2 + gaps)
+            ahead = np.abs(SIDES @ north_up(np.array([np.cos(v.heading_rad), np.sin(v.heading_rad)])))
+            cost = np.tile(0.3 * ahead, len(GAPS_PT)) + np.repeat(np.arange(len(GAPS_PT)), len(SIDES))
+            half = size / 2 + 1.0 / pt_per_m
+            cost += 100 * covered(places, half, taken) + 100 * (cut(places, half, view) > 0)
+            if v.id in self.sides:
+                cost[self.sides[v.id]] -= 0.9
+            best = self.sides[v.id] = int(cost.argmin())
+            place = places[best]
+            taken.append(np.array([place - half, place + half]))
+            outlines.append(_moved(outline, place - size / 2, 1 / pt_per_m))
+            if best >= len(SIDES):
+                leaders.append(np.array([at, at.clip(place - size / 2, place + size / 2)]))
+        yield LineCollection(leaders, colors=INK, linewidths=0.5)
+        if outlines:
+            every = Outline.make_compound_path(*outlines)
+            yield PathPatch(every, facecolor="white", edgecolor="white", linewidth=2.0, joinstyle="round")
+            yield PathPatch(every, facecolor=INK, edgecolor="none")
+
+    def _copy(self) -> object:
+        return self.canvas.copy_from_bbox(self.figure.bbox)  # type: ignore[no-untyped-call]
 
     def _over(self, *artists: Artist) -> None:
         for artist in artists:
@@ -113,25 +196,43 @@ def _sight(state: WorldState, seen: dict[str, list[str]]) -> Iterator[Artist]:
         yield LineCollection(lines, colors=colour, linewidths=0.6, alpha=0.5)
 
 
-def _vehicle(vehicle: VehicleState, known: bool) -> Artist:
+def _vehicle(vehicle: VehicleState, look: str, known: bool) -> Artist:
     """Filled if the ego knew of it when its last decision began."""
-    style = style_of(vehicle.part, not known)
+    style = style_of(look, not known)
+    if look == "danger" and not known:
+        style |= {"edgecolor": ROLES["danger"], "linewidth": 1.2}
     if known and vehicle.crashed:
         style["facecolor"] = BAD
     return Polygon(north_up(vehicle.corners()), **style)
 
 
-def _names(vehicles: Iterable[VehicleState], attackers: Collection[str]) -> Artist:
-    """Every vehicle's id beside it, as one outline, which costs a fifth of as many texts."""
-    at = north_up(np.array([(v.x_m, v.y_m) for v in vehicles])) + 2.5
-    outlines = [_outline(f"{v.id} attacks" if v.id in attackers else v.id) for v in vehicles]
-    moved = [Outline(o.vertices + place, o.codes) for o, place in zip(outlines, at, strict=True)]
-    return PathPatch(Outline.make_compound_path(*moved), facecolor=INK, edgecolor="none")
+def _around(vehicle: VehicleState) -> Floats:
+    corners = north_up(vehicle.corners())
+    return np.array([corners.min(axis=0), corners.max(axis=0)])
 
 
-@lru_cache
-def _outline(name: str) -> Outline:
-    return TextPath((0.0, 0.0), name, size=TEXT_PT / PT_PER_M)
+def _buildings(buildings: Iterable[Building], view: View, pt_per_m: float) -> Artist:
+    """Their names, each in the corner of what is seen of it."""
+    inside = np.array([3.0, -3.0 - NAME_PT]) / pt_per_m
+    names = named(buildings, view, NAME_PT / pt_per_m)
+    moved = [_moved(_outline(name), inside + at, 1 / pt_per_m) for name, *at in names]
+    every = Outline.make_compound_path(*moved) if moved else Outline(np.empty((0, 2)))
+    return PathPatch(every, facecolor=BUILDING, edgecolor="none")
+
+
+def _moved(outline: Outline, to: Floats, scale: float) -> Outline:
+    return Outline(np.asarray(outline.vertices) * scale + to, outline.codes)
+
+
+@lru_cache(maxsize=1024)
+def _outline(text: str) -> Outline:
+    """A text's outline in points: as one shape, many cost a fifth of as many texts."""
+    return TextPath((0.0, 0.0), text, size=NAME_PT)
+
+
+@lru_cache(maxsize=1024)
+def _size(text: str) -> Floats:
+    return np.array([_outline(text).get_extents().x1, 0.75 * NAME_PT])
 
 
 def _messages(played: Played, still: Still) -> Iterator[Artist]:

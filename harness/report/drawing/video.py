@@ -5,7 +5,7 @@ same time. So messages can be seen to travel.
 """
 
 import io
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from itertools import chain, repeat
 from pathlib import Path
@@ -16,11 +16,13 @@ from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
 from harness.core.image import Pixels
-from harness.evaluate.replay import Played, stills
+from harness.evaluate.replay import Played, Still, stills
+from harness.report.drawing.geometry import shape_of
 from harness.report.drawing.pictures import styled
 from harness.report.drawing.still import Canvas
-from harness.world.perception.graph import scene_graph
-from harness.world.state import WorldState
+from harness.report.drawing.view import View, spots, views
+from harness.world.perception.graph import Graph, scene_graph
+from harness.world.scenario import Scenario
 
 STILL_MS, LAST_MS = 100, 2500
 COLOURS = 64  # of a GIF
@@ -84,15 +86,33 @@ def _mp4(pictures: Iterator[Pixels], out: Path) -> None:
 
 
 def _pictures(played: Played, progress: Callable[[int], None]) -> Iterator[Pixels]:
-    canvas: Canvas | None = None
-    moment: WorldState | None = None
-    seen: dict[str, list[str]] = {}
-    for still in stills(played, progress):
-        canvas = canvas or Canvas(played, still.state.buildings)
+    listed = list(stills(played))
+    graphs = list(_graphs(played.scenario, listed))
+    canvas = Canvas(played, listed[0].state.buildings)
+    for still, seen, view in zip(listed, graphs, _views(played.scenario, listed, graphs), strict=True):
+        yield canvas.picture(still, {v: [node["id"] for node in g["nodes"]] for v, g in seen.items()}, view)
+        progress(1)
+
+
+def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, Graph]]:
+    """What each viewer saw when each still's decision began."""
+    moment, found = None, dict[str, Graph]()
+    for still in listed:
         if still.seen != moment:
             moment = still.seen
-            seen = {
-                v.id: [node["id"] for node in scene_graph(played.scenario, moment, v.id)["nodes"]]
-                for v in (moment.ego, *moment.helpers)
-            }
-        yield canvas.picture(still, seen)
+            found = {v.id: scene_graph(scenario, moment, v.id) for v in (moment.ego, *moment.helpers)}
+        yield found
+
+
+def _views(
+    scenario: Scenario, listed: Sequence[Still], graphs: Iterable[Mapping[str, Graph]]
+) -> Iterable[View]:
+    """What each still shows: one view from each decision to the next, then one for each of their periods."""
+    period_s, zone_m = scenario.parameters.decision_period_s, scenario.road().zone_m
+    held = []
+    for still, seen in zip(listed, graphs, strict=True):
+        now = still.since_s < period_s  # later, who was asked last and who was met is of the past
+        asked = [message.sender for message in still.decision.messages] if now else []
+        graph = seen[still.state.ego.id] if now else None
+        held.append(spots(still.state, zone_m, graph, (still.danger, *asked)))
+    return views(held, [int(still.state.time_s / period_s + 1e-6) for still in listed], shape_of(scenario))

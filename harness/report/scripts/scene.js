@@ -31,17 +31,6 @@ function placed(taken, view, x, y, width, height, away) {
   return best;
 }
 
-// A square around where paths cross and who comes there, as [west, north, side] in the picture's metres.
-function action(world, ego, sees, messages, most) {
-  const who = world.vehicles.filter((v) => v === ego || v.part === "danger" || sees.conflicts.some((c) => c.with === v.id)
-    || messages.some((m) => m.from === v.id));
-  const near = who.filter((v) => Math.hypot(v.x - ego.x, v.y - ego.y) < most);
-  const spots = [...near.map((v) => [v.x, -v.y]), ...sees.conflicts.map((c) => [c.x, -c.y])];
-  const [xs, ys] = [0, 1].map((k) => spots.map((spot) => spot[k]));
-  const side = Math.min(2 * most, Math.max(44, Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys)) + 16);
-  return [(Math.max(...xs) + Math.min(...xs) - side) / 2, (Math.max(...ys) + Math.min(...ys) - side) / 2, side];
-}
-
 // What lies behind walls and vehicles as seen from the middle of one, which is where its rays begin.
 function shadows(world, eye, far) {
   const shapes = [...world.buildings.map((b) => b.corners), ...world.vehicles.filter((v) => v !== eye).map(corners)];
@@ -59,7 +48,8 @@ function birdsEye(world, ground, viewer, messages, zoom) {
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
   const seen = new Set([viewer, ...sees.seen]), most = ground.view_m;
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
-  const [west, north, side] = zoom === "all" ? [-most, -most, 2 * most] : action(world, ego, sees, messages, most);
+  const [west, south, side] = zoom === "all" ? [-most, -most, 2 * most] : sees.views[messages.map((m) => m.from).join(" ")];
+  const north = -south - side;
   const view = [west, north, west + side, north + side], size = side / 38;
   const within = (v) => v.x > west + 1 && v.x < view[2] - 1 && -v.y > north + 1 && -v.y < view[3] - 1;
   const hidden = world.vehicles.filter((v) => !seen.has(v.id)).map((v) => v.id);
