@@ -176,6 +176,22 @@ def test_one_that_begins_as_a_model_of_texts_reads_texts_as_that_does(asked: lis
     assert torch.allclose(one, other[..., : one.shape[-1]], atol=1e-5)
 
 
+def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words(
+    lessons: Lessons, asked: list[Question], tmp_path: Path
+):
+    tokenizer = train_tokenizer([m["content"] for q in asked for m in q.messages])
+    new_model(tokenizer, 1).save_pretrained(tmp_path)
+    save_tokenizer(tokenizer, tmp_path)
+    both = replace(lessons, prompts=(prompts.load("v4"), prompts.load("v8")), scenes=lessons.scenes[::9])
+    student = Student([both], PLAN, tmp_path, "cpu", base=tmp_path)
+    texts, pictures = ([q for q in student.questions if (q.image is None) == of] for of in (True, False))
+    read = student.read(student.reading(texts))  # the base's own, as nothing was learnt since
+    for text, seen, intent, sample in zip(texts, pictures, read, student.reading(pictures), strict=True):
+        assert text.key.rpartition("/")[0] == seen.key.rpartition("/")[0]
+        assert sample.target == pytest.approx(intent)
+    assert all(s.target is q.label for q, s in zip(texts, student.reading(texts), strict=True))
+
+
 def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
     model = new_model(read_tokenizer(folder, sees=True), 0, sees=True)
     with pytest.raises(UserError, match=r"--base .*give the folder of a model that `harness distill` made"):

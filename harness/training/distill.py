@@ -127,6 +127,7 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """README.md of a model's folder, from what `distill` returns: data, losses and limits."""
     plan, base = facts["plan"], facts["base_sha256"]
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"
+    before = " The base may have learnt from these layouts, as its own card says." if base else ""
     kind = "Qwen3-VL" if facts["sees"] else "Qwen3"
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
@@ -150,7 +151,7 @@ model that fits beside the source; it says nothing about Qwen3-4B or any other m
 - Seed {plan["seed"]}, batches of {plan["batch"]}, Muon {plan["muon_lr"]:g} and AdamW {plan["adam_lr"]:g}.
 
 The read-out on layouts held out, KL to the soft labels in nats, beside that of always answering the mean
-label:
+label.{before}
 
 | scenario | scenes learnt | layouts held out | questions | KL | of the mean |
 |---|---|---|---|---|---|

@@ -47,19 +47,27 @@ class Student:
             take_over(self.model, base)
         self.model.to(device)
         self._shared: dict[str, Any] = {}
+        self.taught: dict[str, Floats] = {}  # by scenario, scene and viewer
+        if base and sees:
+            texts = [q for q in self.questions if q.image is None]
+            read = self.read(self.reading(texts))
+            self.taught = {_place(q): intent for q, intent in zip(texts, read, strict=True)}
 
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
-        """Samples where one letter is asked for; drawn by the label, it is followed by a report in words.
+        """Samples where one letter is asked for; drawn by the target, it is followed by a report in words.
 
-        The report is of the nearest conflict, or of whom the picture shows, where there is one and `seen` is
-        true.
+        The target is the label. A picture's is what the base reads out of the same viewer's scene graph in
+        words, if it learns both: a label depends on what nobody sees as well, which is noise to an eye that
+        has yet to open. The report is of the nearest conflict, or of whom the picture shows, where there is
+        one and `seen` is true.
         """
         rng = np.random.default_rng(self.plan.seed)
         samples = []
         for q in questions:
-            letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=q.label)]
+            target = self.taught.get(_place(q), q.label) if q.image else q.label
+            letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=target)]
             report = sights(q.graph) if seen and q.image else evidence(q.graph, q.named)
-            samples.append(self._sample(q.read_out, f"{letter}: {report}{END}", q.label, q.image))
+            samples.append(self._sample(q.read_out, f"{letter}: {report}{END}", target, q.image))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
@@ -203,3 +211,9 @@ class Student:
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts, sees).save(str(file))
         return Tokenizer.from_file(str(file))
+
+
+def _place(question: Question) -> str:
+    """Scenario, scene and viewer of a question, and whether messages are in it, whatever its prompt."""
+    place, _, version = question.key.rpartition("/")
+    return place + "+m" * version.endswith("+m")

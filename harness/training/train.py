@@ -39,6 +39,7 @@ PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens
 TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
 LOG_STEPS = 50  # the loss is averaged over so many steps
 CELLS_WEIGHT = 1.0  # of the cross-entropy of what each token of a picture shows
+SEEN_WEIGHT = 4.0  # of the read-out of a picture, which is small beside what else it is fitted to
 KEEP_S = 60.0  # a killed run loses at most so much
 
 
@@ -206,7 +207,8 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
         kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
         # Beside the letters nothing should be likely where a letter is asked for.
         outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
-        total = total + (kl + 0.1 * outside.mean()) * len(reading) / len(batch)
+        kl_weight = SEEN_WEIGHT if batch[0].image else 1.0  # all of a kind have a picture, or none has
+        total = total + (kl_weight * kl + 0.1 * outside.mean()) * len(reading) / len(batch)
     said = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
     writing = [(i, start, end) for i, start, end in said if start < end]
     if writing:
