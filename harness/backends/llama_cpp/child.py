@@ -71,7 +71,7 @@ class Child:
         return prompts
 
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
-        """Return an attribute of the backend by its dotted name; call it with the arguments if it is a method.
+        """Return an attribute of the backend by its dotted name; call it if it is a method.
 
         Raises:
             UserError: the backend raised it, or died of the call.
