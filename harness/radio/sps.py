@@ -69,7 +69,7 @@ class Scheduling:
         return self._same(apart_m, taken, threshold_dbm)
 
     def _taken(self, threshold_dbm: float, times: int) -> float:
-        """Return the resources that count as taken: those of `times` the sensed packets (29, 29.1; 32, 33)."""
+        """Count the resources taken: those of `times` the sensed packets (29, 29.1; 32, 33)."""
         metres = np.abs(np.arange(-REACH_M, REACH_M + 1.0))
         return taken(times * self.per_m * float(self.sensed(metres, threshold_dbm).sum()), self.resources)
 
