@@ -20,14 +20,14 @@ def purpose(first: int, count: int) -> Purpose:
     Raises:
         UserError: they have more than one purpose.
     """
-    found = purposes(first, count)
-    if len(found) > 1:
+    present = purposes(first, count)
+    if len(present) > 1:
         ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]
         raise UserError(
-            f"layout seeds {first} to {first + count - 1} are for {' and '.join(found)}; keep to one of "
+            f"layout seeds {first} to {first + count - 1} are for {' and '.join(present)}; keep to one of "
             f"{', '.join(ends)}, {FIRST['report']} and above (report)"
         )
-    return found[0]
+    return present[0]
 
 
 def stated(first: int, count: int) -> str:

@@ -178,8 +178,8 @@ def _open(opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> A
 
 
 def _get(backend: Any, attribute: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
-    found = attrgetter(attribute)(backend)
-    return found(*arguments, **options) if callable(found) else found
+    value = attrgetter(attribute)(backend)
+    return value(*arguments, **options) if callable(value) else value
 
 
 def _attempt(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:

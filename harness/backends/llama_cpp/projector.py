@@ -99,10 +99,10 @@ class Projector:
         self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
         self._layouts: dict[tuple[int, ...], list[Sequence[int] | int]] = {}
         self._encoded: OrderedDict[int, dict[int, Run]] = OrderedDict()
-        found = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
-        if found != vision.tokens:
+        count = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
+        if count != vision.tokens:
             raise UserError(
-                f"{shown} makes {found} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
+                f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
                 f"card's [vision] {vision.tokens}; mend the card, or give the model's own projector"
             )
 
@@ -111,8 +111,8 @@ class Projector:
         layout = self._layout(image.pixels.shape[:2])
         numbers = picture_tokens(image, sum(part for part in layout if isinstance(part, int)))
         self._images[picture_of(numbers[0])[0]] = image
-        left = iter(numbers)
-        return [t for part in layout for t in (islice(left, part) if isinstance(part, int) else part)]
+        remaining = iter(numbers)
+        return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
         """Return the part of a picture that begins with a token.

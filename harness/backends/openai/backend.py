@@ -107,8 +107,9 @@ class OpenAIBackend:
         first_at_s, tokens = reply.first_at_s, answer.completion_tokens
         if request.answer == "readout":
             first_at_s, tokens = end_s, 1
-        untimed = seconds is None or first_at_s is None or answer.error
-        first_s = None if untimed or first_at_s is None else first_at_s - reply.begun_s
+        first_s = None
+        if seconds is not None and first_at_s is not None and not answer.error:
+            first_s = first_at_s - reply.begun_s
         return Completion(
             request_id=request.id,
             text=answer.text,

@@ -108,7 +108,7 @@ class Farm:
         self._client, self._server, self._name, self._weights = client, server, printable(name), weights
         self._at_once = at_once
         self._places = [_Place(url) for url in server.urls]
-        self._owed: set[_Pending] = set()
+        self._pending: set[_Pending] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._woken = False
         self._refused: Exception | None = None
@@ -148,12 +148,12 @@ class Farm:
         if self._refused:
             raise self._refused
         pending = _Pending(key, build, asyncio.get_running_loop().create_future())
-        self._owed.add(pending)
+        self._pending.add(pending)
         try:
             self._queue(pending)
             return await pending.reply
         finally:
-            self._owed.discard(pending)
+            self._pending.discard(pending)
 
     # -- who is asked ---------------------------------------------------------------------------------------
 
@@ -164,10 +164,10 @@ class Farm:
         weights = {p: blake2b(f"{p.url} {key}".encode(), digest_size=8).digest() for p in self._places}
         return sorted(self._places, key=weights.__getitem__)
 
-    def _queue(self, owed: _Pending) -> None:
+    def _queue(self, pending: _Pending) -> None:
         """Queue a request at its key's server, or at the next that is up and has failed it less often."""
-        place = min(self._ranked(owed.key), key=lambda place: (place.aside, owed.failed[place]))
-        (place.queue.appendleft if owed.failed else place.queue.append)(owed)  # a retry goes first
+        place = min(self._ranked(pending.key), key=lambda place: (place.aside, pending.failed[place]))
+        (place.queue.appendleft if pending.failed else place.queue.append)(pending)  # a retry goes first
         self._wake()
 
     def _wake(self) -> None:
@@ -181,35 +181,35 @@ class Farm:
         available = [place for place in self._places if not place.aside]
         for take in (self._own, self._take):  # first each server's own queue
             for place in available:
-                while place.busy < self._at_once and (owed := take(place)):
+                while place.busy < self._at_once and (pending := take(place)):
                     place.busy += 1
-                    self._run(self._work(place, owed))
+                    self._run(self._work(place, pending))
 
     def _own(self, place: _Place) -> _Pending | None:
         """Take the next request from a server's own queue."""
         while place.queue:
-            if not (owed := place.queue.popleft()).reply.done():  # its caller may have been cancelled
-                return owed
+            if not (pending := place.queue.popleft()).reply.done():  # its caller may have been cancelled
+                return pending
         return None
 
     def _take(self, place: _Place) -> _Pending | None:
         """Take the next request from a server's own queue, or else one from the end of the longest queue."""
         if place.aside:
             return None
-        if owed := self._own(place):
-            return owed
+        if pending := self._own(place):
+            return pending
         queue = max((other.queue for other in self._places), key=len)
         return queue.pop() if queue and not queue[-1].failed[place] else None
 
-    async def _work(self, place: _Place, owed: _Pending | None) -> None:
+    async def _work(self, place: _Place, pending: _Pending | None) -> None:
         """Send a server one request after another until none is left for it."""
-        while owed:
+        while pending:
             try:
-                await self._ask(place, owed)
+                await self._ask(place, pending)
             except Exception as error:  # a bug, which the caller must see
-                if not owed.reply.done():
-                    owed.reply.set_exception(error)
-            owed = self._take(place)
+                if not pending.reply.done():
+                    pending.reply.set_exception(error)
+            pending = self._take(place)
         place.busy -= 1
 
     def _run(self, work: Coroutine[Any, Any, None]) -> None:
@@ -217,34 +217,34 @@ class Farm:
         self._tasks.add(task)  # the event loop holds only weak references to tasks
         task.add_done_callback(self._tasks.discard)
 
-    async def _ask(self, place: _Place, owed: _Pending) -> None:
+    async def _ask(self, place: _Place, pending: _Pending) -> None:
         """Send a request until it is answered, another server may answer it, or no attempt is left."""
         while True:
             place.begun += 1
             nth, first = place.begun, place.busy == 1
-            owed.begun_s = perf_counter() if owed.begun_s is None else owed.begun_s
-            reply = await self._client.post(place.url, _PATH, json.dumps(owed.body()).encode())
+            pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
+            reply = await self._client.post(place.url, _PATH, json.dumps(pending.body()).encode())
             alone = first and place.begun == nth
-            reply = replace(reply, retries=owed.failed[place], begun_s=owed.begun_s, alone=alone)
+            reply = replace(reply, retries=pending.failed[place], begun_s=pending.begun_s, alone=alone)
             if not reply.again:
                 place.failures = place.pauses = 0
                 break
-            owed.failed[place] += 1
+            pending.failed[place] += 1
             if reply.status != 429:
                 self._failed(place, reply)
-            if any(not owed.failed[other] for other in self._places if not other.aside):
-                self._queue(owed)
+            if any(not pending.failed[other] for other in self._places if not other.aside):
+                self._queue(pending)
                 return
-            attempts = owed.failed.total()
+            attempts = pending.failed.total()
             if attempts > self._server.retries:
                 break
             wait_s = pause_s(attempts - 1) if reply.after_s is None else reply.after_s
             await asyncio.sleep(min(wait_s, LONGEST_WAIT_S))
             if place.aside:
-                self._queue(owed)
+                self._queue(pending)
                 return
-        if not owed.reply.done():
-            owed.reply.set_result(reply)
+        if not pending.reply.done():
+            pending.reply.set_result(reply)
 
     # -- who breaks down ------------------------------------------------------------------------------------
 
@@ -263,11 +263,11 @@ class Farm:
         self._queue_again(place)
 
     def _queue_again(self, *places: _Place) -> None:
-        waiting = [owed for place in places for owed in place.queue]
+        waiting = [pending for place in places for pending in place.queue]
         for place in places:
             place.queue.clear()
-        for owed in waiting:
-            self._queue(owed)
+        for pending in waiting:
+            self._queue(pending)
 
     async def _await(self, place: _Place) -> None:
         """Ask a server that was set aside for its model, after longer and longer pauses, until it answers."""
@@ -298,9 +298,9 @@ class Farm:
         self._wake()
 
     def _end(self, error: Exception) -> None:
-        for owed in list(self._owed):
-            if not owed.reply.done():
-                owed.reply.set_exception(error)
+        for pending in list(self._pending):
+            if not pending.reply.done():
+                pending.reply.set_exception(error)
 
     def _faults(self) -> str:
         return "; ".join(f"{printable(place.url)} ({place.fault})" for place in self._places)
