@@ -1,6 +1,6 @@
-"""What a backend is: requests in, completions out, order kept.
+"""The interface of a backend: requests in, completions out, in the same order.
 
-A backend batches, threads or loops inside as suits its engine; nothing else in the program knows.
+How a backend batches or threads inside is its own matter; the rest of the program does not depend on it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Role = Literal["ego", "helper"]
 AnswerMode = Literal["json", "constrained", "readout"]
 FinishReason = Literal["stop", "length", "error"]
-AGAIN = "#2"  # behind the id of a repair turn's request
+AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Request:
     """One question to a small language model.
 
     Attributes:
-        id: unique in a run, `<scene>/<viewer>`; `AGAIN` stands behind that of a repair turn.
+        id: unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`.
         role: which prompt of the version was rendered, and which schema the answer has.
         messages: chat messages, `{"role": "system" | "user" | "assistant", "content": text}`.
         actions: meta-action names, in the environment's order.
@@ -32,20 +32,19 @@ class Request:
         form: what the prompt asks a helper for: `distribution`, or `recommendation` with a confidence.
         answer: how the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
             choices of a fixed text. `readout`: the messages ask for one letter (see
-            `harness.prompts.readout`), whose probabilities are the answer.
-        thinking: whether the model was asked to think first (where its template can).
+            `harness.prompts.readout`), and the letters' probabilities are the answer.
+        thinking: whether the model is asked to think first (if its template can switch that).
         reasons_first: whether the prompt asks for reasons before the answer.
-        temperature: 0 takes the likeliest token each time; above, tokens are drawn from softmax(logits /
+        temperature: 0 takes the likeliest token each time; above 0, tokens are drawn from softmax(logits /
             temperature).
-        sample: which of several answers to one question, and so the seed of its draws; 0 where one is asked
-            for.
-        timed: whether it is asked to measure its time: a server streams it then, which shows its first token.
+        sample: number of the answer among several to one question, which seeds its draws; 0 if there is one.
+        timed: whether the answer's time is measured; a server then streams it, which shows the first token.
         agent: which of the run's agents is asked: 0 is the ego's.
-        image: the picture before the text of the user's message that asks; None where there is none.
-        view: the viewer's own scene graph. Only backends that are no language model read it
-            (`proxy`, the drivers); it holds nothing that the prompt's author could not see.
+        image: the picture before the text of the last user message; None if there is none.
+        view: the viewer's own scene graph. Only backends without a language model read it (`proxy`, the
+            drivers); it holds nothing that the prompt's author could not see.
         truth: scene graph with everything in view; None unless the card is `privileged`.
-        scenario: what the view is of; only backends that read the view read it.
+        scenario: scenario of the view; only backends that read the view read it.
     """
 
     id: str
@@ -68,30 +67,31 @@ class Request:
 
     @property
     def image_sha256(self) -> str | None:
-        """Digest of its picture's pixels; None where there is none."""
+        """Digest of the picture's pixels; None without a picture."""
         return self.image.sha256 if self.image else None
 
 
 @dataclass(frozen=True)
 class Completion:
-    """One answer.
+    """One answer to a request.
 
     Attributes:
         request_id: the request's id.
-        text: what the model said, untouched; empty on error.
-        prompt_tokens: tokens in; None if the engine has no tokenizer.
-        completion_tokens: tokens out; None if the engine has no tokenizer.
+        text: the model's text, unchanged; empty on an error.
+        prompt_tokens: tokens of the prompt; None if the engine has no tokenizer.
+        completion_tokens: tokens of the answer; None if the engine has no tokenizer.
         finish_reason: `stop`, `length` (cut off by max_tokens) or `error`.
-        seconds: time of this answer, only where its request was alone (batch_size 1), else None:
-            a batch's wall time is no answer's latency.
-        batch_size: how many requests went through the engine together.
-        error: the engine's message when finish_reason is `error`.
-        label_mass: probability on the letters together, of a `readout`; None otherwise.
-        retries: attempts that failed before this one; their time is in `seconds`.
-        cached: it comes from the cache, so it has no seconds.
-        slow_s: seconds that this answer is declared to take beyond its card's latency: a proxy's slow tail.
-        first_token_s: time to first token (TTFT), prefill included; None where `seconds` is, or not known.
-        token_s: time per output token (TPOT, see `per_token_s`); None where there is none after the first.
+        seconds: time of this answer if its request ran alone (batch_size 1), else None: the wall time of a
+            batch is not the latency of an answer.
+        batch_size: number of requests that went through the engine together.
+        error: the engine's message if finish_reason is `error`.
+        label_mass: total probability of the letters in a `readout`; None otherwise.
+        retries: failed attempts before this one; their time is in `seconds`.
+        cached: whether it comes from the cache, in which case it has no seconds.
+        slow_s: declared seconds of this answer beyond its card's latency (the slow tail of a proxy).
+        first_token_s: time to first token (TTFT), prefill included; None if `seconds` is None or it is not
+            known.
+        token_s: time per output token (TPOT, see `per_token_s`); None if there is only one token.
     """
 
     request_id: str
@@ -111,10 +111,11 @@ class Completion:
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
-    """Time per output token (TPOT): seconds after the first token, for each token after it.
+    """Return the time per output token (TPOT): the seconds after the first token, for each later token.
 
-    (seconds - first_token_s) / (tokens - 1), as `vllm bench serve` has it. Tokens are those that the model
-    chose: the fixed ones of a constrained answer are read, and their time is in that of the next one chosen.
+    It is (seconds - first_token_s) / (tokens - 1), as in `vllm bench serve`. Only tokens that the model chose
+    count: the fixed tokens of a constrained answer are read as input, and their time is part of the next
+    chosen token's.
     """
     if first_token_s is None or tokens is None or tokens < 2:
         return None
@@ -122,22 +123,22 @@ def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None)
 
 
 class Backend(Protocol):
-    """An engine that answers."""
+    """Answers requests."""
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order. A failed request is a completion with an error."""
+        """Return one completion per request, in the same order; a failed request's has an error."""
         ...
 
     def identity(self) -> dict[str, Any]:
-        """What decides the answers, as JSON: engine, versions, weights, settings. It goes in the manifest."""
+        """Return what decides the answers, as JSON for the manifest: engine, versions, weights, settings."""
         ...
 
 
 class Rendering(Backend, Protocol):
-    """A backend of a language model, which can say what its model is sent."""
+    """A backend of a language model that can show the prompts that its model is sent."""
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """The prompt of each request as the model reads it; as a server is sent it, where that renders it.
+        """Return each request's prompt as the model reads it, or as sent to a server that renders it itself.
 
         Raises:
             UserError: the chat template refuses the messages.
@@ -146,16 +147,16 @@ class Rendering(Backend, Protocol):
 
 
 def window(backend: Backend) -> int:
-    """Requests that a backend has under way at most, if several threads may call `complete` at once.
+    """Return the most requests that a backend works on at once, if threads may call `complete` concurrently.
 
-    0 for one that takes one call after the other, which has no `window`.
+    0 for a backend that takes one call at a time; it has no attribute `window`.
     """
     return getattr(backend, "window", 0)
 
 
 class Timed(Backend, Protocol):
-    """A backend whose answers were timed before, so that they are not timed again."""
+    """A backend whose answers were timed earlier, so that they are not timed again."""
 
     def latency(self) -> "Latency":
-        """What the decisions of the replayed run were made with."""
+        """Return the latency with which the decisions of the replayed run were made."""
         ...

@@ -1,6 +1,6 @@
-"""Completions kept between runs: a model answers the same question once.
+"""The completion cache: keep completions between runs, so that a model answers the same question only once.
 
-The cache only saves time. A run's rows hold its answers, and if the file does not work the run continues
+The cache only saves time. A run's rows hold its answers, and if the file does not work, the run continues
 without it.
 """
 
@@ -22,7 +22,7 @@ from harness.core.files import digest
 
 T = TypeVar("T")
 
-# Fields of a request that decide nothing of its answer. Every other field is in the key.
+# Fields of a request that do not affect its answer. Every other field is in the key.
 NOT_IN_KEY = {
     "id": "names the place in a run; the model never reads it",
     "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
@@ -33,26 +33,26 @@ NOT_IN_KEY = {
     "truth": "no language model reads it",
     "scenario": "no language model reads it; its actions are a field of their own",
 }
-# What a completion has of its own asking, and not of its answer.
+# Fields of a completion that describe one request's handling and not the answer.
 _NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached")
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
-_WAIT_S = 30.0  # for another process that is writing
-_AT_ONCE = 500  # keys of one look-up; SQLite has a limit
+_WAIT_S = 30.0  # longest wait for another process that is writing
+_AT_ONCE = 500  # keys in one query; SQLite has a limit
 _TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
-# The program's own part in an answer, how it is asked for and put into text: other code finds no old answers.
+# Code that takes part in an answer. Its digest is in the key, so changed code finds no old answers.
 _CODE = ("backends/**/*.py", "prompts/answer_schema.py", "prompts/readout.py", "core/rounding.py")
 
 
 def default_file() -> Path:
-    """Where completions are kept unless another file is named."""
+    """Return the file in which completions are kept if no other is named."""
     return kept.folder() / "completions.sqlite"
 
 
 def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
-    """Hex digest of all that decides an answer; no prompt and no secret can be read out of it.
+    """Return the hex digest of all that decides an answer; it reveals no prompt and no secret.
 
-    How many requests went through the engine together is left out: in float32 company changes no answer. In
-    16 bits it may move one by rounding, with a cache or without; the identity holds the number format.
+    The batch size is left out: in float32 other requests in a batch change no answer. In 16 bits they may
+    move one by rounding, with or without a cache; the identity holds the number format.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     asked["image"] = request.image_sha256
@@ -60,30 +60,30 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request) -> str:
 
 
 class CompletionFile:
-    """The file. It is opened anew for every call, so that one that was deleted is simply empty again.
+    """The SQLite file. It is opened for every call, so a file that was deleted is simply empty again.
 
-    Both methods raise sqlite3.Error or OSError where it cannot be read or written.
+    Both methods raise sqlite3.Error or OSError if it cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def find(self, keys: Sequence[str]) -> dict[str, Completion]:
-        """The completions that are there, by key. They have no seconds, and their request's id is empty."""
+        """Return the stored completions by key. They have no seconds, and their request's id is empty."""
         rows: list[tuple[str, str]] = []
         with self._open() as file:
             for start in range(0, len(keys), _AT_ONCE):
-                some = keys[start : start + _AT_ONCE]
-                marks = ",".join("?" * len(some))
-                rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", some)
+                chunk = keys[start : start + _AT_ONCE]
+                marks = ",".join("?" * len(chunk))
+                rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", chunk)
         try:
             return {key: _completion(json.loads(answer)) for key, answer in rows}
         except (ValueError, TypeError) as error:
             raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
 
     def add(self, completions: Mapping[str, Completion]) -> None:
-        """Keep completions by key; one that is there already stays."""
-        # ASCII, since a completion may hold a lone surrogate, which no file takes.
+        """Store completions by key; a stored one is not replaced."""
+        # JSON in ASCII: a completion may hold a lone surrogate, which cannot be written as UTF-8.
         rows = [(key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()]
         with self._open() as file:
             file.execute("BEGIN IMMEDIATE")
@@ -105,17 +105,17 @@ def _completion(kept: dict[str, Any]) -> Completion:
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
-    """A card's backend with a cache before it, if there is a file and its prompts are known."""
+    """Put a cache before a card's backend, if there is a file and the backend can show its prompts."""
     if file is None or not capabilities(card.engine).renders:
         return backend
     return Cached(cast("Rendering", backend), file)
 
 
 class Cached:
-    """A backend whose answers are kept, except errors. A kept answer has no seconds.
+    """A backend with a cache of its answers, except errors. A cached answer has no seconds.
 
     Attributes:
-        backend: answers what is not kept.
+        backend: answers the requests that are not cached.
     """
 
     def __init__(self, backend: Rendering, file: Path) -> None:
@@ -125,26 +125,26 @@ class Cached:
         self.window = window(backend)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order; the backend answers those that are not kept."""
+        """Return one completion per request, in order; the backend answers those that are not cached."""
         prompts = self.backend.rendered(requests)
         keys = [key(self._identity, p, r) for p, r in zip(prompts, requests, strict=True)]
-        kept = self._try(lambda file: file.find(keys)) or {}
-        owed = [r for k, r in zip(keys, requests, strict=True) if k not in kept]
-        asked = iter(self.backend.complete(owed) if owed else [])
-        done = [
-            replace(kept[k], request_id=r.id) if k in kept else next(asked)
+        known = self._try(lambda file: file.find(keys)) or {}
+        missing = [r for k, r in zip(keys, requests, strict=True) if k not in known]
+        answers = iter(self.backend.complete(missing) if missing else [])
+        completions = [
+            replace(known[k], request_id=r.id) if k in known else next(answers)
             for k, r in zip(keys, requests, strict=True)
         ]
-        good = {k: c for k, c in zip(keys, done, strict=True) if c.error is None and not c.cached}
-        if good:
-            self._try(lambda file: file.add(good))
-        return done
+        new = {k: c for k, c in zip(keys, completions, strict=True) if c.error is None and not c.cached}
+        if new:
+            self._try(lambda file: file.add(new))
+        return completions
 
     def identity(self) -> dict[str, Any]:
         return self._identity
 
     def _try(self, work: Callable[[CompletionFile], T]) -> T | None:
-        """The result of some work on the file; None once the file has failed."""
+        """Return the result of some work on the file; None once the file has failed."""
         if self._file is None:
             return None
         try:

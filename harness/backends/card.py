@@ -1,4 +1,4 @@
-"""A model card: what a model is, what it may see and where its latency comes from; and its file."""
+"""The model card: a record of a model, its engine, its weights and its latency, read from a TOML file."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,11 +21,12 @@ Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 
 
 @dataclass(frozen=True)
 class Latency:
-    """Time of one answer.
+    """Declared time of one answer.
 
     Attributes:
-        source: `card` takes `inference_s`; `paper`, for a card that declares no time, the paper's 145 ms.
-        inference_s: declared seconds of one answer; None if the paper's count.
+        source: `card` means `inference_s`; `paper`, for a card that declares no time, means the paper's
+            145 ms.
+        inference_s: declared seconds of one answer; None for the paper's.
         basis: where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date".
     """
 
@@ -45,26 +46,26 @@ class Card:
     Attributes:
         name: file stem of the card, `<stem>:<engine>`, name of the directory or GGUF file, hub id, or
             `replay:<run>`.
-        engine: which backend answers.
+        engine: name of the engine that answers.
         description: one line for people.
-        latency: time of one answer.
+        latency: declared time of one answer.
         weights: directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
-            `replay`; the name a server knows the model by for `openai`; None if model-free.
-        file: name of the GGUF file in `weights`; None where `weights` is the file, or needs none.
-        revision: branch, tag or commit on the hub; None is its default branch.
-        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, compared with it on loading.
-        gated: the hub gives the weights only to who has accepted their licence there.
-        dtype: number format of a checkpoint's weights; `auto` is its own.
-        quantisation: number format of a GGUF file's weights, for people; the file has the say.
-        context_tokens: most tokens of prompt and answer together; None takes the checkpoint's own.
+            `replay`; the server's name of the model for `openai`; None without a model.
+        file: name of the GGUF file in `weights`; None if `weights` is the file itself, or no file is needed.
+        revision: branch, tag or commit on the hub; None means its default branch.
+        sha256: digest of the GGUF file, or of a checkpoint's model.safetensors, checked on loading.
+        gated: whether the hub gives the weights only to those who have accepted their licence there.
+        dtype: number format of a checkpoint's weights; `auto` is the checkpoint's own.
+        quantisation: number format of a GGUF file's weights, for people only; the file decides.
+        context_tokens: most tokens of prompt and answer together; None means the checkpoint's own limit.
         thinking: `switch` if its chat template can turn thinking on and off, `always` if it cannot be off.
-        privileged: sees the truth behind the occlusion: an upper reference, never a contestant.
-        licence: SPDX id of the weights, or their licence's name where it has none.
-        max_new_tokens: most tokens of an answer, where the model needs another bound than its prompt's.
-        thinking_tokens: most tokens of a thought, on top of the answer's where the model is asked to think.
-        server: where an `openai` model is asked; None for other engines.
+        privileged: whether it sees the truth behind the occlusion: an upper reference, never a contestant.
+        licence: SPDX id of the weights' licence, or its name if it has no id.
+        max_new_tokens: most tokens of an answer, if the model needs another limit than its prompt's.
+        thinking_tokens: most tokens of a thought, in addition to the answer's, if asked to think.
+        server: the server of an `openai` model; None for other engines.
         failures: how often the proxy fails on purpose; None if it never does.
-        vision: how it takes pictures; None if it reads texts alone.
+        vision: how the model takes pictures; None if it only reads text.
         projector: name of the GGUF file beside `file` that turns pictures into tokens.
     """
 
@@ -91,60 +92,60 @@ class Card:
     projector: str | None = None
 
     def at(self, urls: tuple[str, ...]) -> "Card":
-        """The same of a served model, behind any of these servers; itself where none is given.
+        """Return the card of a served model with other servers; the card itself if `urls` is empty.
 
         Raises:
-            ValueError: one is no base URL, or is named twice.
+            ValueError: one is not a base URL, or is named twice.
         """
         return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
 
 
 @dataclass(frozen=True)
 class _File(Card):
-    """What a file may say: a card, and what is different on other engines."""
+    """The content of a card file: a card, and what is different on other engines."""
 
     engines: dict[str, Any] = field(default_factory=dict)
 
 
-# Keys that mean something to some engines only; a `Registration` says to which.
-_OF_SOME = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation", "failures",
-            "privileged", "vision", "projector")  # fmt: skip
-# Keys that a model may have anew for each engine that it runs on.
-_ANEW = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation", "server",
-         "projector")  # fmt: skip
+# Keys that only some engines understand; a `Registration` says which.
+_ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
+                "failures", "privileged", "vision", "projector")  # fmt: skip
+# Keys that a model may set again for each further engine.
+_PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
+               "server", "projector")  # fmt: skip
 
 
 def read(path: Path) -> list[Card]:
-    """A file's model on each of its engines; the one it runs on unasked is first.
+    """Read the cards in a file: the model on each of its engines, its default engine first.
 
     Raises:
-        UserError: for every mistake in the file, in one line.
+        UserError: the file has a mistake.
     """
     where = f"model card {path}"
     table = _whole(toml(path, where))
     others = convert(table, _File, where, name=path.stem).engines
     table.pop("engines", None)
     cards = [_card(table, where, path.stem)]
-    shared = {key: value for key, value in table.items() if key not in _ANEW}
-    if cards[0].latency.source == "paper":  # one that was declared says nothing of another engine
+    shared = {key: value for key, value in table.items() if key not in _PER_ENGINE}
+    if cards[0].latency.source == "paper":  # a declared latency does not hold for another engine
         shared["latency"] = table["latency"]
-    for engine, anew in others.items():
+    for engine, settings in others.items():
         at = f"{where} [engines.{printable(engine)}]"
         other = None if engine == table["engine"] else find(engine)
         if other is None or "weights" not in other.allowed_keys:
             allowed = [name for name in _takers("weights") if name != table["engine"]]
             raise unknown(f"engine in {where}", engine, allowed)
-        if not isinstance(anew, dict):
-            raise UserError(f"{at} = {printable(anew)!r}; allowed: a table")
-        for key in anew:
-            if key not in _ANEW:
-                raise unknown(f"key in {at}", key, _ANEW)
-        cards.append(_card(_whole({**shared, **anew, "engine": engine}), at, f"{path.stem}:{engine}"))
+        if not isinstance(settings, dict):
+            raise UserError(f"{at} = {printable(settings)!r}; allowed: a table")
+        for key in settings:
+            if key not in _PER_ENGINE:
+                raise unknown(f"key in {at}", key, _PER_ENGINE)
+        cards.append(_card(_whole({**shared, **settings, "engine": engine}), at, f"{path.stem}:{engine}"))
     return cards
 
 
 def _whole(table: dict[str, Any]) -> dict[str, Any]:
-    """A table with the `inference_s` that is left out where no time is declared."""
+    """Add to a card's table the `inference_s` that is left out if no time is declared."""
     latency = table.get("latency")
     return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
 
@@ -153,7 +154,7 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
     card = convert(table, Card, where, name=name)
     if (engine := find(card.engine)) is None:
         raise unknown(f"engine in {where}", card.engine, engines())
-    for key in _OF_SOME:
+    for key in _ENGINE_KEYS:
         lacking = key in engine.required_keys and key not in table
         if lacking or (key in table and key not in engine.allowed_keys):
             shown = f"[{key}]" if key in ("server", "failures", "vision") else key
@@ -175,5 +176,5 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
 
 
 def _takers(key: str) -> list[str]:
-    """Engines whose cards may have a key that not all may have."""
+    """Return the engines that understand a key."""
     return [engine for engine, registered in registrations().items() if key in registered.allowed_keys]

@@ -1,7 +1,7 @@
-"""The model cards that are found here, and the card that a user names.
+"""Find the model card that a user names, and list all cards.
 
 A card is one file, `models/<name>.toml`; `<name>:<engine>` is the same model on another engine that the file
-names. A directory, a GGUF file, a hub id and `replay:RUN_DIR` get a card on the spot.
+lists. For a directory, a GGUF file, a hub id or `replay:RUN_DIR`, a card is made on the spot.
 """
 
 import json
@@ -23,47 +23,50 @@ __all__ = ["Card", "Dtype", "Latency", "LatencySource", "Thinking", "argument", 
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
-PROJECTOR = "mmproj-"  # how a GGUF file of one begins
-_SWITCH = b"enable_thinking"  # what a chat template calls its thinking switch
-_GGUF_HEAD = 1 << 25  # bytes of a GGUF file that hold its vocabulary and its template
+PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
+_SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
+_GGUF_HEAD = 1 << 25  # the first bytes of a GGUF file, with its vocabulary and its template
 
 
 def names() -> list[str]:
-    """Names of all card files, sorted."""
+    """Return the sorted names of all card files."""
     return resources.names("models")
 
 
 def load(name: str) -> Card:
-    """The card of a name, or of `<name>:<engine>`.
+    """Load a card by `<name>` or `<name>:<engine>`.
 
     Raises:
-        UserError: there is no such card, it names no such engine, or its file has a mistake.
+        UserError: there is no such card, it does not list the engine, or its file has a mistake.
     """
     stem, _, engine = name.partition(":")
     if stem not in names():
         raise unknown("model", name, names())
-    found = each_engine(stem)
-    if engine and engine not in {card.engine for card in found}:
-        raise unknown(f"engine of model {stem}", engine, [card.engine for card in found])
-    return next(card for card in found if engine in ("", card.engine))
+    cards = each_engine(stem)
+    if engine and engine not in {card.engine for card in cards}:
+        raise unknown(f"engine of model {stem}", engine, [card.engine for card in cards])
+    return next(card for card in cards if engine in ("", card.engine))
 
 
 def load_all() -> list[Card]:
-    """Every card, on each of its engines."""
+    """Load all cards, on each of their engines."""
     return [card for name in names() for card in each_engine(name)]
 
 
 def each_engine(stem: str) -> list[Card]:
-    """The card of a file's name on each of its engines. Raises UserError if the file has a mistake."""
+    """Load a file's card on each of its engines. Raises UserError if the file has a mistake."""
     return read(resources.find("models", f"{stem}.toml"))
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """The card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
+    """Return the card of a name, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
     Args:
         text: what the user wrote.
-        engine: what to run it on, where there is a choice; None for its own.
+        engine: engine to run it on, if there is a choice; None for the default one.
+
+    Raises:
+        UserError: there is no such model or engine, or the model does not run on the engine.
     """
     if engine is not None and engine not in engines():
         raise unknown("engine", engine, engines())
@@ -78,7 +81,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
 
 
 def argument(card: Card) -> str:
-    """What `--model` was given, or anything that resolves to the same card."""
+    """Return a value of `--model` that resolves to this card."""
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
@@ -93,7 +96,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
                 f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
             )
         return replace(
-            _made(f"replay:{run.name}", "replay", str(run), "Answers of a run"), vision=_stated(run)
+            _new_card(f"replay:{run.name}", "replay", str(run), "Answers of a run"), vision=_run_vision(run)
         )
     where = _path(text)
     if where is not None and where.is_dir():
@@ -101,7 +104,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
     if where is not None and where.suffix == ".gguf":
         return _of_file(text, where)
     if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
-        return _made(text, "transformers", text, "Hub model without a card")
+        return _new_card(text, "transformers", text, "Hub model without a card")
     if "/" in text:
         raise UserError(
             f"model {printable(text)!r} is no directory, no .gguf file and no hub id; "
@@ -116,7 +119,7 @@ def _on_the_spot(text: str, engine: str | None) -> Card:
 def _of_directory(text: str, where: Path, engine: str | None) -> Card:
     files = sorted(file for file in where.glob("*.gguf") if not file.name.startswith(PROJECTOR))
     if (where / "config.json").is_file() and engine != "llama-cpp":
-        card = _made(where.name, "transformers", str(where), "Local directory", _thinking(where))
+        card = _new_card(where.name, "transformers", str(where), "Local directory", _thinking(where))
         return replace(card, vision=_vision(text, where))
     if len(files) == 1:
         return _of_file(text, files[0])
@@ -131,32 +134,32 @@ def _of_directory(text: str, where: Path, engine: str | None) -> Card:
 
 
 def _of_file(text: str, file: Path) -> Card:
-    """The card of a GGUF file, with the projector that lies beside it under its name."""
-    card = _made(file.stem, "llama-cpp", str(file), "Local GGUF file", _gguf_thinking(file))
+    """Make the card of a GGUF file, with the projector beside it that has the same name behind its prefix."""
+    card = _new_card(file.stem, "llama-cpp", str(file), "Local GGUF file", _gguf_thinking(file))
     beside = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if beside.is_file() else None
     return replace(card, vision=vision, projector=beside.name if vision else None)
 
 
 def _path(text: str) -> Path | None:
-    """What is at a path, absolute; None for any other text, however odd (`os.path` never raises)."""
+    """Return the absolute path of an existing file or folder; None for any other text."""
     path = os.path.expanduser(text)
     return Path(path).resolve() if os.path.exists(path) else None
 
 
-def _made(name: str, engine: str, weights: str, description: str, thinking: Thinking = "none") -> Card:
+def _new_card(name: str, engine: str, weights: str, description: str, thinking: Thinking = "none") -> Card:
     latency = Latency("paper", None, "none declared: the paper's")
     return Card(name, engine, description, latency, weights=weights, thinking=thinking)
 
 
 def _thinking(checkpoint: Path) -> Thinking:
-    """Whether a checkpoint's chat template knows the thinking switch, read without loading it."""
+    """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
     files = (checkpoint / name for name in _TEMPLATE_FILES)
     return "switch" if any(_SWITCH in f.read_bytes() for f in files if f.is_file()) else "none"
 
 
-def _stated(run: Path) -> Vision | None:
-    """How the model of a run took pictures; None too where nothing can be read, which opening it says."""
+def _run_vision(run: Path) -> Vision | None:
+    """Return how a run's model took pictures; None also for an unreadable run, which fails on opening."""
     with suppress(OSError, ValueError, TypeError, KeyError, UserError):
         stated = json.loads((run / "run.json").read_bytes())["model"]["vision"]
         return stated and convert(stated, Vision, "vision")
@@ -164,7 +167,7 @@ def _stated(run: Path) -> Vision | None:
 
 
 def _vision(text: str, checkpoint: Path) -> Vision | None:
-    """How a checkpoint takes pictures, by its small files. Raises UserError where they do not say."""
+    """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
     try:
         config, processor = (
             json.loads(file.read_bytes()) if file.is_file() else {}
@@ -179,6 +182,6 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
 
 
 def _gguf_thinking(file: Path) -> Thinking:
-    """Whether the chat template in a GGUF file knows the thinking switch, read without parsing the file."""
+    """Return `switch` if the chat template in a GGUF file has the thinking switch; the file is not parsed."""
     with file.open("rb") as data:
         return "switch" if _SWITCH in data.read(_GGUF_HEAD) else "none"

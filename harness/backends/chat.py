@@ -1,4 +1,4 @@
-"""A checkpoint's chat template and tokenizer: messages in, the prompt that its model reads out."""
+"""A model's chat template and tokenizer: render messages to the prompt that it reads, and encode that."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,12 +8,12 @@ from harness.core.errors import UserError, printable
 
 
 class Chat:
-    """A tokenizer that has a chat template.
+    """A tokenizer with its chat template.
 
     Attributes:
-        name: the model's.
-        template: Jinja.
-        image_token: what the template writes for a picture; None if the model takes none.
+        name: name of the model.
+        template: the template's Jinja text.
+        image_token: token that the template writes for a picture; None if the model takes none.
     """
 
     image_token: str | None = None
@@ -36,14 +36,14 @@ class Chat:
 
     @property
     def thinking(self) -> Thinking:
-        """What the template can do; `always` if its prompt opens a thought that nothing can switch off."""
+        """What the template can do: `switch`, `none`, or `always` if its prompt always opens a thought."""
         if self._switch:
             return "switch"
         prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
         return "always" if prompt.rstrip().endswith("<think>") else "none"
 
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
-        """The prompt as the model reads it, `image_token` in the place of a picture.
+        """Render messages to the prompt that the model reads, with `image_token` for a picture.
 
         Raises:
             UserError: the template refuses the messages.
@@ -60,7 +60,7 @@ class Chat:
             ) from None
 
     def _shown(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-        """Messages as the template takes them; who writes the token of a picture in a text shows none."""
+        """Convert messages for the template. A picture's token written inside a text is broken up."""
         token = self.image_token
         if token is None:
             return [dict(message) for message in messages]
@@ -74,17 +74,17 @@ class Chat:
         return text
 
     def encode(self, prompt: str) -> list[int]:
-        """Token ids of a rendered prompt; the template has written BOS already, where there is one."""
+        """Return the token ids of a rendered prompt, in which the template has already written any BOS."""
         ids: list[int] = self.tokenizer(prompt, add_special_tokens=False)["input_ids"]
         return ids
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Text of an answer without its special tokens; `<think>` is none in Qwen3's tokenizer, and stays."""
+        """Return the text of an answer without special tokens. Qwen3's `<think>` is not one, and stays."""
         text: str = self.tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False)
         return text
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """The text of each token on its own, special ones as they are written; broken bytes are U+FFFD."""
+        """Return the text of each single token, with special tokens; incomplete bytes become U+FFFD."""
         return [
             self.tokenizer.decode([i], skip_special_tokens=False, clean_up_tokenization_spaces=False)
             for i in ids
@@ -92,11 +92,11 @@ class Chat:
 
 
 def in_parts(messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Messages whose contents are lists of parts, as models that see take them.
+    """Convert messages to contents that are lists of parts, as models with vision take them.
 
     Args:
-        messages: texts of a chat; one with the key `image` has the picture before its text.
-        picture: that part.
+        messages: chat messages with text; one with the key `image` gets the picture before its text.
+        picture: the part that stands for the picture.
     """
     return [
         {"role": m["role"], "content": [picture] * ("image" in m) + [{"type": "text", "text": m["content"]}]}

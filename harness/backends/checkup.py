@@ -1,4 +1,4 @@
-"""A look at a language model before any run: what it reads, token by token, and how fast it answers."""
+"""Check a language model before a run: the prompt it reads, token by token, its answers and their time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,17 +9,17 @@ from harness.backends.cards import Thinking
 from harness.backends.chat import Chat
 from harness.core.errors import UserError
 
-Pictured = tuple[Request, Request, Request]  # with what the cameras see, with a blank picture, with none
+Pictured = tuple[Request, Request, Request]  # one question with a camera picture, a blank one, and none
 
 
 @dataclass(frozen=True)
 class Looks:
-    """What a model does with the picture of an image prompt.
+    """A model's answers to an image prompt with different pictures.
 
     Attributes:
-        answers: one answer an answer mode, to what the cameras see.
-        blank: the same to a blank picture in its place.
-        text: an answer to the text alone, in the last answer mode that it answered in.
+        answers: one answer in each answer mode to what the cameras see.
+        blank: the same with a blank picture instead.
+        text: an answer to the text alone, in the last answer mode that worked; None if none did.
     """
 
     answers: dict[AnswerMode, Completion]
@@ -28,17 +28,17 @@ class Looks:
 
     @property
     def fault(self) -> str | None:
-        """Why it takes no pictures; None if it does.
+        """Why the model takes no pictures; None if it does.
 
-        One that answers all pictures alike still reads them if they are tokens in its prompt.
+        A model that answers all pictures alike still reads them if its prompt has more tokens with one.
         """
         if self.text is None:
             [error, *_] = (a.error for a in (*self.answers.values(), *self.blank.values()) if a.error)
             return f"answers no prompt with a picture: {error}"
-        both = [(answer, self.blank[way]) for way, answer in self.answers.items()]
-        if any(a.text != b.text for a, b in both if not (a.error or b.error)):
+        pairs = [(answer, self.blank[mode]) for mode, answer in self.answers.items()]
+        if any(a.text != b.text for a, b in pairs if not (a.error or b.error)):
             return None
-        counts = [answer.prompt_tokens for answer, _ in both if answer.prompt_tokens is not None]
+        counts = [answer.prompt_tokens for answer, _ in pairs if answer.prompt_tokens is not None]
         text = self.text.prompt_tokens
         if text is None or not counts:
             return "ignores pictures: the same answers to a frame and to a blank one"
@@ -52,16 +52,16 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """What a look at a model shows.
+    """Result of checking a model.
 
     Attributes:
-        prompt: the first question, just as the model reads it; as a server is sent it.
-        tokens: its token ids, each with its text; None where only a server knows them.
-        bos_tokens: how many of them begin a sequence; more than one harms most models.
-        thinking: what the model's own template can do, whatever its card says; None where a server has it.
-        answers: one answer an answer mode, asked alone after a warm-up; its seconds are batch-1 seconds.
-        identity: as in a run's manifest.
-        looks: what it does with pictures; None if its card says that it takes none.
+        prompt: the first question as the model reads it, or as a server is sent it.
+        tokens: its token ids, each with its text; None if only a server knows them.
+        bos_tokens: number of BOS tokens among them; more than one harms most models.
+        thinking: what the model's own template can do, whatever its card says; None for a server's.
+        answers: one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1.
+        identity: identity of the backend, as in a run's manifest.
+        looks: answers to pictures; None if the card says that the model takes none.
     """
 
     prompt: str
@@ -74,12 +74,12 @@ class Checkup:
 
 
 def check(backend: Rendering, asked: Sequence[Request], shown: Sequence[Pictured] = ()) -> Checkup:
-    """Look at a model by some questions, one an answer mode.
+    """Check a model with some questions, one in each answer mode.
 
     Args:
-        backend: the model.
+        backend: the model's backend.
         asked: the questions.
-        shown: those of an image prompt; none for a model of texts.
+        shown: questions of an image prompt; empty for a model without vision.
     """
     [prompt] = backend.rendered(asked[:1])
     chat: Chat | None = getattr(backend, "chat", None)
@@ -103,12 +103,12 @@ def _looks(backend: Rendering, shown: Sequence[Pictured]) -> Looks:
 
 
 def _answer(backend: Rendering, request: Request, warm: bool = False) -> Completion:
-    """The answer to a question, asked alone, behind another one where the model is not `warm` yet."""
+    """Ask one question alone; unless the model is `warm`, ask another one first."""
     try:
         if warm:
             return backend.complete([request])[0]
-        # The first answer pays for kernels and caches. As in a run, its system prompt is the same and its
-        # scene is another.
+        # The first answer's time includes loading kernels and caches. As in a run, the first question has the
+        # same system prompt and another scene.
         *head, last = request.messages
         other = {**last, "content": f"Another scene. {last['content']}"}
         backend.complete([replace(request, messages=(*head, other))])

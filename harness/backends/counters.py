@@ -1,9 +1,9 @@
-"""Energy counters that a machine may have: NVML, RAPL, and the power rails of a Jetson.
+"""Read the energy counters of a machine: NVML, RAPL, and the power rails of a Jetson.
 
-What they can be trusted with differs. NVML's total (GPUs since Volta) and RAPL's count energy themselves;
-RAPL's wraps around, and Linux lets root alone read it. A Jetson states power, which is sampled and summed up
-here. All are too coarse for one answer: NVML looks at the power a quarter of the time on some GPUs (Yang et
-al., SC24, arXiv 2312.02741), so a measurement lasts seconds and is repeated (`harness device measure`).
+NVML (GPUs since Volta) and RAPL count energy themselves; RAPL's counter wraps around, and on Linux only root
+may read it. A Jetson reports power, which is sampled and integrated here. All are too coarse for one answer:
+on some GPUs NVML samples the power only a quarter of the time (Yang et al., SC24, arXiv 2312.02741), so a
+measurement lasts seconds and is repeated (`harness device measure`).
 """
 
 import time
@@ -16,17 +16,17 @@ from threading import Event, Thread
 from typing import Any
 
 SYS = Path("/sys")
-SAMPLED_S = 0.02  # between two looks at a power
+SAMPLED_S = 0.02  # time between two samples of a power
 
 
 @dataclass(frozen=True)
 class Counter:
-    """One meter.
+    """One energy or power meter.
 
     Attributes:
-        name: `nvml 0`, `rapl package-0`, `jetson VDD_IN`.
-        joules: counted so far, from whenever; None where the meter states power.
-        watts: drawn now; None where it counts energy.
+        name: such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`.
+        joules: reads the energy counted so far, from any start; None for a meter of power.
+        watts: reads the present power; None for a meter of energy.
     """
 
     name: str
@@ -35,13 +35,13 @@ class Counter:
 
 
 def counters(sys: Path = SYS) -> list[Counter]:
-    """The meters that can be read here. `sys` is where the kernel shows its own."""
+    """Return the meters that can be read here. `sys` is the folder in which the kernel shows its own."""
     return [*_nvml(), *_rapl(sys), *_jetson(sys)]
 
 
 @contextmanager
 def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
-    """Joules by a meter's name of what is done inside, there once it is done."""
+    """Measure the energy of the block: the yielded dictionary of joules by meter is filled at its end."""
     spent: dict[str, float] = {}
     sums = {meter.name: 0.0 for meter in meters if meter.watts}
     ended = Event()
@@ -85,7 +85,7 @@ def _nvml() -> Iterator[Counter]:
 
 def _rapl(sys: Path) -> Iterator[Counter]:
     for folder in sorted((sys / "class/powercap").glob("*-rapl:*")):
-        if folder.name.count(":") > 1:  # a part of a package, which that one has in it
+        if folder.name.count(":") > 1:  # a part of a package, whose energy the package's counter includes
             continue
         with suppress(OSError, ValueError):
             name = (folder / "name").read_text().strip()
@@ -94,7 +94,7 @@ def _rapl(sys: Path) -> Iterator[Counter]:
 
 
 class _Wrapping:
-    """Joules of a counter of microjoules that begins anew at its end."""
+    """Reads joules from a counter of microjoules that wraps around at `most`."""
 
     def __init__(self, path: Path, most: float) -> None:
         self._path, self._most = path, most

@@ -1,4 +1,4 @@
-"""The three answer modes, each written once, over any engine.
+"""The three answer modes, implemented once for all engines.
 
 `json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout`: it is asked
 for one letter, and the letters' probabilities are the answer.
@@ -20,16 +20,16 @@ from harness.prompts.readout import letters, stated
 
 @dataclass(frozen=True)
 class Answer:
-    """What a model said to one prompt.
+    """A model's answer to one prompt.
 
     Attributes:
-        text: without the stop token.
-        tokens: how many were written, the fixed ones of a skeleton and the stop token included.
+        text: the answer without the stop token.
+        tokens: number of written tokens, with the fixed ones of a skeleton and the stop token.
         finish_reason: `stop` or `length`.
-        label_mass: probability on the letters together, of a read-out.
-        seconds: of an answer alone, as are the next two; None in a batch.
-        first_token_s: until its first token was chosen; of a read-out, until it was there.
-        token_s: for each token chosen after the first (`per_token_s`).
+        label_mass: total probability of the letters in a read-out.
+        seconds: time of an answer that was asked alone; None in a batch, as are the next two.
+        first_token_s: time until its first token was chosen; for a read-out, until it was complete.
+        token_s: time for each token chosen after the first (`per_token_s`).
     """
 
     text: str
@@ -42,7 +42,7 @@ class Answer:
 
 
 class Decoding:
-    """Answers of one engine."""
+    """Answers requests with one engine."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -51,7 +51,7 @@ class Decoding:
         self._letters: dict[tuple[str, ...], list[int]] = {}
 
     def room(self, request: Request) -> int:
-        """Most tokens that the answer takes behind the prompt.
+        """Return the most tokens that the answer can take after the prompt.
 
         Raises:
             UserError: the tokenizer or the request's `max_tokens` leaves no room for this answer mode.
@@ -64,10 +64,10 @@ class Decoding:
         return request.max_tokens
 
     def answer(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> list[Answer]:
-        """One answer a request, in order.
+        """Return one answer for each request, in order.
 
         Args:
-            requests: all to be answered the same way, and `room` was there for each.
+            requests: requests of one answer mode, for each of which there is `room`.
             prompts: their rendered messages, in tokens.
         """
         start_s = time.perf_counter()
@@ -76,8 +76,8 @@ class Decoding:
             if requests[0].answer == "readout":
                 answers = self._read_out(session, requests)
             else:
-                way = self._free if requests[0].answer == "json" else self._constrained
-                answers = way(session, requests, choice)
+                mode = self._free if requests[0].answer == "json" else self._constrained
+                answers = mode(session, requests, choice)
         end_s = time.perf_counter()
         if len(answers) > 1:
             return answers
@@ -86,23 +86,23 @@ class Decoding:
         return [replace(answers[0], seconds=seconds, first_token_s=first_s, token_s=token_s)]
 
     def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
-        said: list[list[int]] = [[] for _ in requests]
+        written: list[list[int]] = [[] for _ in requests]
         live = list(range(len(requests)))
         while live:
             for i, token in zip(live, choice.next(session, live, [None] * len(live)), strict=True):
-                said[i].append(token)
-            live = _narrow(session, live, [not self._over(said[i], requests[i]) for i in live])
+                written[i].append(token)
+            live = _narrow(session, live, [not self._over(written[i], requests[i]) for i in live])
             if live:
-                session.advance([said[i][-1:] for i in live])
-        return [self._ended(tokens) for tokens in said]
+                session.advance([written[i][-1:] for i in live])
+        return [self._ended(tokens) for tokens in written]
 
-    def _over(self, said: list[int], request: Request) -> bool:
-        return said[-1] in self._engine.stops or len(said) == request.max_tokens
+    def _over(self, tokens: list[int], request: Request) -> bool:
+        return tokens[-1] in self._engine.stops or len(tokens) == request.max_tokens
 
-    def _ended(self, said: list[int]) -> Answer:
-        if said[-1] in self._engine.stops:
-            return Answer(self._chat.decode(said[:-1]), len(said), "stop")
-        return Answer(self._chat.decode(said), len(said), "length")
+    def _ended(self, tokens: list[int]) -> Answer:
+        if tokens[-1] in self._engine.stops:
+            return Answer(self._chat.decode(tokens[:-1]), len(tokens), "stop")
+        return Answer(self._chat.decode(tokens), len(tokens), "length")
 
     def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Answer]:
         walks = [self._skeleton(request).walk() for request in requests]
@@ -136,33 +136,33 @@ class Decoding:
         return skeleton
 
     def _read_out(self, session: Session, requests: Sequence[Request]) -> list[Answer]:
-        # Rows may have more or fewer actions: each column stands for one letter's token.
-        every = sorted({token for r in requests for token in self._letter_tokens(r.actions)})
-        column = {token: j for j, token in enumerate(every)}
+        # Requests may have different numbers of actions: each column stands for one letter's token.
+        letter_tokens = sorted({token for r in requests for token in self._letter_tokens(r.actions)})
+        column = {token: j for j, token in enumerate(letter_tokens)}
         answers = []
-        for request, row in zip(requests, session.log_probs(every), strict=True):
-            logs = [float(row[column[token]]) for token in self._letter_tokens(request.actions)]
-            most = max(logs)
-            weights = [math.exp(x - most) for x in logs]
+        for request, row in zip(requests, session.log_probs(letter_tokens), strict=True):
+            log_p = [float(row[column[token]]) for token in self._letter_tokens(request.actions)]
+            largest = max(log_p)
+            weights = [math.exp(x - largest) for x in log_p]
             text = stated(request.actions, weights)
-            answers.append(Answer(text, 1, "stop", min(1.0, math.exp(most) * sum(weights))))
+            answers.append(Answer(text, 1, "stop", min(1.0, math.exp(largest) * sum(weights))))
         return answers
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[int]:
         if actions not in self._letters:
-            found = [tokens_after(self._chat, "\n", letter) for letter in letters(actions)]
-            if any(len(tokens) != 1 for tokens in found) or len(set(found)) < len(found):
+            encodings = [tokens_after(self._chat, "\n", letter) for letter in letters(actions)]
+            if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(encodings):
                 raise UserError(
                     f"model {printable(self._chat.name)!r}: its tokenizer has no single token for each of "
                     f"the letters {letters(actions)}; use --answer json"
                 )
-            self._letters[actions] = [token for (token,) in found]
+            self._letters[actions] = [token for (token,) in encodings]
         return self._letters[actions]
 
 
-def _narrow(session: Session, live: list[int], going: list[bool]) -> list[int]:
-    """Let the sequences that are done leave the session; those that go on."""
-    places = [place for place, goes_on in enumerate(going) if goes_on]
+def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[int]:
+    """Drop finished sequences from the session, and return the unfinished ones."""
+    places = [place for place, continues in enumerate(unfinished) if continues]
     if 0 < len(places) < len(live):
         session.keep(places)
     return [live[place] for place in places]

@@ -1,6 +1,6 @@
-"""Device profiles: files `devices/*.toml`, shipped and a project's, and how fast a model answers on one.
+"""Device profiles (`devices/*.toml`, shipped and a project's), and the time and energy of an answer on one.
 
-A file has a row a model. A number that nobody states is left out, and what follows from it is not known.
+A file has one row for each model. A number without a source is left out, and results from it are not known.
 """
 
 import re
@@ -15,18 +15,18 @@ from harness.core.errors import UserError, printable, unknown
 from harness.runs.records import Constant, Device, DeviceRow, Speed
 
 RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
-# Joules that a row does not have follow from the power that the device draws, and from the rate.
+# Joules that a row lacks are derived from the power that the device draws, and the rate.
 JOULES = {"joules_per_prompt_token": RATES[0], "joules_per_output_token": RATES[1]}
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
 def names() -> list[str]:
-    """Names of all device profiles, sorted."""
+    """Return the sorted names of all device profiles."""
     return resources.names("devices")
 
 
 def load(name: str) -> Device:
-    """The profile of a name.
+    """Load a profile by name.
 
     Raises:
         UserError: there is none, or its file has a mistake.
@@ -43,9 +43,9 @@ def load(name: str) -> Device:
 
 
 def _with_sources(value: Any, sources: dict[str, str]) -> Any:
-    """The same, with the text of each source in place of its name."""
+    """Replace the name of each source by its text."""
     if isinstance(value, list):
-        return [_with_sources(each, sources) for each in value]
+        return [_with_sources(item, sources) for item in value]
     if not isinstance(value, dict):
         return value
     return {
@@ -56,14 +56,14 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 
 
 def row_of(device: Device, model: str) -> DeviceRow:
-    """The row of a model: its own, or, where the profile says how, the nearest one scaled.
+    """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
 
     Args:
         device: the profile.
         model: name of a row, of a card, or a size such as `3b`, in billions of weights.
 
     Raises:
-        UserError: the profile says nothing of it.
+        UserError: the profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:
@@ -78,23 +78,23 @@ def row_of(device: Device, model: str) -> DeviceRow:
 
 
 def _scaled(device: Device, billions: float) -> DeviceRow:
-    """The row whose number of weights is nearest by its ratio, with rates in inverse proportion."""
+    """Scale the row with the nearest number of weights, by ratio; rates go down as the weights go up."""
     near = min(device.rows, key=lambda row: max(row.billions, billions) / min(row.billions, billions))
-    times = billions / near.billions
+    ratio = billions / near.billions
 
-    def moved(constant: Constant | None, factor: float) -> Constant | None:
+    def scaled(constant: Constant | None, factor: float) -> Constant | None:
         source = f"{near.model} times {factor:.3g}, by the number of weights"
         return constant and Constant(constant.value * factor, "modelled", source)
 
     return msgspec.structs.replace(
         near, model=f"{billions:g}b from {near.model}", billions=billions,
-        **{name: moved(getattr(near, name), 1 / times) for name in RATES},
-        **{name: moved(getattr(near, name), times) for name in JOULES},
+        **{name: scaled(getattr(near, name), 1 / ratio) for name in RATES},
+        **{name: scaled(getattr(near, name), ratio) for name in JOULES},
     )  # fmt: skip
 
 
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
-    """Rates and joules of a row, each by its name; joules that the row does not have from `load_watts`."""
+    """Yield the rates and joules of a row by name; joules that it lacks are derived from `load_watts`."""
     for name in RATES:
         yield name, getattr(row, name)
     for name, rate in JOULES.items():
@@ -107,20 +107,20 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 
 
 def speed(device: Device, row: DeviceRow) -> Speed:
-    """What follows for an answer, in plain numbers."""
+    """Return the rates and joules of a row as plain numbers."""
     return Speed(row.model, **{name: c.value if c else None for name, c in constants(device, row)})
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Of one answer: tokens in over the rate of prefill, tokens out over that of decoding; NaN if unknown."""
+    """Return the seconds of one answer: prompt and output tokens, each over its rate; NaN if unknown."""
     rates = _known(speed.prefill_tokens_per_s), _known(speed.decode_tokens_per_s)
     return prompt_tokens / rates[0] + output_tokens / rates[1]
 
 
 def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Of one answer, the device's idling meanwhile included; NaN if unknown."""
-    each = _known(speed.joules_per_prompt_token), _known(speed.joules_per_output_token)
-    return prompt_tokens * each[0] + output_tokens * each[1]
+    """Return the joules of one answer, with those of the idle device in that time; NaN if unknown."""
+    per_token = _known(speed.joules_per_prompt_token), _known(speed.joules_per_output_token)
+    return prompt_tokens * per_token[0] + output_tokens * per_token[1]
 
 
 def _known(value: float | None) -> float:

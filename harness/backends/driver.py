@@ -1,4 +1,4 @@
-"""Reference drivers behind the backend protocol, so that they run like any model."""
+"""The backend of the reference drivers, so that they run like any model."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,14 +12,14 @@ from harness.world.drivers import DRIVERS, choose
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
-    """The driver that a card names. Raises UserError if there is none."""
+    """Open the driver that a card names. Raises UserError if there is none."""
     if card.name not in DRIVERS:
         raise unknown("driver", card.name, DRIVERS)
     return DriverBackend(card.name)
 
 
 class DriverBackend:
-    """Answers with all mass on the driver's action, so it never asks for help."""
+    """Answers with all probability on the driver's action, so it never asks for help."""
 
     def __init__(self, driver: str) -> None:
         self.driver = driver
@@ -35,5 +35,5 @@ class DriverBackend:
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """The driver and the version of its rules."""
+        """Return the driver and the version of its rules."""
         return {"engine": "driver", "driver": self.driver, "harness": __version__}

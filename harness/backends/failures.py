@@ -1,4 +1,4 @@
-"""How a stand-in for a language model fails on purpose, so that a run's counts can be checked."""
+"""Deliberate failures of the proxy at known rates, so that a run's counts of failures can be checked."""
 
 import re
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 @dataclass(frozen=True)
 class Failures:
-    """Shares of all answers, each drawn for its request alone; the rest is answered well.
+    """The share of answers with each failure, drawn for each request on its own; the others are good.
 
-    A text is spoilt in one way at most; being slow comes on top.
+    A text is spoilt in one way at most; any answer may be slow as well.
 
     Attributes:
-        fence: the answer stands in a code fence. Recovered.
-        prose: the answer stands between sentences. Recovered.
-        truncation: cut off inside its JSON. Failed, `truncated_json`.
+        fence: the answer is in a code fence. Recovered.
+        prose: the answer is between sentences. Recovered.
+        truncation: the answer is cut off inside its JSON. Failed, `truncated_json`.
         nan: one probability is NaN. Failed, `non_finite`.
         unknown_action: no action's name is one of the scenario's. Failed, `unknown_action`.
-        unclosed_think: stands in a thought that never ends. Failed, `truncated_reasoning`.
-        slow_tail: takes `slow_s` longer than the card's latency.
-        slow_s: seconds, more than 0 where there is a slow tail.
+        unclosed_think: the answer is in a thought that never ends. Failed, `truncated_reasoning`.
+        slow_tail: the answer takes `slow_s` longer than the card's latency.
+        slow_s: seconds; above 0 if there is a slow tail.
     """
 
     fence: Share = 0.0
@@ -47,16 +47,16 @@ class Failures:
 
     @property
     def texts(self) -> dict[str, float]:
-        """The shares of the spoilt texts by their names, in order."""
+        """The shares of the spoilt texts by name, in order."""
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
 def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:
-    """How a request's text fails, None if it does not, and how many seconds the answer is slow.
+    """Draw how a request's text fails (None if it does not), and by how many seconds its answer is slow.
 
-    Drawn for the id alone, so neither batch nor order, prompt nor condition changes it.
+    The draw depends on the id only, so batch, order, prompt and condition do not change it.
     """
-    from harness.core import noise  # NumPy, which a list of cards needs not
+    from harness.core import noise  # imports NumPy, which listing cards does not need
 
     text, slow = noise.uniforms((2,), "proxy failure", request_id).tolist()
     slow_s = failures.slow_s if slow < failures.slow_tail else 0.0
@@ -68,7 +68,7 @@ def drawn(failures: Failures, request_id: str) -> tuple[str | None, float]:
 
 
 def spoilt(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
-    """A good answer, which ends in compact JSON, spoilt in one of the ways of `Failures`."""
+    """Spoil a good answer, which ends in compact JSON, in one of the ways of `Failures`."""
     match how:
         case "fence":
             return f"```json\n{text}\n```", "stop"

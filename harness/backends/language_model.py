@@ -1,4 +1,4 @@
-"""The backend of every language model that runs in this process, whatever its engine."""
+"""The backend of language models that run in this process, on any engine: batching, overflow and errors."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -13,7 +13,7 @@ from harness.core.errors import UserError, printable
 
 
 class _Prompt(NamedTuple):
-    """One request as the engine sees it."""
+    """A request with its place among the requests and its prompt in tokens."""
 
     position: int
     request: Request
@@ -21,7 +21,7 @@ class _Prompt(NamedTuple):
 
 
 class LanguageModel:
-    """An engine that is asked in batches.
+    """A backend that asks an engine in batches.
 
     Attributes:
         engine: the loaded model.
@@ -36,10 +36,10 @@ class LanguageModel:
         self._decoding = Decoding(engine)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order.
+        """Return one completion per request, in the same order.
 
-        `completion_tokens` counts what was written, the stop token and fixed tokens included, padding not.
-        A batch that fails is asked again, one request at a time.
+        `completion_tokens` counts all written tokens, with the stop token and fixed tokens and without
+        padding. If a batch fails, its requests are asked again one at a time.
 
         Raises:
             UserError: the tokenizer or `max_tokens` leaves no room for the answer mode, or the template
@@ -60,7 +60,7 @@ class LanguageModel:
         return [done[position] for position in range(len(requests))]
 
     def tokens(self, request: Request) -> list[int]:
-        """A prompt, in tokens; those of a picture as its engine gives them."""
+        """Return a request's prompt in tokens; the engine gives those of a picture."""
         text = self.chat.render(request.messages, thinking=request.thinking)
         if request.image is None:
             return self.chat.encode(text)
@@ -76,7 +76,10 @@ class LanguageModel:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
+        """Return the natural log-probabilities of the first `vocabulary` tokens after each prompt.
+
+        Shape (n, vocabulary).
+        """
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 
@@ -84,15 +87,18 @@ class LanguageModel:
         return self.engine.identity()
 
     def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:
-        """Prompts that are answered alike, begin alike (a role has one system prompt) and are as long."""
+        """Yield batches of prompts that have one answer mode, similar beginnings and similar lengths.
+
+        Prompts of one role begin alike, since they have the same system prompt.
+        """
 
         def kind(p: _Prompt) -> tuple[str, str, int, int]:
             return p.request.answer, p.request.role, p.request.max_tokens, len(p.ids)
 
-        for _, same in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
-            alike = list(same)
-            for start in range(0, len(alike), self.batch_size):
-                yield alike[start : start + self.batch_size]
+        for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: p.request.answer):
+            same_mode = list(group)
+            for start in range(0, len(same_mode), self.batch_size):
+                yield same_mode[start : start + self.batch_size]
 
     def _overflow(self, prompt_tokens: int, room: int) -> str:
         return (
@@ -101,23 +107,23 @@ class LanguageModel:
         )
 
     def _answer(self, batch: list[_Prompt]) -> list[Completion]:
-        answered = self._try(batch)
-        if isinstance(answered, list):
-            return answered
-        # Out here nothing of the failed batch is alive, so that an engine can free its memory.
+        answers = self._try(batch)
+        if isinstance(answers, list):
+            return answers
+        # `_try` has returned, so nothing refers to the failed batch and an engine can free its memory.
         completions = []
         for prompt in batch:
-            alone = self._try([prompt])
+            single = self._try([prompt])
             completions += (
-                alone if isinstance(alone, list) else [_failed(prompt.request, len(prompt.ids), alone)]
+                single if isinstance(single, list) else [_failed(prompt.request, len(prompt.ids), single)]
             )
         return completions
 
     def _try(self, batch: list[_Prompt]) -> list[Completion] | str:
-        """Completions of a batch, or the engine's message."""
+        """Return the completions of a batch, or the engine's error message."""
         try:
             answers = self._decoding.answer([p.request for p in batch], [p.ids for p in batch])
-        except Exception as error:  # an engine may fail in any way; what it says is data
+        except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {printable(' '.join(str(error).split()), 200)}"
         return [_completion(p, answer, len(batch)) for p, answer in zip(batch, answers, strict=True)]
 

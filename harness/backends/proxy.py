@@ -1,7 +1,7 @@
-"""The proxy: a deterministic stand-in for a language model that reads its own viewer's scene graph.
+"""The proxy backend: a deterministic rule in place of a language model, which reads the viewer's scene graph.
 
-It needs no model and shows the whole path. It plans on what its viewer sees, as `local-view` does, and is the
-less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not fitted: what it scores says
+It exercises the whole pipeline without a model. It plans on what its viewer sees, as `local-view` does, and
+is less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not fitted: its scores say
 something about the harness and nothing about any language model. Its card may make it fail at known rates.
 """
 
@@ -19,20 +19,20 @@ from harness.world.scenario import Scenario
 
 VERSION = "proxy/1"
 
-SURE_SLOWER = 0.90  # probability of SLOWER where the viewer sees a conflict that calls for it
+SURE_SLOWER = 0.90  # probability of SLOWER if the viewer sees a conflict that calls for it
 LEAST_DOUBT, MOST_DOUBT = 0.05, 0.38  # probability of SLOWER with every sector in sight, and with one hidden
 OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor the planned one
 
 
 def open(card: Card, **_: Any) -> "Proxy":
-    """The proxy, with the failures of its card."""
+    """Open the proxy with the failures of its card."""
     return Proxy(card.failures)
 
 
 class Proxy:
-    """Answers like a well-behaved small language model, in the form its prompt asks for.
+    """Answers in the form that its prompt asks for, like a well-behaved language model.
 
-    With failures it answers like one that is not so well-behaved.
+    With `failures`, it answers like a model that is less well-behaved.
     """
 
     def __init__(self, failures: Failures | None = None) -> None:
@@ -52,7 +52,7 @@ class Proxy:
         return Completion(request.id, text, None, None, finish_reason, None, 1, slow_s=slow_s)
 
     def identity(self) -> dict[str, Any]:
-        """Its version and its failures."""
+        """Return the proxy's version and failures."""
         return {
             "engine": "proxy",
             "proxy_model_version": VERSION,
@@ -62,7 +62,7 @@ class Proxy:
 
 
 def answer(request: Request) -> str:
-    """The text of one answer."""
+    """Return the text of the answer to a request."""
     if request.view is None or request.scenario is None:
         raise ValueError(f"request {request.id} has no view of a scenario; the proxy reads nothing else")
     intent = distribution(request.scenario, request.view)
@@ -76,7 +76,7 @@ def answer(request: Request) -> str:
 
 
 def distribution(scenario: Scenario, view: Mapping[str, Any]) -> dict[str, float]:
-    """Intent of a viewer: what the planner would do on its graph, hedged by what it cannot see."""
+    """Return a viewer's intent: the planner's action on its graph, hedged by what it cannot see."""
     actions, planned = scenario.actions, plan(scenario, view)
     if planned == "SLOWER":
         braking = SURE_SLOWER

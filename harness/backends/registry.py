@@ -1,7 +1,7 @@
-"""Which engines there are, what each can do, and the backend that answers for it.
+"""Registry of engines: what each can do, and how the backend of a card is opened.
 
-Importing this loads no engine. A package from outside adds one by an entry point of the group
-`swarmdrive.backends`: its name is the engine's name in cards, its value a `Registration`.
+Importing this loads no engine. An external package adds one by an entry point of the group
+`swarmdrive.backends`: its name is the engine's name in cards, and its value is a `Registration`.
 """
 
 import os
@@ -25,21 +25,22 @@ GROUP = "swarmdrive.backends"
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What an engine can do. Other rooms ask for this, never for an engine's name.
+    """What an engine can do. Other code tests these capabilities, never an engine's name.
 
     Attributes:
-        language_model: a language model wrote the answers, so they take time that can be measured, and it can
-            be asked to fuse messages.
-        answer_modes: how it can be asked.
+        language_model: whether a language model writes the answers: their time can be measured, and it can be
+            asked to fuse messages.
+        answer_modes: the supported answer modes.
         thinks: whether it can be asked to think first: `always`, if its `card` says so, or `never`.
-        renders: it is a `harness.backends.base.Rendering`, so its answers can be cached and a check can show
-            what its model reads.
-        has_weights: it loads weights here, so they can be pulled, and a device and a number format chosen.
-        asks_helpers: helpers are asked as well as the ego.
-        closed_loop: it answers for scenes that are new, not only for recorded ones.
-        own_latency: it is a `harness.backends.base.Timed`: its answers were timed before.
-        reference: a driver that a report holds models against.
-        samples: it heeds a request's `temperature` and `sample`, but for a `readout`.
+        renders: whether it is a `harness.backends.base.Rendering`: its answers can be cached, and a check can
+            show what its model reads.
+        has_weights: whether it loads weights here: they can be pulled, and a device and a number format can
+            be chosen.
+        asks_helpers: whether helpers are asked as well as the ego.
+        closed_loop: whether it answers for new scenes and not only for recorded ones.
+        own_latency: whether it is a `harness.backends.base.Timed`: its answers were timed earlier.
+        reference: whether it is a driver that a report compares models with.
+        samples: whether it heeds a request's `temperature` and `sample` (never in a `readout`).
     """
 
     language_model: bool = True
@@ -60,15 +61,15 @@ class Registration:
 
     Attributes:
         opens: `module:function`, called with a card and the options of `open_backend`; returns a backend.
-        capabilities: what it can do.
-        card_keys: keys of a card that mean something to this engine and not to every other.
-        required_keys: keys of that kind that its cards must have.
-        packages: packages that it needs, by the name of the module that must be there.
+        capabilities: what the engine can do.
+        card_keys: card keys that this engine understands and not every engine does.
+        required_keys: such keys that its cards must have.
+        packages: packages that it needs, by the name of the module that is imported.
         install: the command that installs them.
-        finds: `module:function`, which returns where a card's weights lie and raises UserError if nowhere;
-            for an engine that has weights.
-        sees: `module:function`, which returns the tokens that a card's own image processor makes of a picture
-            of the card's size, without loading its weights; empty where there is no such way.
+        finds: `module:function`, which returns the path of a card's weights, or raises UserError; for an
+            engine that has weights.
+        sees: `module:function`, which returns the number of tokens that a card's image processor makes of a
+            picture of the card's size, without loading weights; empty if there is no such way.
     """
 
     opens: str
@@ -82,7 +83,7 @@ class Registration:
 
     @property
     def allowed_keys(self) -> tuple[str, ...]:
-        """Keys that its cards may have and not all others."""
+        """Card keys that this engine understands and not every engine does."""
         return (*self.required_keys, *self.card_keys)
 
 
@@ -127,14 +128,14 @@ BUILT_IN: Mapping[str, Registration] = {
 
 
 def engines() -> list[str]:
-    """Names of all engines: those built in, then the plug-ins."""
+    """Return the names of all engines: built-in ones, then plug-ins."""
     from importlib.metadata import entry_points
 
     return list(dict.fromkeys([*BUILT_IN, *sorted(entry_points(group=GROUP).names)]))
 
 
 def find(engine: str) -> Registration | None:
-    """The registration of an engine; None if there is none of that name.
+    """Return the registration of an engine; None if there is none of that name.
 
     Raises:
         UserError: a plug-in of that name does not load.
@@ -164,19 +165,19 @@ def _plug_in(engine: str) -> Registration | None:
 
 
 def registration(engine: str) -> Registration:
-    """The registration of an engine. Raises UserError if there is none, or a plug-in fails."""
-    if (found := find(engine)) is None:
+    """Return the registration of an engine. Raises UserError if there is none, or a plug-in fails."""
+    if (entry := find(engine)) is None:
         raise unknown("engine", engine, engines())
-    return found
+    return entry
 
 
 def capabilities(engine: str) -> Capabilities:
-    """What an engine can do. Raises UserError if there is none of that name, or a plug-in fails."""
+    """Return what an engine can do. Raises UserError if there is no such engine, or a plug-in fails."""
     return registration(engine).capabilities
 
 
 def registrations() -> dict[str, Registration]:
-    """Every engine by its name, but for plug-ins that do not load."""
+    """Return all engines by name, without plug-ins that do not load."""
     loaded = {}
     for engine in engines():
         with suppress(UserError):
@@ -187,16 +188,16 @@ def registrations() -> dict[str, Registration]:
 def open_backend(
     card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> "Backend":
-    """The backend of a card, weights loaded. Engines without weights take the options and need none of them.
+    """Open the backend of a card and load its weights. Engines without weights ignore the options.
 
     Args:
         card: the model.
-        device: `cpu`, `cuda` or `cuda:N`; None is CUDA where there is any.
-        dtype: number format in place of the card's.
+        device: `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any.
+        dtype: number format instead of the card's.
         batch_size: most requests that go through the engine together.
 
     Raises:
-        UserError: a package or the weights are missing, an option cannot be, or a file does not load.
+        UserError: a package or the weights are missing, an option is wrong, or a file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
@@ -210,11 +211,12 @@ def open_backend(
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> "Backend":
-    """This process's backend of a card, opened once (see `open_backend`)."""
+    """Return this process's backend of a card, opened once (see `open_backend`)."""
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
 
-# A forked process has its parent's, and may not ask it: two at one pipe read each other's answers.
+# Keyed by the process: a forked one inherits its parent's backend, and two that use one pipe would read each
+# other's answers.
 @lru_cache(maxsize=8)
 def _opened_in(
     process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int
@@ -223,19 +225,19 @@ def _opened_in(
 
 
 def resolve(place: str) -> Any:
-    """What is at `module:name`; its module is imported."""
+    """Import the module of `module:name` and return the object."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
 
 def missing_package(engine: str) -> str | None:
-    """Name of the package that an engine lacks to run here; None if none."""
+    """Return the first package that an engine needs and that is not installed; None if all are."""
     packages = registration(engine).packages
     return next((package for module, package in packages.items() if find_spec(module) is None), None)
 
 
 def missing(card: "Card") -> str | None:
-    """What a card lacks to run here, in a word: a package's name or `weights`. None if nothing."""
+    """Return what a card lacks to run here: the name of a package or `weights`; None if nothing."""
     if package := missing_package(card.engine):
         return package
     try:
@@ -247,7 +249,10 @@ def missing(card: "Card") -> str | None:
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Tokens that a card's own image processor makes of a picture of the card's size; None if not here."""
+    """Return how many tokens a card's image processor makes of a picture of the card's size.
+
+    None if the processor is not installed here.
+    """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None
     tokens: int = resolve(sees)(card)

@@ -1,4 +1,4 @@
-"""Replay: the answers of an earlier run, so that a changed parser, rule or mix is scored without a model."""
+"""The replay backend: answers from an earlier run, to score a changed parser, rule or mix without a model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,14 +17,14 @@ from harness.runs.records import BLIND, Answer, FirstTurn, Latency
 
 
 def open(card: Card, **_: Any) -> "Replay":
-    """The answers stored in the run folder that a card names.
+    """Open the run folder that a card names.
 
     Raises:
-        UserError: it is no finished run, or a driver's, which is asked for the ego alone.
+        UserError: it is not a finished run, or it is a driver's run, which has answers of the ego only.
     """
     run = read(Path(card.weights or ""))
-    of = find(str(run.manifest.model.get("engine")))
-    if of and not of.capabilities.asks_helpers:
+    engine = find(str(run.manifest.model.get("engine")))
+    if engine and not engine.capabilities.asks_helpers:
         raise UserError(
             f"{printable(run.path)} is a run of a driver; "
             f"run it again with --model {printable(run.manifest.model['name'])}"
@@ -33,10 +33,10 @@ def open(card: Card, **_: Any) -> "Replay":
 
 
 class Replay:
-    """Looks answers up by scene and viewer. A prompt that was never asked is an error, not a guess.
+    """Looks up answers by scene and viewer. A prompt that was never asked is an error and not a guess.
 
-    Where other decisions lead to a decision point that the run did not come to, its model is asked: the same,
-    by its identity.
+    If other decisions lead to a decision point that the run did not reach, the run's model is asked; its
+    identity must be the same.
     """
 
     def __init__(self, run: Run) -> None:
@@ -46,34 +46,36 @@ class Replay:
         self._models: dict[str, Backend] = {}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        known = [self._known(request) for request in requests]
-        lacking: dict[str, list[Request]] = {}
-        for request, answer in zip(requests, known, strict=True):
+        stored = [self._stored(request) for request in requests]
+        missing: dict[str, list[Request]] = {}
+        for request, answer in zip(requests, stored, strict=True):
             if answer is None:
-                lacking.setdefault(request.role, []).append(self._drawn(request))
-        asked = {
-            c.request_id: c for role, some in lacking.items() for c in self._model(role, some).complete(some)
+                missing.setdefault(request.role, []).append(self._as_run(request))
+        new = {
+            completion.request_id: completion
+            for role, of_role in missing.items()
+            for completion in self._model(role, of_role).complete(of_role)
         }
         return [
-            asked[request.id] if answer is None else self._completion(request, answer)
-            for request, answer in zip(requests, known, strict=True)
+            new[request.id] if answer is None else self._completion(request, answer)
+            for request, answer in zip(requests, stored, strict=True)
         ]
 
-    def _known(self, request: Request) -> Answer | None:
-        """The answer that the run has to a request; of a repair turn, where it has one."""
+    def _stored(self, request: Request) -> Answer | None:
+        """Return the run's answer to a request; for a repair turn, only if the answer had one."""
         answer = self._answers.get(request.id.removesuffix(AGAIN))
         return answer if answer and (answer.first or not request.id.endswith(AGAIN)) else None
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
-        """The model that answered in a role. Raises UserError where it cannot be asked what the run lacks."""
+        """Open the model that answered in a role. Raises UserError if it cannot be asked these requests."""
         manifest, shown = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
-            # A run has an answer wherever an episode begins, if it has the episode; blind ones it may lack.
-            begins = _step(request.id) == "0" and not request.id.endswith(BLIND)
-            again = request.id.endswith(AGAIN)  # after an answer that is read otherwise than it was
-            other = begins or _episode(request.id) not in self._episodes or "+" in request.id
-            if (other and not again) or (role == "helper" and len(manifest.helpers) > 1):
+            # A run answers the first step of each of its episodes; only blind answers may be missing.
+            first_step = _step(request.id) == "0" and not request.id.endswith(BLIND)
+            again = request.id.endswith(AGAIN)  # a changed parser may ask for a repair that the run did not
+            foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id
+            if (foreign and not again) or (role == "helper" and len(manifest.helpers) > 1):
                 raise UserError(
                     f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
                     + (", whose conditions delivered the same messages" if "+" in request.id else "")
@@ -93,8 +95,8 @@ class Replay:
             self._models[role] = cached(model, card, default_file())
         return self._models[role]
 
-    def _drawn(self, request: Request) -> Request:
-        """The request as the run would have asked it."""
+    def _as_run(self, request: Request) -> Request:
+        """Return the request with the sampling settings of the run."""
         manifest = self._run.manifest
         if request.answer == "readout":
             return request
@@ -102,7 +104,7 @@ class Replay:
 
     def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
         shown = printable(self._run.path)
-        # Free and constrained answers have the same prompt.
+        # The prompt's digest cannot tell: free and constrained answers have the same prompt.
         if agent["answer"] != request.answer:
             raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
         if request.thinking != agent["thinking"]:
@@ -131,7 +133,7 @@ class Replay:
         return self._run.manifest.latency
 
     def identity(self) -> dict[str, Any]:
-        """The run and the digest of its answers."""
+        """Return the digest of the run's answers, with its model and identity."""
         return {
             "engine": "replay", "answers_sha256": sha256_file(self._run.path / "answers.jsonl"),
             "of": {"model": self._run.manifest.model, "identity": self._run.manifest.identity},
@@ -139,16 +141,16 @@ class Replay:
 
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:
-    """One of the two turns of an answer: the second, or the first."""
-    took: dict[str, Any] = {}
+    """Return one of an answer's two turns: the repair turn if `again`, else the first."""
+    costs: dict[str, Any] = {}
     for name in ("prompt_tokens", "completion_tokens", "seconds", "slow_s"):
         both, of_first = getattr(whole, name), getattr(first, name)
-        rest = None if both is None or of_first is None else both - of_first
-        took[name] = rest if again else of_first
+        of_second = None if both is None or of_first is None else both - of_first
+        costs[name] = of_second if again else of_first
     if again:
-        return replace(whole, **took)
+        return replace(whole, **costs)
     reason: Any = first.finish_reason
-    return replace(whole, text=first.raw, finish_reason=reason, error=None, retries=0, **took)
+    return replace(whole, text=first.raw, finish_reason=reason, error=None, retries=0, **costs)
 
 
 def _episode(scene: str) -> str:

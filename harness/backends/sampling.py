@@ -1,6 +1,6 @@
-"""Which token comes next: the likeliest, or one drawn at a temperature.
+"""Choose the next token: the likeliest, or one drawn at a temperature.
 
-Draws are keyed by what the model reads and by which answer it is, so company, order and a resume change none.
+Draws are keyed by the prompt and the answer's number, so other requests, order and a resume change none.
 """
 
 import time
@@ -15,11 +15,11 @@ from harness.core.arrays import Floats
 
 
 class Choice:
-    """Chooses the tokens of some answers: a uniform draw for each token of those that are drawn.
+    """Chooses the tokens of some answers; each sampled token takes one uniform draw.
 
     Attributes:
-        first_at_s: when the first was there, by `time.perf_counter`; None before.
-        rounds: how often some were chosen: of an answer alone, its tokens.
+        first_at_s: when the first token was chosen, by `time.perf_counter`; None before.
+        rounds: number of calls of `next`; for an answer that is asked alone, its number of chosen tokens.
     """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
@@ -34,12 +34,12 @@ class Choice:
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
     ) -> list[int]:
-        """The next token of each sequence of a session, of those listed for it or of all where None.
+        """Choose the next token of each sequence of a session.
 
         Args:
-            session: whose sequences are those of `places`, in order.
-            places: of their requests.
-            among: tokens that are allowed.
+            session: session with the sequences of `places`, in order.
+            places: places of their requests.
+            among: allowed tokens of each sequence; None allows all.
         """
         chosen = session.argmax(among)
         if self._drawn:
@@ -55,16 +55,16 @@ class Choice:
 
 
 def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
-    """The token that a uniform draw means, of softmax(log_p / temperature) over those that are allowed.
+    """Return the token of a uniform draw from softmax(log_p / temperature) over the allowed tokens.
 
     Args:
         log_p: log-probabilities of the vocabulary.
-        among: the tokens that are allowed; None for all.
+        among: allowed tokens; None allows all.
         temperature: above 0.
-        u: in [0, 1).
+        u: the draw, in [0, 1).
     """
     tokens = np.arange(len(log_p)) if among is None else np.unique(among)
-    with np.errstate(over="ignore"):  # far below the likeliest there is no probability left
+    with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0
         ends = np.exp((log_p[tokens] - log_p[tokens].max()) / temperature).cumsum()
-    last = np.searchsorted(ends, ends[-1])  # rounding may take a draw beyond it
+    last = np.searchsorted(ends, ends[-1])  # rounding may take a draw beyond the last possible token
     return int(tokens[min(np.searchsorted(ends, u * ends[-1], side="right"), last)])

@@ -1,4 +1,7 @@
-"""Where a served model is asked. A card is a public file: it names the key's variable and holds no secret."""
+"""The `[server]` table of a card: the address of a served model, and how it is asked.
+
+A card is a public file: it names the environment variable of the key and holds no secret.
+"""
 
 import re
 from dataclasses import dataclass
@@ -18,13 +21,13 @@ class Server:
     """A server that speaks OpenAI's chat completions.
 
     Attributes:
-        base_url: up to and with `/v1`; http or https, without credentials, query or fragment. A list is of
-            servers that each have the model, any of which may answer; each has to list it then.
+        base_url: URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
+            of servers, any of them may answer, and each must list the model.
         kind: decides how a constrained answer is asked for; `generic` is OpenAI's own way.
-        key_env: environment variable with the key. It need not be set for a server that asks for none.
-        timeout_s: longest that one attempt may take, from connecting to the last byte, in seconds.
-        retries: attempts after the first, where a server was busy, broke down or was not reached; at least
-            one at each of several.
+        key_env: environment variable with the key; it need not be set for a server without one.
+        timeout_s: longest time of one attempt, from connecting to the last byte, in seconds.
+        retries: attempts after the first, if a server was busy, broke down or was not reached; of several
+            servers, each is tried at least once.
     """
 
     base_url: str | tuple[str, ...]
@@ -34,7 +37,7 @@ class Server:
     retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
 
     def __post_init__(self) -> None:
-        # What is refused is not shown: it may hold a password.
+        # A refused URL is not shown, since it may hold a password.
         if fault := next(filter(None, map(_fault, self.urls)), None if self.urls else "is an empty list"):
             raise ValueError(f"base_url {fault}; give one such as http://127.0.0.1:8080/v1")
         if len(set(self.urls)) < len(self.urls):
@@ -47,13 +50,13 @@ class Server:
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """The base URL of each server, without a slash at its end."""
-        given = (self.base_url,) if isinstance(self.base_url, str) else self.base_url
-        return tuple(url.rstrip("/") for url in given)
+        """The base URL of each server, without a trailing slash."""
+        urls = (self.base_url,) if isinstance(self.base_url, str) else self.base_url
+        return tuple(url.rstrip("/") for url in urls)
 
     @property
     def any_may_answer(self) -> bool:
-        """Whether the model is what its servers list, wherever they are."""
+        """Whether any of several servers may answer, so that the model's identity is what they list."""
         return not isinstance(self.base_url, str)
 
     @property
@@ -63,10 +66,10 @@ class Server:
 
 
 def _fault(url: str) -> str | None:
-    """What keeps a text from being a base URL, None if nothing."""
+    """Return what is wrong with a base URL; None if nothing is."""
     try:
         parts = urlsplit(url)
-        host = bool(parts.hostname) and parts.port != 0  # a port that is no number raises
+        host = bool(parts.hostname) and parts.port != 0  # raises if the port is not a number
     except ValueError:
         return "is no URL"
     if "@" in parts.netloc:

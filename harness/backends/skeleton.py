@@ -1,11 +1,11 @@
 """The fixed text of a constrained answer, in which the model fills in digits and choices.
 
-Compact JSON, always in the answer schema's form. A probability is `0.` and two digits, so 1.00 cannot be
-written, and what was written need not sum to 1: `finished` divides the sum out. A helper's evidence is empty,
-since there is no free text.
+The text is compact JSON that always fits the answer schema. A probability is `0.` and two digits, so 1.00
+cannot be written, and the digits need not sum to 1: `finished` divides by their sum. A helper's evidence is
+empty, since there is no free text.
 
-What is fixed is never asked for: a choice is walked token by token, and only where the options that are left
-differ in their next token does the model decide (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
+The model is never asked for fixed text. A choice is made token by token, and the model decides only where the
+remaining options differ in their next token (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
 """
 
 from collections.abc import Generator, Sequence
@@ -23,9 +23,9 @@ TWO_DIGITS = tuple(f"{n:02d}" for n in range(100))
 
 
 def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
-    """The text: what stands as it is, and tuples of options, never two in a row and none at either end.
+    """Return the text in parts: fixed strings, and tuples of options, each between two strings.
 
-    It is cut beside letters and digits only, where tokenizers cut, too.
+    Parts begin and end only beside letters and digits, where tokenizers split as well.
     """
     text: list[Part] = []
     opening = "{"
@@ -43,13 +43,13 @@ def parts(role: str, form: str, actions: Sequence[str]) -> list[Part]:
 
 
 def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]) -> str:
-    """The answer as text, valid under the schema; two decimals, a distribution's summing to 1.
+    """Write the answer as text that is valid under the schema: two decimals, and a distribution sums to 1.
 
     Args:
         role: `ego` or `helper`.
-        form: what a helper is asked for.
+        form: the form that a helper is asked for.
         actions: meta-action names.
-        chosen: for each choice of `parts` the place of the chosen option. Digits that are all zero say
+        chosen: the place of the chosen option for each choice of `parts`. Digits that are all zero say
             nothing about any action, so they become the uniform distribution.
     """
     body: dict[str, object] = {"evidence": "", "risk": RISKS[chosen[0]]} if role == "helper" else {}
@@ -63,19 +63,19 @@ def finished(role: str, form: str, actions: Sequence[str], chosen: Sequence[int]
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
-    """Tokens of a text that stands behind another: some tokenizers mark where a text begins.
+    """Return the tokens of a text that follows another, since some tokenizers mark the beginning of a text.
 
-    Where a token would span the two, those of the text alone.
+    If a token would span both texts, the tokens are those of the text alone.
     """
     head, whole = chat.encode(before), chat.encode(before + text)
     return tuple(whole[len(head) :] if whole[: len(head)] == head else chat.encode(text))
 
 
 class Ask(NamedTuple):
-    """A decision of a walk.
+    """A decision that the model has to make in a skeleton.
 
     Attributes:
-        forced: tokens to append before it is made, the last decision's among them.
+        forced: tokens to append first, among them that of the last decision.
         among: tokens to choose from, sorted.
     """
 
@@ -94,7 +94,7 @@ class Skeleton:
         self._literals: list[tuple[int, ...]] = []
         self._choices: list[list[tuple[int, ...]]] = []
         pieces = parts(role, form, actions)
-        before = "\n"  # an answer follows a line's end in every chat template we know
+        before = "\n"  # an answer follows a line break in every known chat template
         for piece in pieces:
             if isinstance(piece, str):
                 self._literals.append(tokens_after(chat, before, piece))
@@ -103,7 +103,7 @@ class Skeleton:
                 self._choices.append([tokens_after(chat, before, option) for option in piece])
                 before = piece[0]
         for place, options in enumerate(self._choices):
-            # An option may begin as another does, whole (SLOW, SLOWER): what comes after decides.
+            # One option may be a prefix of another (SLOW, SLOWER), so the token after it is needed to decide.
             stop = self._literals[place + 1][:1]
             self._choices[place] = ended = [option + stop for option in options]
             if any(longer[: len(short)] == short for short, longer in pairwise(sorted(ended))):
@@ -118,24 +118,24 @@ class Skeleton:
         return sum(map(len, self._literals)) + sum(len(option) - 1 for option in ended)
 
     def count(self, chosen: Sequence[int]) -> int:
-        """Length of a filling, in tokens."""
+        """Return the length of the filled-in text in tokens."""
         return self._count([options[i] for options, i in zip(self._choices, chosen, strict=True)])
 
     def walk(self) -> Generator[Ask, int, list[int]]:
-        """Ask for each decision, be sent its token, and return the chosen places that `finished` takes."""
+        """Yield each decision, receive its token, and return the chosen places that `finished` takes."""
         chosen = []
         forced = list(self._literals[0])
         for options, after in zip(self._choices, self._literals[1:], strict=True):
-            left, depth = list(range(len(options))), 0
-            while len(left) > 1:
-                among = sorted({options[i][depth] for i in left})
+            remaining, depth = list(range(len(options))), 0
+            while len(remaining) > 1:
+                among = sorted({options[i][depth] for i in remaining})
                 if len(among) > 1:
                     token = yield Ask(forced, among)
                     forced = []
-                    left = [i for i in left if options[i][depth] == token]
-                if len(left) > 1:
-                    forced.append(options[left[0]][depth])
+                    remaining = [i for i in remaining if options[i][depth] == token]
+                if len(remaining) > 1:
+                    forced.append(options[remaining[0]][depth])
                     depth += 1
-            chosen.append(left[0])
-            forced += [*options[left[0]][depth:-1], *after]
+            chosen.append(remaining[0])
+            forced += [*options[remaining[0]][depth:-1], *after]
         return chosen

@@ -1,4 +1,4 @@
-"""Counting tokens as a model counts them: with its own tokenizer."""
+"""Count the tokens of prompts with a model's own tokenizer, without loading the model."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -9,7 +9,7 @@ from harness.backends.cards import Card
 from harness.core.errors import UserError, printable
 from harness.core.resources import find
 
-# Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit stands alone.
+# Qwen2's pre-tokeniser, for `tokenizer.ggml.pre = qwen2`: every digit is a piece of its own.
 QWEN2_SPLIT = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}"
     r"| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
@@ -18,10 +18,10 @@ QWEN2_SPLIT = (
 
 @lru_cache(maxsize=4)
 def tokenizer(source: Path) -> Any:
-    """A `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
+    """Load a `tokenizers.Tokenizer` from a GGUF file (Qwen2 kind), a tokenizer.json, or a folder with one.
 
     Raises:
-        UserError: there is no tokenizer there, or not one of those.
+        UserError: there is no tokenizer, or it is of another kind.
     """
     from tokenizers import Tokenizer
 
@@ -56,14 +56,14 @@ def _from_gguf(file: Path) -> Any:
     types = [int(reader.fields["tokenizer.ggml.token_type"].parts[i][0])
              for i in reader.fields["tokenizer.ggml.token_type"].data]  # fmt: skip
     built = byte_level(models.BPE(vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges))
-    # Control tokens, and words that a text holds whole, such as `<think>`.
+    # Control tokens, and user-defined tokens that are never split, such as `<think>`.
     added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
     built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
     return built
 
 
 def byte_level(model: Any) -> Any:
-    """A `tokenizers.Tokenizer` of a BPE model over bytes, which splits text as Qwen2 does."""
+    """Build a `tokenizers.Tokenizer` of a byte-level BPE model that splits text as Qwen2 does."""
     from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
 
     built = Tokenizer(model)
@@ -80,9 +80,9 @@ def byte_level(model: Any) -> Any:
 def counter(
     source: Path | None, card: Card | None = None
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
-    """A function that counts the tokens of chat messages' contents, the chat template's own left out.
+    """Return a function that counts the tokens of chat messages, without those of the chat template.
 
-    Takes the tokenizer given, else the one that lies with the model's weights; None where there is neither.
+    It uses the given tokenizer, or else the one beside the model's weights; None if there is neither.
     """
     if source is None and card and card.weights:
         beside = find("models", card.weights)
@@ -94,6 +94,6 @@ def counter(
 
 
 def spread_of(counts: Sequence[int]) -> dict[str, float]:
-    """`n`, `least`, `mean` and `most` of some counts of tokens."""
+    """Return `n`, `least`, `mean` and `most` of some token counts."""
     mean = round(sum(counts) / len(counts), 1)
     return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

@@ -1,4 +1,4 @@
-"""How a model takes pictures: the size that they are made in for it, and the tokens that one becomes."""
+"""The `[vision]` table of a card: the size of the pictures that a model is shown, and their tokens."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.core.config import Count
 
-WIDE, HIGH = 16, 8  # tokens of a picture whose size nothing fixes
+WIDE, HIGH = 16, 8  # tokens along the sides of a picture whose size the checkpoint does not fix
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,13 @@ class Vision:
     whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one size (Idefics3).
 
     Attributes:
-        width_px: of the pictures that it is shown.
-        height_px: of them; even, since one camera's picture stands above the other's.
+        width_px: width of the pictures that the model is shown.
+        height_px: their height; even, since one camera's picture is above the other's.
         patch_px: side of a patch.
-        merge: patches along a side of a token's square.
-        least_px: least area of a picture; a smaller one is enlarged. None if none.
-        most_px: greatest area; a larger one is made smaller. None if none.
-        scaled_to_px: width and height that every picture is scaled to; None if they keep theirs.
+        merge: number of patches along a side of a token's square.
+        least_px: least area of a picture; a smaller one is enlarged. None if there is no limit.
+        most_px: greatest area; a larger one is scaled down. None if there is no limit.
+        scaled_to_px: width and height that every picture is scaled to; None if pictures keep their size.
     """
 
     width_px: Count
@@ -43,18 +43,18 @@ class Vision:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of the pictures that it is shown."""
+        """Width and height of the pictures that the model is shown."""
         return self.width_px, self.height_px
 
     @property
     def tokens(self) -> int:
-        """Tokens that one picture becomes, markers around it left out."""
+        """Number of tokens of one picture, without markers around it."""
         square = self.patch_px * self.merge
         width, height = self.scaled_to_px or self._whole_squares(square)
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """What to say of a model that makes this many tokens of such a picture; None if as stated here."""
+        """Return the error text for a model that makes another number of tokens; None if it agrees."""
         if tokens == self.tokens:
             return None
         return (
@@ -66,30 +66,30 @@ class Vision:
         sides = self.width_px, self.height_px
         width, height = (max(square, round(side / square) * square) for side in sides)
         if self.most_px is not None and width * height > self.most_px:
-            less = math.sqrt(sides[0] * sides[1] / self.most_px)
-            width, height = (max(square, math.floor(side / less / square) * square) for side in sides)
+            shrink = math.sqrt(sides[0] * sides[1] / self.most_px)
+            width, height = (max(square, math.floor(side / shrink / square) * square) for side in sides)
         elif self.least_px is not None and width * height < self.least_px:
-            more = math.sqrt(self.least_px / (sides[0] * sides[1]))
-            width, height = (math.ceil(side * more / square) * square for side in sides)
+            grow = math.sqrt(self.least_px / (sides[0] * sides[1]))
+            width, height = (math.ceil(side * grow / square) * square for side in sides)
         return width, height
 
 
 def of_checkpoint(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
-    """What a checkpoint's config.json and preprocessor_config.json say; None of a model of texts alone.
+    """Read a checkpoint's config.json and preprocessor_config.json; None for a model without vision.
 
     Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own.
 
     Raises:
-        LookupError, TypeError: a model of another kind than Qwen's and Idefics3's, or a file that is none.
+        LookupError, TypeError: the model is neither Qwen's nor Idefics3's kind, or a file is malformed.
     """
-    eyes = config.get("vision_config")
-    if eyes is None:
+    vision = config.get("vision_config")
+    if vision is None:
         return None
-    patch = int(eyes["patch_size"])
+    patch = int(vision["patch_size"])
     if "scale_factor" in config:
-        side = int(eyes["image_size"])
+        side = int(vision["image_size"])
         return Vision(512, 256, patch, int(config["scale_factor"]), scaled_to_px=(side, side))
-    merge, size = int(eyes["spatial_merge_size"]), processor.get("size") or processor
+    merge, size = int(vision["spatial_merge_size"]), processor.get("size") or processor
     square = patch * merge
     least = size.get("shortest_edge", size.get("min_pixels"))
     most = size.get("longest_edge", size.get("max_pixels"))

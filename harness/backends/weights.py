@@ -1,4 +1,4 @@
-"""A card's weights on disk: where they lie, whether they are whole, and fetching them once, by hand.
+"""A card's weights on disk: find them, check that they are complete, and download them on request.
 
 Nothing else in the program downloads anything.
 """
@@ -14,19 +14,19 @@ from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
 from harness.core.resources import find
 
-# Without these AutoTokenizer builds an empty tokenizer and says nothing.
+# Without one of these AutoTokenizer silently builds an empty tokenizer.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
 _WEIGHTS = ("*.safetensors", "*.bin")
 _SHARDS = "model.safetensors.index.json"
-# What transformers loads; a repository's other formats of the same weights would come on top.
+# The files that transformers loads; a repository may hold the same weights in other formats as well.
 _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Directory of a card's checkpoint: as given, beside the cards, or in the hub's cache.
+    """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache.
 
     Raises:
-        UserError: it is nowhere, or its config, weights or tokenizer are not there.
+        UserError: it is not found, or it lacks its config, weights or tokenizer.
     """
     local = find("models", card.weights or "")
     where = local if local.is_dir() else _snapshot(card)
@@ -36,9 +36,9 @@ def find_checkpoint(card: Card) -> Path:
             f"model {card.name!r}: no directory {card.weights!r}, and none{at} in the hub cache "
             f"{_hub_cache()}; {fetching(card)}"
         )
-    wanted = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
-    wanted |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
-    for what, patterns in wanted.items():
+    required = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
+    required |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
+    for what, patterns in required.items():
         if not any(path.is_file() for pattern in patterns for path in where.glob(pattern)):
             raise UserError(
                 f"model {card.name!r} in {where} has no {what} ({' or '.join(patterns)}); {fetching(card)}"
@@ -47,10 +47,10 @@ def find_checkpoint(card: Card) -> Path:
 
 
 def find_gguf(card: Card) -> Path:
-    """The GGUF file of a card, as given, beside the cards, or in the hub's cache; its projector is beside it.
+    """Find the GGUF file of a card, as given, beside the cards, or in the hub's cache.
 
     Raises:
-        UserError: one of them is nowhere.
+        UserError: the file is not found, or its projector is not beside it.
     """
     local = find("models", card.weights or "")
     where = local / card.file if card.file else local
@@ -69,7 +69,7 @@ def find_gguf(card: Card) -> Path:
 
 
 def held_to_digest(card: Card, file: Path) -> Path:
-    """The file, if the card's digest is the file's, or the card has none. Raises UserError if it is not."""
+    """Return the file if its digest is the card's, or the card has none. Raises UserError if they differ."""
     if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
         raise UserError(
             f"model {printable(card.name)!r}: {printable(file)} is not what its card says: sha256 {digest}, "
@@ -79,14 +79,14 @@ def held_to_digest(card: Card, file: Path) -> Path:
 
 
 def pull(card: Card) -> Path:
-    """Download what a card's engine needs and is not there yet, into the hub's cache.
+    """Download the files that a card's engine needs and that are missing, into the hub's cache.
 
     Returns:
         The checkpoint's directory, or the GGUF file.
 
     Raises:
-        UserError: there is nothing to fetch, the hub is not reached or refuses, or what came is not what the
-            card says.
+        UserError: there is nothing to fetch, the hub is not reached or refuses, or the digest is not the
+            card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"model {printable(card.name)!r} runs on {card.engine}: it has no weights to pull")
@@ -128,19 +128,19 @@ def _download(card: Card) -> None:
 
 
 def hub_commit(folder: Path) -> str | None:
-    """The commit that a folder of the hub's cache holds; None for a folder anywhere else."""
+    """Return the commit in a folder of the hub's cache; None for any other folder."""
     return folder.name if folder.parent.name == "snapshots" else None
 
 
 def fetching(card: Card) -> str:
-    """What to do about a checkpoint that is not there, or not whole."""
+    """Return the advice for a checkpoint that is missing or incomplete."""
     if Path(card.weights or "").is_absolute():
         return "copy the checkpoint again, or give another directory"
     return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"
 
 
 def _hub_cache() -> Path:
-    """Where the hub's package keeps what it fetched. Importing it to ask would take longer than a listing."""
+    """Return the cache folder of the hub's package, without importing it, which would slow down listings."""
     home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     home = os.environ.get("HF_HOME") or f"{home}/huggingface"
     cache = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE") or f"{home}/hub"
@@ -148,7 +148,7 @@ def _hub_cache() -> Path:
 
 
 def _snapshot(card: Card) -> Path | None:
-    """The folder in the hub's cache of a card's repository at its revision; None if it is not there."""
+    """Return the folder in the hub's cache of a card's repository at its revision; None if there is none."""
     repository = _hub_cache() / f"models--{(card.weights or '').replace('/', '--')}"
     revision = card.revision or "main"
     reference = repository / "refs" / revision
@@ -158,7 +158,7 @@ def _snapshot(card: Card) -> Path | None:
 
 
 def _shards(checkpoint: Path) -> list[str]:
-    """Names of the files that weights are split into; a download that was cut off lacks some."""
+    """Return the names of the files that weights are split into; an interrupted download lacks some."""
     try:
         index = json.loads((checkpoint / _SHARDS).read_bytes())
         return sorted(set(index["weight_map"].values()))

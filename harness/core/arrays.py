@@ -1,4 +1,4 @@
-"""Names for the arrays that rules take and give. `(...)` in a docstring is any number of batch dims."""
+"""Types of the arrays that rules take and return. `(...)` in a docstring means any number of batch dims."""
 
 from functools import reduce
 
@@ -12,6 +12,6 @@ Texts = NDArray[np.str_]
 
 
 def summed(values: Floats, axis: int) -> Floats:
-    """The sum along a short axis, such as that of actions, which `np.sum` takes several times as long for."""
+    """Sum along a short axis, such as that of actions, several times as fast as `np.sum`."""
     total: Floats = reduce(np.add, np.moveaxis(values, axis, 0))
     return total

@@ -1,9 +1,12 @@
-"""Configuration as typed records. A mistake is one line: file, table and key, the value, what is allowed.
+"""Read TOML configuration into typed records, and report each mistake in one line.
+
+The line names the file, the table, the key, the value and what is allowed.
 
 A record is a frozen dataclass or a `msgspec.Struct`, nested as the file's tables are. Its annotations are the
 rules: `Literal[...]` lists choices; `Annotated[float, Meta(ge=0, description="seconds, 0 or more")]` bounds a
-value and says so in words; a ValueError from `__post_init__` says what is wrong with a table as a whole. No
-value is converted but an integer to a float. An unknown key is refused, with the nearest one that exists.
+value and describes the bound; a ValueError from `__post_init__` says what is wrong with a table as a whole.
+Integers are converted to floats, and nothing else is. An unknown key is refused, and the message suggests the
+nearest known one.
 
     @dataclass(frozen=True)
     class Channel:
@@ -29,25 +32,25 @@ from harness.core.files import text_of
 
 Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
-LONGEST_S = 3600.0  # of an answer that a model can be declared to take
+LONGEST_S = 3600.0  # the longest time that a model may be declared to take for an answer
 Seconds = Annotated[
     float, msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}")
 ]
 _type_info = cache(type_info)
 _MISSING = re.compile(r"Object missing required field `(.+)`")
-_STEPS = re.compile(r"[^.\[\]`]+")  # of a path such as `.points[1].loss`
+_STEPS = re.compile(r"[^.\[\]`]+")  # the steps of a path such as `.points[1].loss`
 _IN_WORDS = {"object": "a table", "array": "a list"}
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Read the tables of a TOML file.
 
     Args:
-        path: the file, which is there.
-        where: what it is called in messages, such as `model card models/mine.toml`.
+        path: the file, which must exist.
+        where: its name in messages, such as `model card models/mine.toml`.
 
     Raises:
-        UserError: it is no TOML.
+        UserError: the file cannot be read or is not TOML.
     """
     try:
         return loads(text_of(path), where)
@@ -57,21 +60,21 @@ def toml(path: Path, where: str) -> dict[str, Any]:
 
 
 def loads(text: str, where: str) -> dict[str, Any]:
-    """The tables of a TOML text. Raises UserError if it is none."""
+    """Parse a TOML text into tables. Raises UserError if it is not TOML."""
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # too many digits, and brackets, among them
+    except (ValueError, RecursionError) as error:  # also raised for too many digits or brackets
         raise UserError(f"{where} is no TOML: {printable(error)}; fix the file") from None
 
 
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
-    """A record of some kind from a table, as TOML and JSON have them.
+    """Convert a TOML or JSON table to a record.
 
     Args:
-        table: its keys are names of fields.
+        table: the values by field name.
         kind: class of the record.
-        where: what the table is called in messages.
-        given: fields that the program fills in, which the table may not hold.
+        where: name of the table in messages.
+        given: fields that the program fills in; the table may not hold them.
 
     Raises:
         UserError: an unknown or missing key, or a value that is not allowed.
@@ -86,15 +89,15 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
-    """A frozen dataclass with some of its fields from their texts.
+    """Return a copy of a frozen dataclass with some fields set from text.
 
     Args:
-        record: what is changed.
-        settings: fields' names and values.
-        where: what to call it in messages.
+        record: the original, which stays as it is.
+        settings: new values, as text, by field name.
+        where: name of the record in messages.
 
     Raises:
-        UserError: a field that it has not, or a value that is not allowed.
+        UserError: an unknown field, or a value that is not allowed.
     """
     hints = get_type_hints(type(record), include_extras=True)
     known = {name: getattr(record, name) for name in settable(record)}
@@ -111,13 +114,16 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 
 
 def settable(record: Any) -> list[str]:
-    """Names of the fields that are one number, switch or text."""
+    """Return the names of the fields that hold one number, boolean or string."""
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
 
 
 def value_of(usual: object, text: str) -> object:
-    """A value of the kind that is usual; what is none stays text, which no setting of that kind allows."""
+    """Convert a text to the type of the `usual` value.
+
+    A text that cannot be converted is returned unchanged; the check of the type then refuses it.
+    """
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
     if isinstance(usual, str):
@@ -133,13 +139,13 @@ def _place(where: str, path: Sequence[str]) -> str:
 
 
 def _unknown_keys(
-    value: Any, kind: Any, path: tuple[str, ...], but: Collection[str] = ()
+    value: Any, kind: Any, path: tuple[str, ...], exempt: Collection[str] = ()
 ) -> Iterator[tuple[tuple[str, ...], str, list[str]]]:
-    """Path of a table, key that is none of its record's fields, and the fields' names."""
+    """Yield each unknown key: the path of its table, the key, and the names of the known fields."""
     if isinstance(value, Mapping) and (fields := _fields(kind)):
         for key, inner in value.items():
-            if key in but or key not in fields:
-                yield path, key, [name for name in fields if name not in but]
+            if key in exempt or key not in fields:
+                yield path, key, [name for name in fields if name not in exempt]
             else:
                 yield from _unknown_keys(inner, fields[key], (*path, key))
     elif isinstance(value, Mapping | list) and (item := _item(kind)):
@@ -148,47 +154,47 @@ def _unknown_keys(
 
 
 def _mistake(message: str, table: Mapping[str, Any], kind: Any, where: str) -> UserError:
-    """What msgspec says, such as "Expected `int`, got `str` - at `$.latency.n`", as a line for people."""
-    said, _, at = message.partition(" - at `$")
-    path = _STEPS.findall(at)
-    if missing := _MISSING.fullmatch(said):
+    """Rewrite a message of msgspec, such as "Expected `int`, got `str` - at `$.latency.n`", for people."""
+    problem, _, location = message.partition(" - at `$")
+    path = _STEPS.findall(location)
+    if missing := _MISSING.fullmatch(problem):
         return UserError(f"{_place(where, path)} has no {missing[1]}; add it")
-    # From a __post_init__, of the whole, or inside a member that msgspec does not name.
-    if not said.startswith(("Expected", "Invalid enum")) or not path or "[...]" in at[:-6]:
-        return UserError(f"{_place(where, path)}: {printable(said)}")
+    # The message is a __post_init__'s, is about the whole, or is inside a member that msgspec does not name.
+    if not problem.startswith(("Expected", "Invalid enum")) or not path or "[...]" in location[:-6]:
+        return UserError(f"{_place(where, path)}: {printable(problem)}")
     value: Any = table
     for step in path:
         value = value[int(step) if isinstance(value, list) else step]
         kind = (_fields(kind) or {}).get(step) or _item(kind)
     *tables, key = path
-    if said.startswith("Invalid enum"):
+    if problem.startswith("Invalid enum"):
         return unknown(f"{key} in {_place(where, tables)}", str(value), map(str, _plain(kind).values))
-    expected, _, got = said.removeprefix("Expected ").replace("`", "").partition(", got ")
+    expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_IN_WORDS.get(name, name) for name in expected.split(" | ") if name != "null")
     allowed = kinds if got else _description(kind) or kinds
     return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
 
 
 def _fields(kind: Any) -> dict[str, Any]:
-    """Types of a record's fields; empty for any other type."""
+    """Return the types of a record's fields by name; empty for any other type."""
     return {field.encode_name: field.type for field in getattr(_plain(kind), "fields", ())}
 
 
 def _item(kind: Any) -> Any:
-    """Type of what a list or a table of any keys holds; None for any other type."""
+    """Return the type of the items of a list, or of the values of a mapping; None for any other type."""
     plain = _plain(kind)
     return getattr(plain, "item_type", None) or getattr(plain, "value_type", None)
 
 
 def _plain(kind: Any) -> Any:
-    """A type without null and without what describes it."""
+    """Strip the description and the null option from a type."""
     if hasattr(kind, "extra_json_schema"):
         return _plain(kind.type)
-    others = [one for one in getattr(kind, "types", ()) if type(one).__name__ != "NoneType"]
-    return _plain(others[0]) if len(others) == 1 else kind
+    members = [member for member in getattr(kind, "types", ()) if type(member).__name__ != "NoneType"]
+    return _plain(members[0]) if len(members) == 1 else kind
 
 
 def _description(kind: Any) -> str | None:
-    """The words of a type's `Meta(description=...)`."""
-    words: str | None = (getattr(kind, "extra_json_schema", None) or {}).get("description")
-    return words or next(filter(None, map(_description, getattr(kind, "types", ()))), None)
+    """Return the text of a type's `Meta(description=...)`."""
+    description: str | None = (getattr(kind, "extra_json_schema", None) or {}).get("description")
+    return description or next(filter(None, map(_description, getattr(kind, "types", ()))), None)

@@ -1,4 +1,4 @@
-"""What a user can get wrong, said in one line.
+"""Errors for users: bad input is reported in one line.
 
 Three kinds of failure are kept apart. A bad completion is data (a parse status). Bad input is a
 `UserError`: one line, exit code 2. Anything else is a bug and crashes with a traceback.
@@ -13,19 +13,19 @@ class UserError(Exception):
 
 
 class Unfinished(UserError):
-    """Some parts of some work cannot be done; the others are."""
+    """Some parts of the work cannot be done; all others are done."""
 
 
 def printable(text: object, limit: int = 120) -> str:
-    """Hostile text made safe for one terminal line: control characters escaped, cut at `limit`."""
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
-    return shown if len(shown) <= limit else shown[: limit - 1] + "…"
+    """Make any text safe for one terminal line: escape control characters, and cut at `limit` characters."""
+    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+    return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
-    """`UserError` for a name that does not exist, with the nearest one and the list."""
+    """Build the `UserError` for a name that does not exist; it suggests the nearest name and lists all."""
     names = sorted(known)
-    near = get_close_matches(name, names, n=1)
-    meant = f"; did you mean {near[0]!r}?" if near else ";"
+    nearest = get_close_matches(name, names, n=1)
+    suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
     listed = ", ".join(names) or "(none)"
-    return UserError(f"unknown {kind} {printable(name)!r}{meant} known: {listed}{hint}")
+    return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")

@@ -1,7 +1,7 @@
-"""Packages that only some commands need, each in an extra of pyproject.toml.
+"""Optional packages, which only some commands need; each is in an extra of pyproject.toml.
 
-They are imported where they are used. Where one is missing the command line says, in one line, which, and
-the command that installs it: of an import that fails (`without`), and before long work (`need`).
+They are imported where they are used. If one is missing, a one-line error names it and the command that
+installs it: `need` checks before long work, and `without` builds the error of a failed import.
 """
 
 from importlib.util import find_spec
@@ -24,7 +24,7 @@ OPTIONAL = {
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra."""
+    """Return the command that installs an extra."""
     return f"pip install 'swarmdrive-harness[{extra}]'"
 
 
@@ -36,5 +36,5 @@ def need(what: str, *modules: str) -> None:
 
 
 def without(what: str, package: str, extra: str) -> UserError:
-    """The error of what cannot run without a package."""
+    """Build the error for a command or option (`what`) that needs a missing package."""
     return UserError(f"{what} needs {package}, which is not installed; run `{install(extra)}`")

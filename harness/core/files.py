@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and named by what is in them."""
+"""Write files atomically, lock them, and compute digests of files and JSON values."""
 
 import errno
 import hashlib
@@ -23,18 +23,21 @@ _PLAIN = frozenset({str, int, bool, NoneType})
 
 
 def canonical_json(value: Any) -> str:
-    """One text for one value: sorted keys, no spaces, no NaN. Raises ValueError on NaN or infinity."""
-    # Digests are of this text, which is the standard library's; msgspec writes most of it in half the time.
+    """Return the one JSON text of a value: sorted keys, no spaces. Raises ValueError on NaN or infinity."""
+    # Digests depend on this text, which the standard library defines; msgspec takes half the time for most.
     if _written_alike(value):
         try:
             return _QUICK.encode(value).decode()
-        except (TypeError, UnicodeEncodeError):  # a key that is no text, or a lone surrogate
+        except (TypeError, UnicodeEncodeError):  # a key that is not a string, or a lone surrogate
             pass
     return _EXACT.encode(value)
 
 
 def _written_alike(value: Any) -> bool:
-    """Whether msgspec and the standard library agree: not on exponents, NaN and types that JSON lacks."""
+    """Whether msgspec and the standard library encode a value alike.
+
+    They differ on exponents, NaN and types that JSON lacks.
+    """
     kind = type(value)
     if kind is dict:
         value = value.values()
@@ -54,8 +57,13 @@ def _without_exponent(number: float) -> bool:
 
 
 def text_of(path: Path, most: int = 1 << 24) -> str:
-    """Text of a file. Raises OSError if it is none or above `most` bytes, UnicodeDecodeError if not UTF-8."""
-    if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for, and a device never ends
+    """Read a UTF-8 text file.
+
+    Raises:
+        OSError: it is not a regular file, or is larger than `most` bytes.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe would block, and a device never ends
         raise OSError(errno.EINVAL, "it is no file")
     if path.stat().st_size > most:
         raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
@@ -63,33 +71,33 @@ def text_of(path: Path, most: int = 1 << 24) -> str:
 
 
 def sha256_bytes(data: bytes) -> str:
-    """Hex digest of some bytes."""
+    """Return the hex SHA-256 digest of bytes."""
     return hashlib.sha256(data).hexdigest()
 
 
 def sha256_file(path: Path) -> str:
-    """Hex digest of a file's content."""
+    """Return the hex SHA-256 digest of a file's content."""
     with path.open("rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def digest(value: Any) -> str:
-    """Hex digest of a JSON value, the same in every process."""
+    """Return the hex SHA-256 digest of a JSON value; it is the same in every process."""
     return sha256_bytes(canonical_json(value).encode())
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write to, which takes the place of `path` at the end; gone if that is not reached.
+    """Yield a temporary file to write to; it replaces `path` on success and is deleted on an error.
 
-    What killed processes left of such files goes as well.
+    Temporary files of killed processes are deleted as well.
     """
-    if path.is_dir():  # and not only after all is written
+    if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     forget_halves(path.parent, escape(path.name))
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.unlink(missing_ok=True)  # a link, or of a process that had this number
+    part.unlink(missing_ok=True)  # it may be a link, or left by an earlier process with this id
     try:
         with alone(part):
             yield part
@@ -101,27 +109,27 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def forget_halves(folder: Path, name: str = "*") -> None:
-    """Remove what killed processes left half written of the files of a name: nobody holds it any more."""
-    for left in folder.glob(f".{name}.*.part"):
-        with suppress(OSError), alone(left):
-            left.unlink()
+    """Delete temporary files that killed processes left (they are not locked); `name` is a glob pattern."""
+    for part in folder.glob(f".{name}.*.part"):
+        with suppress(OSError), alone(part):
+            part.unlink()
 
 
 def write_whole(path: Path, data: str | bytes) -> None:
-    """Replace `path` by `data` in one step, so that a kill leaves the old file or the new one."""
+    """Write `data` to `path` in one step: a kill leaves either the old file or the new one."""
     with replacing(path) as part:
         part.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold a file's lock, which a killed process gives back; the file is made where it is missing.
+    """Hold an exclusive lock on a file, which is created if missing. A killed process releases its lock.
 
-    Where the system has no such locks (Windows) nothing is held.
+    On a system without such locks (Windows) nothing is locked.
 
     Raises:
-        BlockingIOError: another process holds it for longer than `patience_s`.
-        OSError: it cannot be opened, or is a link, which is not followed.
+        BlockingIOError: another process still holds the lock after `patience_s` seconds.
+        OSError: the file cannot be opened, or is a link, which is not followed.
     """
     try:
         import fcntl
@@ -130,13 +138,13 @@ def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
         return
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
-        until_s = time.monotonic() + patience_s
+        deadline_s = time.monotonic() + patience_s
         while True:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                if time.monotonic() >= until_s:
+                if time.monotonic() >= deadline_s:
                     raise
                 time.sleep(0.05)
         yield

@@ -1,7 +1,8 @@
-"""Names that folders are known by."""
+"""Names of the files and formats that identify a folder as a run, unfinished work or a suite."""
 
 FORMAT = "swarmdrive-run/2"
-READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}  # older formats, and the version for them
-WORK = ".work"  # what a kill leaves
-CONFIG = "config.json"  # the settings that work began with; it counts only once this is there
-SUITE = "suite.json"  # what makes a folder that of a suite's runs
+# Older formats, and the version of the harness that reads each.
+READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
+WORK = ".work"  # folder of unfinished work
+CONFIG = "config.json"  # in it, the settings that the work began with; without it there is nothing to resume
+SUITE = "suite.json"  # marks a folder that holds a suite's runs

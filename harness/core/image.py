@@ -1,4 +1,4 @@
-"""A picture: its pixels, their digest, and a PNG file of them (ISO/IEC 15948), which needs no package."""
+"""A picture with its digest, and a PNG encoder (ISO/IEC 15948) that needs no imaging package."""
 
 import zlib
 from functools import cached_property
@@ -13,11 +13,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Image:
-    """A picture.
-
-    Attributes:
-        pixels: (height, width, 3) red, green and blue.
-    """
+    """A picture as `pixels`, (height, width, 3) red, green and blue."""
 
     def __init__(self, pixels: Pixels) -> None:
         self._pixels = pixels
@@ -28,13 +24,13 @@ class Image:
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of its size and its pixels, whatever file holds them."""
+        """Digest of the size and the pixels; it does not depend on a file format."""
         return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def png(self) -> bytes:
-        """The picture as a file."""
+        """Encode the picture as a PNG file."""
         height, width, _ = self.pixels.shape
-        # Every line begins with 0, no filter: what has few colours is smallest so.
+        # Every line begins with 0, which means no filter: pictures with few colours are smallest so.
         lines = np.pad(self.pixels.reshape(height, -1), ((0, 0), (1, 0)))
         chunks = (
             (b"IHDR", pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),

@@ -1,4 +1,4 @@
-"""Test cases in JUnit's XML, which CI systems show."""
+"""Write test cases as JUnit XML, which CI systems show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 from harness.core.errors import printable
 
-WHOLE = 10**6  # characters of a message
+WHOLE = 10**6  # most characters of a message
 
 
 @dataclass(frozen=True)
 class Case:
-    """One test case; `failure` says why it failed, None that it passed."""
+    """One test case of a class `of`; `failure` says why it failed, and is None if it passed."""
 
     of: str
     name: str
@@ -19,7 +19,7 @@ class Case:
 
 
 def junit(name: str, cases: Sequence[Case]) -> str:
-    """A test suite as XML, whatever its texts hold."""
+    """Return a test suite as XML; texts may hold any characters."""
     failed = sum(case.failure is not None for case in cases)
     suite = Element("testsuite", {"name": name, "tests": str(len(cases)), "failures": str(failed)})
     for case in cases:

@@ -1,4 +1,4 @@
-"""What is kept between runs in the user's cache folder: it saves time, and is made again where it is gone."""
+"""Keep data between runs in the user's cache folder. It only saves time: what is missing is made again."""
 
 import os
 from contextlib import suppress
@@ -12,7 +12,7 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def folder() -> Path:
-    """`$SWARMDRIVE_CACHE`, else the harness's folder in the user's cache folder."""
+    """Return `$SWARMDRIVE_CACHE`, or else the harness's folder in the user's cache folder."""
     if moved := os.environ.get("SWARMDRIVE_CACHE"):
         return Path(moved)
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
@@ -20,7 +20,7 @@ def folder() -> Path:
 
 
 def recall(name: str) -> bytes | None:
-    """What was kept under a name; None where nothing can be read."""
+    """Read what was kept under a name; None if it cannot be read."""
     try:
         return (folder() / name).read_bytes()
     except OSError:
@@ -28,13 +28,13 @@ def recall(name: str) -> bytes | None:
 
 
 def keep(name: str, data: bytes) -> None:
-    """Keep something under a name, where the folder can be written."""
+    """Keep data under a name; do nothing if the folder cannot be written."""
     with suppress(OSError):
         write_whole(folder() / name, data)
 
 
 @cache
 def code_sha256(*patterns: str) -> str:
-    """Digest of the files of the package that match, so that other code finds nothing of what is kept."""
+    """Return the digest of the package's files that match, for keys that change with the code."""
     files = sorted(file for pattern in patterns for file in _PACKAGE.glob(pattern))
     return digest([__version__, *(sha256_bytes(file.read_bytes()) for file in files)])

@@ -1,4 +1,4 @@
-"""Python's garbage collector, kept from walking millions of plain values that hold no cycle."""
+"""Suspend Python's garbage collector while millions of plain values without cycles are created."""
 
 import gc
 from collections.abc import Iterator
@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """No collection of cycles while open. For code that fills memory with JSON or rows, and makes no cycles.
+    """Suspend the collection of cycles, for code that fills memory with JSON or rows and makes no cycles.
 
-    The collector otherwise walks all that is there each time it has grown by a quarter, which was up to half
-    of the time such code took.
+    The collector would otherwise walk everything each time memory has grown by a quarter, which took up to
+    half of the time of such code.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 
 def generator(*key: object) -> np.random.Generator:
-    """Generator for one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
+    """Return the generator of one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
     return np.random.Generator(np.random.PCG64(int.from_bytes(seed, "big")))
 
 
 def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:
-    """Uniform draws in [0, 1) for one key."""
+    """Return the uniform draws in [0, 1) of one key."""
     return generator(*key).random(shape)

@@ -1,4 +1,4 @@
-"""The test of a difference in success between two runs of the same episodes."""
+"""Test the difference in success between two runs of the same episodes."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from harness.core.statistics import rate_difference
 
 @dataclass(frozen=True)
 class SuccessTest:
-    """What a test says of the difference in success.
+    """Result of a test of the difference in success.
 
     Attributes:
-        method: `mcnemar` where no seed changes an episode's success, so that an episode is one yes or no;
+        method: `mcnemar` if no seed changes any episode's success, so that an episode is one yes or no;
             else `interval`.
-        p_value: two-sided and exact, of McNemar's test; None for an interval.
+        p_value: exact two-sided p-value of McNemar's test; None for an interval.
         low: lower end of the 95 % interval of B - A over episodes; None for McNemar's test.
         high: upper end.
     """
@@ -25,14 +25,19 @@ class SuccessTest:
 
 
 def success_test(a: Floats, b: Floats) -> SuccessTest | None:
-    """Test the difference in success, 0 or 1, both (E, S), over episodes."""
+    """Test the difference in success between A and B over episodes; None for an interval of one episode.
+
+    Args:
+        a: A's success, 0 or 1, by episode and seed, (E, S).
+        b: B's, in the same order.
+    """
     from scipy.stats import binomtest
 
     if (a == a[:, :1]).all() and (b == b[:, :1]).all():
-        gained, lost = (int((x > y).sum()) for x, y in ((b[:, 0], a[:, 0]), (a[:, 0], b[:, 0])))
-        p_value = float(binomtest(lost, gained + lost).pvalue) if gained + lost else 1.0
+        gains, losses = int((b[:, 0] > a[:, 0]).sum()), int((a[:, 0] > b[:, 0]).sum())
+        p_value = float(binomtest(losses, gains + losses).pvalue) if gains + losses else 1.0
         return SuccessTest("mcnemar", p_value=p_value)
     if len(a) < 2:
         return None
-    found = rate_difference(b, a)
-    return SuccessTest("interval", low=found.low, high=found.high)
+    difference = rate_difference(b, a)
+    return SuccessTest("interval", low=difference.low, high=difference.high)

@@ -1,6 +1,6 @@
-"""Work spread over processes, or over the nodes of a Ray cluster: the same results, whoever does it.
+"""Map a function over items in processes or on a Ray cluster; the results are the same either way.
 
-Whoever asks takes every result, and so is the only one who writes.
+The calling process receives every result, so only it writes files.
 """
 
 import os
@@ -22,26 +22,26 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MOST_WORKERS = 256
-TRIES = 3  # of an item whose worker dies of it
+TRIES = 3  # attempts at an item whose worker dies
 _RAY = re.compile(r"ray(?::(//)?([\w.\[\]:-]+:\d+))?", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Ray:
-    """A Ray cluster: its address, or None for that of `RAY_ADDRESS`, else one on this machine."""
+    """A Ray cluster by its address; None means that of `RAY_ADDRESS`, or else one on this machine."""
 
     address: str | None = None
 
 
-Workers = int | Ray  # processes, or a cluster
+Workers = int | Ray  # a number of processes, or a cluster
 
 
 def workers_of(text: str) -> Workers:
-    """Who `--workers` names. Raises UserError where it names nobody."""
+    """Parse the value of `--workers`. Raises UserError if it is neither a count nor a cluster."""
     if text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= MOST_WORKERS:
         return int(text)
-    if found := _RAY.fullmatch(text):
-        return Ray(text if found[1] else found[2])
+    if match := _RAY.fullmatch(text):
+        return Ray(text if match[1] else match[2])
     raise UserError(
         f"--workers {printable(text)}: give 1 to {MOST_WORKERS} processes, or ray for a Ray cluster, "
         "ray://HOST:10001 for one elsewhere, ray:HOST:6379 on a node of it"
@@ -49,102 +49,102 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Who works. An item that is given comes back once, as its result or as `Lost`."""
+    """Runs items on workers. Every submitted item comes back once, as its result or as `Lost`."""
 
     def room(self) -> bool:
-        """Whether another item can be given."""
+        """Whether another item can be submitted."""
         ...
 
     def give(self, place: int, item: Any) -> None:
-        """Have an item worked on."""
+        """Submit an item."""
         ...
 
     def take(self) -> "tuple[int, Any]":
-        """Wait for an item: its place, and its result or `Lost`. Raises what the work raises."""
+        """Wait for an item; return its place, and its result or `Lost`. Raises what the work raises."""
         ...
 
     def close(self) -> None:
-        """End whatever is still worked on."""
+        """Stop all items that still run."""
         ...
 
 
 class Lost:
-    """What becomes of an item whose worker died."""
+    """Stands for the result of an item whose worker died."""
 
 
 def each(
     work: Callable[[Item], Result], items: Iterable[Item], workers: Workers,
-    took: Callable[[int, Result], None], named: Callable[[Item], str] = str, repeatable: bool = True,
+    on_result: Callable[[int, Result], None], label: Callable[[Item], str] = str, repeatable: bool = True,
 ) -> None:  # fmt: skip
-    """Work on items in any order, and take each one's result once, in this process.
+    """Call `work` on every item, in any order, and handle each result once, in this process.
 
-    Where work raises, or this is interrupted, the others are ended.
+    If `work` raises, or the call is interrupted, the items that still run are stopped.
 
     Args:
-        work: what is done with an item; both can be pickled.
-        items: what is worked on.
-        workers: who works; one worker is this process.
-        took: called with an item's place and its result as soon as that is there.
-        named: what an item is called in messages.
-        repeatable: the same work on another node has to come out the same, or this stops.
+        work: the function; it and the items can be pickled.
+        items: its arguments.
+        workers: processes or a cluster; 1 means this process.
+        on_result: called with an item's place and its result as soon as the result arrives.
+        label: gives an item's name in messages.
+        repeatable: whether the same item must give the same result on another node; a difference is an error.
 
     Raises:
-        Unfinished: some items' workers died `TRIES` times; all other items are taken.
+        Unfinished: the workers of some items died `TRIES` times; all other items are done.
     """
-    given = list(items)
-    if workers == 1 or not given:
-        for place, item in enumerate(given):
-            took(place, work(item))
+    inputs = list(items)
+    if workers == 1 or not inputs:
+        for place, item in enumerate(inputs):
+            on_result(place, work(item))
         return
-    executor = _executor(work, given, workers, named, repeatable)
-    todo, busy, deaths = deque(range(len(given))), 0, Counter[int]()
-    taken, dead = 0, list[int]()
+    executor = _executor(work, inputs, workers, label, repeatable)
+    todo, busy, deaths = deque(range(len(inputs))), 0, Counter[int]()
+    n_done, dead = 0, list[int]()
     try:
         while todo or busy:
             while todo and executor.room():
                 place = todo.popleft()
-                executor.give(place, given[place])
+                executor.give(place, inputs[place])
                 busy += 1
             place, result = executor.take()
             busy -= 1
             if not isinstance(result, Lost):
-                taken += 1
-                took(place, result)
+                n_done += 1
+                on_result(place, result)
                 continue
             deaths[place] += 1
             if deaths[place] < TRIES:
                 todo.appendleft(place)
                 continue
             dead.append(place)
-            if not taken and len(dead) == TRIES:  # nothing works: the rest is not tried
+            if not n_done and len(dead) == TRIES:  # nothing works, so the rest is not tried
                 break
     finally:
         executor.close()
     if dead:
-        names = ", ".join(named(given[place]) for place in sorted(dead))
+        names = ", ".join(label(inputs[place]) for place in sorted(dead))
         raise Unfinished(
             f"{printable(names)}: the worker was killed {TRIES} times, perhaps because memory ran out; try "
-            f"fewer --workers; the other {taken} are done"
+            f"fewer --workers; the other {n_done} are done"
         )
 
 
 def spread(
     work: Callable[[Item], Result], items: Iterable[Item], workers: Workers,
-    progress: Callable[[int], None], named: Callable[[Item], str] = str, repeatable: bool = True,
+    progress: Callable[[int], None], label: Callable[[Item], str] = str, repeatable: bool = True,
 ) -> list[Result]:  # fmt: skip
-    """`[work(i) for i in items]` (see `each`); `progress(1)` is called as each is done."""
-    done: dict[int, Result] = {}
+    """Return `[work(i) for i in items]` (see `each`), and call `progress(1)` after every item."""
+    results: dict[int, Result] = {}
 
-    def took(place: int, result: Result) -> None:
-        done[place] = result
+    def on_result(place: int, result: Result) -> None:
+        results[place] = result
         progress(1)
 
-    each(work, items, workers, took, named, repeatable)
-    return [done[place] for place in range(len(done))]
+    each(work, items, workers, on_result, label, repeatable)
+    return [results[place] for place in range(len(results))]
 
 
 def _executor(
-    work: Callable[[Any], Any], items: list[Any], workers: Workers, named: Callable[[Any], str],
+    work: Callable[[Any], Any], items: list[Any], workers: Workers, label: Callable[[Any], str],
     repeatable: bool,
 ) -> Executor:  # fmt: skip
     if isinstance(workers, int):
@@ -152,11 +152,11 @@ def _executor(
     extras.need(f"--workers {workers.address or 'ray'}", "ray")
     from harness.core.ray_tasks import Tasks
 
-    return Tasks(work, workers.address, lambda place: named(items[place]), repeatable)
+    return Tasks(work, workers.address, lambda place: label(items[place]), repeatable)
 
 
 class _Processes:
-    """Processes, each a pool of its own, so that one that dies takes its own item alone with it."""
+    """An executor of processes. Each process is a pool of its own, so a death loses one item only."""
 
     def __init__(self, work: Callable[[Any], Any], workers: int) -> None:
         self._work, self._workers = work, workers
@@ -192,14 +192,14 @@ class _Processes:
 
 
 def _begin() -> None:
-    """Leave signals to the parent, which kills its workers."""
+    """Ignore signals in a worker: the parent handles them and kills its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     end_with_parent()
 
 
 def end_with_parent() -> None:
-    """Have this process end with its parent, however that ends, also in the middle of its work."""
+    """End this process as soon as its parent ends, for whatever reason, even in the middle of its work."""
 
     def wait() -> None:
         parent = parent_process()

@@ -1,4 +1,4 @@
-"""Plug-ins: what a room has built in, and what installed packages add by entry points."""
+"""Registries of plug-ins: built-in ones, and those that installed packages add by entry points."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
@@ -12,17 +12,17 @@ T = TypeVar("T")
 
 
 class Plugins(Mapping[str, T], Generic[T]):
-    """Things by name. A package adds one by an entry point; it loads when it is looked up by name.
+    """Plug-ins by name. A package adds one by an entry point, which is loaded when its name is looked up.
 
-    What is built in cannot be replaced.
+    Built-in ones cannot be replaced.
 
     Attributes:
-        group: the entry points' group.
-        built_in: what the harness has itself.
+        group: group of the entry points.
+        kind: class or runtime-checkable protocol that every plug-in must be an instance of.
+        built_in: those of the harness itself.
     """
 
     def __init__(self, group: str, kind: Any, built_in: Mapping[str, T]) -> None:
-        """`kind` is the class or the runtime-checkable protocol that every plug-in has to be of."""
         self.group, self.kind, self.built_in = group, kind, built_in
         self._loaded = dict(built_in)
 
@@ -39,7 +39,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         return len(list(iter(self)))
 
     def _entries(self) -> dict[str, Any]:
-        from importlib.metadata import entry_points  # only a look-up pays for it
+        from importlib.metadata import entry_points  # imported here because it is slow
 
         return {entry.name: entry for entry in sorted(entry_points(group=self.group))}
 
@@ -51,7 +51,7 @@ class Plugins(Mapping[str, T], Generic[T]):
             plugin: T = entry.load()
         except Exception as error:  # whatever a package's import raises
             raise UserError(f"{what} does not load ({printable(error)}); {repair}") from error
-        # A class has its instances' methods, and so would pass for one of them.
+        # A class has the methods of its instances, so it would pass the check of the protocol.
         if isinstance(plugin, type) or not isinstance(plugin, self.kind):
             raise UserError(
                 f"{what} is of type {type(plugin).__name__} and no {self.kind.__name__}; {repair}"
@@ -60,19 +60,22 @@ class Plugins(Mapping[str, T], Generic[T]):
 
 
 class FilesAndPlugins(Plugins[T]):
-    """Plug-ins; behind what is built in and before packages come TOML files, shipped and a project's."""
+    """Plug-ins that may also be TOML files, shipped or a project's.
+
+    Built-in ones come first, then files, then packages.
+    """
 
     folder: str
-    """The files' kind of resource."""
+    """Kind of resource that the files are, such as `channels`."""
 
     @abstractmethod
     def read(self, file: Path) -> T:
-        """What a file holds. Raises UserError for one that does not work."""
+        """Read the plug-in in a file. Raises UserError if the file is wrong."""
 
     def file(self, name: str) -> Path | None:
-        """The file that holds a thing; None for one that no file holds."""
-        there = name not in self.built_in and name in resources.names(self.folder)
-        return resources.find(self.folder, f"{name}.toml") if there else None
+        """Return the file of a plug-in; None if it is not a file."""
+        is_file = name not in self.built_in and name in resources.names(self.folder)
+        return resources.find(self.folder, f"{name}.toml") if is_file else None
 
     def __getitem__(self, name: str) -> T:
         """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""

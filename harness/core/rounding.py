@@ -1,14 +1,14 @@
-"""Probabilities in whole parts that still sum to 1."""
+"""Round probabilities so that they still sum to 1."""
 
 from collections.abc import Sequence
 
 
 def rounded(p: Sequence[float], parts: int = 100) -> list[float]:
-    """The distribution in so many equal parts; the last go where rounding took most (largest remainder).
+    """Round a distribution to multiples of 1/`parts` by the method of the largest remainder.
 
     Args:
         p: probabilities that sum to 1.
-        parts: hundredths are what a prompt asks for.
+        parts: 100 for the hundredths that a prompt asks for.
     """
     floor = [int(x * parts + 1e-9) for x in p]
     short = parts - sum(floor)

@@ -1,4 +1,4 @@
-"""Layout seeds by purpose, so that no layout is tuned or trained on and then reported.
+"""Ranges of layout seeds by purpose, so that no layout is tuned or trained on and then reported.
 
 Constants of scenarios and wordings of prompts are chosen on tune seeds, models learn from train seeds, and
 every number that is quoted comes from report seeds. The rule is the same for every scenario.
@@ -11,32 +11,32 @@ from harness.core.errors import UserError
 
 Purpose = Literal["tune", "train", "report"]
 
-FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # up to the next one's
+FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # each range ends at the next
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """What the layout seeds `first` to `first + count - 1` are for.
+    """Return the one purpose of the layout seeds `first` to `first + count - 1`.
 
     Raises:
-        UserError: they are not all for one purpose.
+        UserError: they have more than one purpose.
     """
-    found = purposes(first, count)
-    if len(found) > 1:
+    present = purposes(first, count)
+    if len(present) > 1:
         ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]
         raise UserError(
-            f"layout seeds {first} to {first + count - 1} are for {' and '.join(found)}; keep to one of "
+            f"layout seeds {first} to {first + count - 1} are for {' and '.join(present)}; keep to one of "
             f"{', '.join(ends)}, {FIRST['report']} and above (report)"
         )
-    return found[0]
+    return present[0]
 
 
 def stated(first: int, count: int) -> str:
-    """Layout seeds as they stand beside a number: `layout seeds 0 to 239 (tune)`."""
+    """Describe a range of layout seeds as printed beside a number: `layout seeds 0 to 239 (tune)`."""
     return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 
 
 def purposes(first: int, count: int) -> list[Purpose]:
-    """What the layout seeds `first` to `first + count - 1` are for; several where no command asked before."""
+    """Return all purposes of the layout seeds `first` to `first + count - 1`."""
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
     return [n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count]

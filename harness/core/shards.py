@@ -1,6 +1,6 @@
-"""Shards: parts of one work that are done apart, each in a folder of its own, and put together by the bytes.
+"""Split work into shards, one folder each, and merge their files byte for byte.
 
-A shard's working folder holds what the whole's would at these places, and says which shard it is.
+A shard's working folder holds the same files as the whole work would, and its config names the shard.
 """
 
 import os
@@ -19,13 +19,14 @@ from harness.core.formats import CONFIG, WORK
 
 T = TypeVar("T")
 MOST = 100_000
-# Numbers of a job's task, and what its first one is: Slurm's is what the array says, Kubernetes's is 0.
+# Environment variables that number a job's tasks, with the number taken as the first: an array of Slurm has
+# the numbers that it was given, and Kubernetes counts from 0.
 TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One of `of` parts of a work, counted from 1."""
+    """Part `number` of `of` parts, counted from 1."""
 
     number: int
     of: int
@@ -34,22 +35,22 @@ class Shard:
         return f"{self.number}/{self.of}"
 
     def part(self, items: Sequence[T]) -> Sequence[T]:
-        """Of a sequence the shard's items, which stand together. Raises UserError where a shard has none."""
+        """Return this shard's slice of a sequence. Raises UserError if there are more shards than items."""
         if self.of > len(items):
             raise UserError(
                 f"--shard {self}: the work has {len(items)} parts; give {len(items)} shards or fewer"
             )
-        at, until = (len(items) * n // self.of for n in (self.number - 1, self.number))
-        return items[at:until]
+        start, stop = (len(items) * n // self.of for n in (self.number - 1, self.number))
+        return items[start:stop]
 
 
 def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
-    """The shard that `--shard` names: `3/16`, or `auto/16` for the number of this task of a job.
+    """Parse the value of `--shard`: `3/16`, or `auto/16` for the number of this task in a job.
 
     Raises:
-        UserError: there is no such shard, or this is no task of a job.
+        UserError: there is no such shard, or `auto` is given outside a job.
     """
-    number, _, of = text.partition("/")
+    number, _, total = text.partition("/")
     if number == "auto":
         name = next((name for name in TASKS if name in environment), None)
         if name is None:
@@ -58,100 +59,105 @@ def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
             )
         task = environment[name]
         number = str(int(task) + 1 - TASKS[name]) if re.fullmatch(r"\d{1,9}", task, re.ASCII) else task
-        text = f"{printable(number)}/{of} ({name} is {printable(task)})"
-    counts = re.fullmatch(r"\d{1,9}/\d{1,9}", f"{number}/{of}", re.ASCII)
-    if not counts or not 1 <= int(number) <= int(of) <= MOST:
+        text = f"{printable(number)}/{total} ({name} is {printable(task)})"
+    counts = re.fullmatch(r"\d{1,9}/\d{1,9}", f"{number}/{total}", re.ASCII)
+    if not counts or not 1 <= int(number) <= int(total) <= MOST:
         raise UserError(
             f"--shard {printable(text)}: give 1/N to N/N, or auto/N, with N shards, {MOST} at most"
         )
-    return Shard(int(number), int(of))
+    return Shard(int(number), int(total))
 
 
 Begun = TypeVar("Begun", bound=work.Begun)
 
 
 def read(folders: Sequence[Path], kind: type[Begun]) -> list[Begun]:
-    """What the shards in some folders began with: all shards of one work.
+    """Read what the shards in some folders began with, and check that they make up one work.
 
     Raises:
-        UserError: a folder holds none, one is still being written, they are of different works, or one is
-            missing.
+        UserError: a folder holds no shard, a shard is still being written, the shards are of different works,
+            or one is missing.
     """
-    found = [_read(folder, kind) for folder in folders]
-    first, facts = folders[0], found[0].facts()
-    for folder, begun in zip(folders, found, strict=True):
-        others = begun.facts()
+    configs = [_read(folder, kind) for folder in folders]
+    first, facts = folders[0], configs[0].facts()
+    for folder, config in zip(folders, configs, strict=True):
+        others = config.facts()
         if differ := [key for key in {**facts, **others} if facts.get(key) != others.get(key)]:
             raise UserError(
                 f"{printable(folder)} and {printable(first)} differ in {printable(', '.join(differ))}; give "
                 "shards of one run"
             )
-    shards = [shard_of(begun.shard) for begun in found]
-    of = {shard.of for shard in shards}
-    if len(of) > 1:
-        raise UserError(f"shards of {' and of '.join(map(str, sorted(of)))}; give those of one run")
-    have, every = {shard.number for shard in shards}, shards[0].of
-    if lack := [str(Shard(n, every)) for n in range(1, every + 1) if n not in have]:
-        raise UserError(f"shards {printable(', '.join(lack))} are missing; give the folders of all {every}")
-    return found
+    shards = [shard_of(config.shard) for config in configs]
+    totals = {shard.of for shard in shards}
+    if len(totals) > 1:
+        raise UserError(f"shards of {' and of '.join(map(str, sorted(totals)))}; give those of one run")
+    numbers, total = {shard.number for shard in shards}, shards[0].of
+    if missing := [str(Shard(n, total)) for n in range(1, total + 1) if n not in numbers]:
+        raise UserError(
+            f"shards {printable(', '.join(missing))} are missing; give the folders of all {total}"
+        )
+    return configs
 
 
 def _read(folder: Path, kind: type[Begun]) -> Begun:
     file = folder / WORK / CONFIG
     try:
-        begun = msgspec.json.decode(file.read_bytes(), type=kind)
+        config = msgspec.json.decode(file.read_bytes(), type=kind)
     except (OSError, ValueError, RecursionError):
-        begun = None
-    if begun is None or not begun.shard:
+        config = None
+    if config is None or not config.shard:
         raise UserError(
             f"{printable(folder)} is no shard; give folders made with --shard, which were not merged yet"
         )
-    shard_of(begun.shard, {})
+    shard_of(config.shard, {})
     if work.held(folder):
         raise UserError(f"{printable(folder)} is being written by another process; wait for it")
-    return begun
+    return config
 
 
 def owners(
-    folders: Sequence[Path], begun: Sequence[work.Begun], parts: Sequence[str], named: Callable[[str], str]
+    folders: Sequence[Path], configs: Sequence[work.Begun], parts: Sequence[str], label: Callable[[str], str]
 ) -> dict[str, Path]:
-    """Where each part of a work lies.
+    """Locate every part of a work in the shards' folders.
 
     Args:
-        folders: of the shards.
-        begun: what each began with.
+        folders: the shards' folders.
+        configs: what each shard began with.
         parts: names of all parts of the work, in order.
-        named: what a part is called in messages.
+        label: gives a part's name in messages.
+
+    Returns:
+        The path of each part by its name.
 
     Raises:
-        UserError: a shard is not finished, or two folders have a part that differs.
+        UserError: a shard is not finished, or a part differs between two folders.
     """
-    found: dict[str, Path] = {}
-    for folder, each in zip(folders, begun, strict=True):
-        mine = {name: folder / WORK / name for name in shard_of(each.shard).part(parts)}
-        if lack := [name for name, part in mine.items() if not part.exists()]:
+    paths: dict[str, Path] = {}
+    for folder, config in zip(folders, configs, strict=True):
+        shard_parts = {name: folder / WORK / name for name in shard_of(config.shard).part(parts)}
+        if missing := [name for name, part in shard_parts.items() if not part.exists()]:
             raise UserError(
-                f"{printable(folder)}, shard {each.shard}, lacks {printable(named(lack[0]))} and "
-                f"{len(lack) - 1} parts more; type its command again, and then merge"
+                f"{printable(folder)}, shard {config.shard}, lacks {printable(label(missing[0]))} and "
+                f"{len(missing) - 1} parts more; type its command again, and then merge"
             )
-        for name, part in mine.items():
-            if name in found and _content(part) != _content(found[name]):
+        for name, part in shard_parts.items():
+            if name in paths and _content(part) != _content(paths[name]):
                 raise UserError(
-                    f"{printable(named(name))} came out differently in {printable(folder)} than in "
-                    f"{printable(found[name].parents[1])}; find out which is right, and leave out the other"
+                    f"{printable(label(name))} came out differently in {printable(folder)} than in "
+                    f"{printable(paths[name].parents[1])}; find out which is right, and leave out the other"
                 )
-            found[name] = part
-    return found
+            paths[name] = part
+    return paths
 
 
-def collect(parts: Mapping[str, Path], place: Path) -> None:
-    """Copy parts to a working folder, each whole, but those that are there."""
+def collect(parts: Mapping[str, Path], folder: Path) -> None:
+    """Copy parts to a working folder, each in one step; parts that it already holds are skipped."""
     for name, part in parts.items():
-        half = place / f".{name}.{os.getpid()}.part"
-        if not (place / name).exists():
-            shutil.rmtree(half, ignore_errors=True)
-            (shutil.copytree if part.is_dir() else shutil.copyfile)(part, half)
-            os.replace(half, place / name)
+        copy = folder / f".{name}.{os.getpid()}.part"
+        if not (folder / name).exists():
+            shutil.rmtree(copy, ignore_errors=True)
+            (shutil.copytree if part.is_dir() else shutil.copyfile)(part, copy)
+            os.replace(copy, folder / name)
 
 
 def _content(part: Path) -> dict[str, bytes]:

@@ -1,8 +1,8 @@
-"""Scores of intents, and means with an interval.
+"""Scores of intents, and confidence intervals of means, shares and differences.
 
-A score has one value per decision; an interval turns values into an `Estimate`. Steps of one episode
-are no independent trials, so intervals are over episodes or over seeds. How often they cover what they
-should is measured by `benchmarks/coverage.py`.
+A score has one value per decision; an interval turns values into an `Estimate`. Steps of one episode are not
+independent trials, so intervals are over episodes or over seeds. `benchmarks/coverage.py` measures how often
+they cover the true value.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 
-ROUNDING = 1e-18  # sum of squares that is none, relative to a mean above 1
+ROUNDING = 1e-18  # a smaller sum of squares is rounding only; relative to the mean where that is above 1
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Estimate:
 
     Attributes:
         value: the mean; NaN if there was nothing to average.
-        low: lower end of the interval; NaN where the data cannot bound it.
+        low: lower end of the interval; NaN if the data cannot bound it.
         high: upper end.
-        n: independent units behind it: episodes, pairs of episodes or seeds.
+        n: number of independent units: episodes, pairs of episodes or seeds.
         n_excluded: units left out because their value is NaN.
     """
 
@@ -36,42 +36,43 @@ class Estimate:
 
 
 def safe_target(safe: Bools) -> Floats:
-    """Distribution that is uniform over the safe actions, `(..., A)`; NaN where no action is safe."""
+    """Return the uniform distribution over the safe actions, `(..., A)`; NaN where no action is safe."""
     count = np.sum(safe, axis=-1, keepdims=True)
     return np.where(count > 0, safe / np.maximum(count, 1), np.nan)
 
 
 def brier(p: Floats, target: Floats) -> Floats:
-    """Squared distance of intents from target distributions, both `(..., A)`; 0 best, 2 worst. `(...)`.
+    """Return the squared distance of intents from target distributions, both `(..., A)`; 0 best, 2 worst.
 
-    Brier 1950 for many classes, with a distribution (`safe_target`) in the place of the one true class.
-    It is smallest at p = target: of two safe actions, sure of one scores 0.5 and undecided scores 0.
+    This is the score of Brier 1950 for many classes, with a distribution (`safe_target`) instead of one true
+    class. It is smallest at p = target: with two safe actions, an intent that is sure of one scores 0.5, and
+    one that is undecided between both scores 0. Shape `(...)`.
     """
     score: Floats = np.sum((p - target) ** 2, axis=-1)
     return score
 
 
 def negative_log_likelihood(p: Floats, safe: Bools, floor: float = 1e-4) -> Floats:
-    """-ln of the probability that intents `(..., A)` give to the safe actions; 0 best. Shape `(...)`.
+    """Return -ln of the probability that intents give to the safe actions; 0 best. Shape `(...)`.
 
-    The logarithmic score (Good 1952) with the set of safe actions as the event that came true: how the
-    mass is spread inside the set does not matter, which `brier` looks at. NaN where no action is safe.
+    This is the logarithmic score (Good 1952) with the set of safe actions as the event that came true. Unlike
+    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe.
 
     Args:
-        p: intents.
+        p: intents, `(..., A)`.
         safe: which actions are safe, `(..., A)`.
-        floor: least probability counted, so that one answer both sure and wrong costs -ln(floor)
+        floor: least probability counted, so that an answer that is sure and wrong costs -ln(floor)
             = 9.2 nats and not infinity.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
-    # Rounding may put the mass of a distribution a hair above 1.
+    # Rounding may put the mass of a distribution slightly above 1.
     return np.where(np.any(safe, axis=-1), -np.log(np.clip(mass, floor, 1.0)), np.nan)
 
 
 def seed_interval(per_seed_means: Floats, level: float = 0.95) -> Estimate:
-    """Mean over seeds `(S,)` with Student's t interval, the paper's error bars; t(4) = 2.776 for 5 seeds.
+    """Return the mean over seeds `(S,)` with Student's t interval; t(4) = 2.776 for 5 seeds.
 
-    One seed, or seeds that all agree, have a value and no interval.
+    These are the paper's error bars. One seed, or seeds that all agree, have a value and no interval.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)), level)
 
@@ -79,15 +80,15 @@ def seed_interval(per_seed_means: Floats, level: float = 0.95) -> Estimate:
 def episode_interval(
     values_by_episode: Floats, episodes: Ints | None = None, level: float = 0.95
 ) -> Estimate:
-    """Mean with Student's t interval over episodes; for shares see `rate_interval`.
+    """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    Where all episodes are alike nothing tells how far others would be from them, so the ends are NaN.
+    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN.
 
     Args:
-        values_by_episode: `(E,)`, or `(E, ...)` with steps behind, of which an episode has the mean of what
-            is not NaN; an episode with nothing else is excluded.
-        episodes: of which episode each of the values `(n,)` is, where they are not one an episode. The mean
-            is then over values, and the variance that of a ratio of totals (Cochran 1977, section 6.3).
+        values_by_episode: `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an
+            episode's known values is taken; an episode that is all NaN is excluded.
+        episodes: the episode of each of the values `(n,)`, if there is not one value an episode. The mean is
+            then over values, and the variance is that of a ratio of totals (Cochran 1977, section 6.3).
         level: confidence level.
     """
     values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
@@ -96,7 +97,7 @@ def episode_interval(
 
 
 def known_mean(values: Floats, axis: int) -> Floats:
-    """Mean along an axis of what is not NaN; NaN where nothing is."""
+    """Return the mean along an axis, NaN left out; NaN where all values are."""
     known = ~np.isnan(values)
     count = np.sum(known, axis=axis)
     total = np.sum(np.where(known, values, 0.0), axis=axis)
@@ -104,13 +105,13 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0.95) -> Estimate:
-    """Mean of values from 0 to 1 with Wilson's interval for as many yes or no as they are worth.
+    """Return the mean of values from 0 to 1 with Wilson's interval for their effective sample size.
 
-    What an episode is worth depends on how alike its seeds or decisions are (`_worth`).
+    How much an episode counts depends on how alike its seeds or decisions are (`_effective_n`).
 
     Args:
-        values: `(n,)`: outcomes, or shares of outcomes; NaN is left out.
-        episodes: of which episode each is, `(n,)`; None where each is an episode of its own.
+        values: outcomes, or shares of outcomes, `(n,)`; NaN is left out.
+        episodes: the episode of each value, `(n,)`; None if each is an episode of its own.
         level: confidence level.
     """
     known = ~np.isnan(values)
@@ -119,28 +120,28 @@ def rate_interval(values: Floats, episodes: Ints | None = None, level: float = 0
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
     rate = float(np.mean(values[known]))
     totals, sizes = _clusters(values[known] - rate, None if episodes is None else episodes[known])
-    return Estimate(rate, *wilson(rate, _worth(rate, totals, sizes, level), level), n, n_excluded)
+    return Estimate(rate, *wilson(rate, _effective_n(rate, totals, sizes, level), level), n, n_excluded)
 
 
 def wilson(rate: float, n: float, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a share among n (Wilson 1927)."""
+    """Return Wilson's score interval of a share among n (Wilson 1927)."""
     z = _normal(level)
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    # At 0 and 1 the end is the rate itself; only rounding says otherwise.
+    # At 0 and 1 the end is exactly the rate; without these bounds rounding would move it.
     return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
 
 
 def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
-    """Mean over seeds of shares of these episodes, with an interval over other seeds.
+    """Return the mean of shares over seeds, for these episodes, with an interval over other seeds.
 
     Draws are independent between seeds and between episodes, so the variance is that of seeds inside each
-    episode: of E (S - 1) degrees of freedom, where the means of S seeds have S - 1. Two more values are
-    counted that go another way than the rest of their episode, one each way (as Bonett and Price 2012 do
-    with pairs): where no seed changed anything, one might.
+    episode. It has E (S - 1) degrees of freedom, where the means of S seeds have only S - 1. Two values that
+    deviate from the rest of their episode are added, one each way (as Bonett and Price 2012 do with pairs):
+    even if no seed changed anything, another might.
 
     Args:
-        values: from 0 to 1, or differences of such, `(S, E)`; NaN is left out.
+        values: from 0 to 1, or differences of such values, `(S, E)`; NaN is left out.
         level: confidence level.
 
     Returns:
@@ -161,32 +162,33 @@ def seed_rate_interval(values: Floats, level: float = 0.95) -> Estimate:
 
 
 def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
-    """Mean of a - b over episodes, of shares, with an interval from the two of `rate_interval`.
+    """Return the mean over episodes of a - b, for shares, with an interval from the two of `rate_interval`.
 
-    The ends of both are put together by their correlation over episodes (Newcombe 1998, method 10; Zou and
-    Donner 2008). The correlation is that with two more pairs that differ, one each way (as Bonett and Price
-    2012 do): where all pairs agree, a few of other episodes might not.
+    The ends of both intervals are combined by the correlation over episodes (Newcombe 1998, method 10; Zou
+    and Donner 2008). The correlation includes two more pairs that differ, one each way (as in Bonett and
+    Price 2012): even if all pairs agree, a few of other episodes might not.
 
     Args:
         a: one condition's values from 0 to 1, `(E,)` or `(E, ...)`, episodes in the same order as in `b`.
-        b: the other's. Where either is NaN the pair is excluded.
+        b: the other condition's values. A pair in which either is NaN is excluded.
         level: confidence level.
     """
     unknown = np.isnan(a) | np.isnan(b)
     x, y = (
-        known_mean(np.where(unknown, np.nan, of).reshape(len(of), math.prod(of.shape[1:])), axis=-1)
-        for of in (a, b)
+        known_mean(np.where(unknown, np.nan, side).reshape(len(side), math.prod(side.shape[1:])), axis=-1)
+        for side in (a, b)
     )
     x, y = x[~np.isnan(x)], y[~np.isnan(y)]
     n, n_excluded = len(x), len(a) - len(x)
     value = float(np.mean(x - y)) if n else math.nan
     if n < 2:
         return Estimate(value, math.nan, math.nan, n, n_excluded)
-    (p, of_p, p_low, p_high, worth), (q, of_q, q_low, q_high, other) = (_around(of, level) for of in (x, y))
-    shared = float(np.mean(of_p * of_q))
-    shared = max(shared - 1 / math.sqrt(worth * other), 0.0) if shared > 0 else shared
-    spread = math.sqrt(float(np.mean(of_p**2) * np.mean(of_q**2)))
-    correlation = shared / spread if spread > 0 else 0.0
+    p, p_off, p_low, p_high, p_n = _around(x, level)
+    q, q_off, q_low, q_high, q_n = _around(y, level)
+    covariance = float(np.mean(p_off * q_off))
+    covariance = max(covariance - 1 / math.sqrt(p_n * q_n), 0.0) if covariance > 0 else covariance
+    spread = math.sqrt(float(np.mean(p_off**2) * np.mean(q_off**2)))
+    correlation = covariance / spread if spread > 0 else 0.0
 
     def reach(one: float, two: float) -> float:
         return math.sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
@@ -196,11 +198,11 @@ def rate_difference(a: Floats, b: Floats, level: float = 0.95) -> Estimate:
 
 
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:
-    """Unweighted mean of independent estimates, with an interval from their own, of their level.
+    """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
-    An end is as far from the mean as the estimates' ends from them, added as squares ("MOVER": Zou and Donner
-    2008). What is averaged is fixed, not drawn from more of its kind: another family of scenes is not in the
-    interval. NaN where any estimate's is.
+    The distances of the estimates' ends from their values are combined as the root of their sum of squares
+    ("MOVER": Zou and Donner 2008), so the level is theirs. The averaged estimates are taken as fixed and not
+    as a sample: the interval says nothing of another family of scenes. NaN where any estimate is.
     """
     value, low, high = (np.array([getattr(e, end) for e in estimates]) for end in ("value", "low", "high"))
     mean = float(np.mean(value))
@@ -210,14 +212,17 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
-    """How often each of n units counts: once each, then as drawn with replacement, `(1 + times, n)`."""
+    """Return how often each of n units counts, `(1 + times, n)`: once, then as drawn with replacement."""
     return np.vstack([np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)])
 
 
 def of_resamples(values: Floats, n: int) -> Estimate:
-    """A figure of n units and its 95 % interval: the first of the values, `(1 + times,)`, as `resampled`.
+    """Return a figure of n units with its bootstrap's 95 % interval.
 
-    Resamples without the figure, NaN, are left out; without a figure there is no interval.
+    Args:
+        values: `(1 + times,)`, in the order of `resampled`: the figure itself, then that of each resample.
+            NaN resamples are left out; if the figure itself is NaN, there is no interval.
+        n: number of units.
     """
     known = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):
@@ -227,25 +232,25 @@ def of_resamples(values: Floats, n: int) -> Estimate:
 
 
 def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:
-    """Mean of shares `(E,)`, their distances from it, both ends of its interval, and their worth."""
+    """Return the mean of shares `(E,)`, the deviations, the interval's ends and the effective sample size."""
     rate = float(np.mean(values))
-    distances = values - rate
-    worth = _worth(rate, distances, np.ones(len(values)), level)
-    return rate, distances, *wilson(rate, worth, level), worth
+    deviations = values - rate
+    effective_n = _effective_n(rate, deviations, np.ones(len(values)), level)
+    return rate, deviations, *wilson(rate, effective_n, level), effective_n
 
 
-def _worth(rate: float, totals: Floats, sizes: Floats, level: float) -> float:
-    """How many independent yes or no, of which this share is yes, say as much as these episodes.
+def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float) -> float:
+    """Return the number of independent yes-or-no trials that are as informative as these episodes.
 
-    The effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the mean with
-    episodes as clusters, less what Student's t asks for beyond the normal distribution. Its degrees of
-    freedom are Satterthwaite's, from the fourth moment: where few episodes differ from the rest there are
-    few. An episode is worth one at least, since no values from 0 to 1 vary more than yes or no.
+    This is the effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the
+    mean with episodes as clusters, reduced for Student's t in place of the normal distribution. The degrees
+    of freedom are Satterthwaite's, from the fourth moment: they are few if few episodes differ from the rest.
+    An episode counts as one trial at least, since no values from 0 to 1 vary more than yes or no.
 
     Args:
         rate: mean of the values.
-        totals: of each episode, of the values' differences from it, (C,).
-        sizes: how many values each episode has, (C,).
+        totals: sum of each episode's deviations from the rate, (C,).
+        sizes: number of each episode's values, (C,).
         level: confidence level.
     """
     from scipy.special import stdtrit
@@ -263,7 +268,7 @@ def _worth(rate: float, totals: Floats, sizes: Floats, level: float) -> float:
 
 
 def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
-    """Total and number of the values `(n,)` of each episode, (C,)."""
+    """Return the sum and the number of each episode's values, both (C,)."""
     if episodes is None:
         return values, np.ones(len(values))
     place: Ints = np.unique(episodes, return_inverse=True)[1]

@@ -1,4 +1,4 @@
-"""Versions of what a result may depend on, here and on other nodes."""
+"""Versions of the software that a result may depend on, here and on other nodes."""
 
 import platform
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", 
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
-    """Versions of the installed packages that a result may depend on."""
+    """Return the versions of the harness, Python, the platform and those packages that are installed."""
     installed = {"harness": __version__, "python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:
@@ -25,14 +25,14 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
 
 @cache
 def of_node() -> dict[str, str]:
-    """What has to be the same on all machines that work on one thing, the harness's own source among it."""
-    found: dict[str, str] = versions((*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow"))
-    del found["platform"]  # of which the kernel is a part
-    return {**found, "source of harness": code_sha256("**/*.py")[:12]}
+    """Return the versions that must agree on all nodes of one job, with a digest of the harness's source."""
+    required: dict[str, str] = versions((*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow"))
+    del required["platform"]  # it names the kernel, which may differ
+    return {**required, "source of harness": code_sha256("**/*.py")[:12]}
 
 
 def differing(wanted: dict[str, str]) -> str | None:
-    """The first thing that is another here, with both versions; None if nothing is."""
+    """Describe the first version that differs here from those wanted; None if all agree."""
     here = of_node()
     for name in {**wanted, **here}:
         if here.get(name) != wanted.get(name):

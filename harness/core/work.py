@@ -1,7 +1,7 @@
-"""A working folder: what a stopped command leaves in the folder it makes, so that the same command goes on.
+"""The working folder of a command, from which the same command resumes after it was stopped.
 
-`.work/config.json` says what the work began with, and the work counts only once that is there. One process
-at a time holds the folder.
+It is the folder `.work` inside the output folder. Its `config.json` holds the settings that the work began
+with; without that file there is nothing to resume. A lock keeps the folder to one process at a time.
 """
 
 import os
@@ -18,22 +18,22 @@ from harness.core.files import alone, forget_halves, write_whole
 from harness.core.formats import CONFIG, WORK
 
 LOCK = "lock"
-GONE_S = 3.0  # within which the processes of a killed command are gone
+GONE_S = 3.0  # seconds until the processes of a killed command are gone
 
 
 class Begun(msgspec.Struct, frozen=True, kw_only=True):
-    """What work began with.
+    """The settings that a piece of work began with.
 
     Attributes:
-        settings: what has to be the same for it to go on, as plain values.
-        shard: which part of the work it is, such as `3/16`; empty for the whole.
+        settings: plain values that must be the same for the work to be resumed.
+        shard: which part of the work this is, such as `3/16`; empty for the whole.
     """
 
     settings: dict[str, Any]
     shard: str = ""
 
     def facts(self) -> dict[str, Any]:
-        """What has to be the same for all shards of a work."""
+        """Return the values that must be the same in all shards of one work."""
         return self.settings
 
 
@@ -41,10 +41,10 @@ Kind = TypeVar("Kind", bound=Begun)
 
 
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
-    """What the work that is left in a folder began with; None where the folder is new, or has none.
+    """Read what the unfinished work in a folder began with; None if the folder is new or empty.
 
     Raises:
-        UserError: the work is damaged, or something else is in the folder.
+        UserError: the file is damaged, or the folder holds something else.
     """
     shown, file = printable(out), out / WORK / CONFIG
     try:
@@ -63,16 +63,16 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
 
 def same(out: Path, now: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
     """Raise UserError, naming what differs, unless work began with these settings."""
-    now = msgspec.json.decode(msgspec.json.encode(now))  # lists for tuples
-    if other := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
+    now = msgspec.json.decode(msgspec.json.encode(now))  # turns tuples into lists, as they are stored
+    if differing := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
         raise UserError(
-            f"--out {printable(out)} was begun with another {printable(', '.join(other))}; "
+            f"--out {printable(out)} was begun with another {printable(', '.join(differing))}; "
             "repeat its settings, delete it, or choose another folder"
         )
 
 
 def held(out: Path) -> bool:
-    """Whether another process is at work in a folder."""
+    """Whether another process is working in a folder."""
     try:
         with alone(out / WORK / LOCK, GONE_S):
             return False
@@ -82,12 +82,17 @@ def held(out: Path) -> bool:
 
 @contextmanager
 def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
-    """Hold the working folder, the one that was left or a new one that begins with this.
+    """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
 
-    Another process may have finished, and written the file named `last`, since this one looked: that is
-    refused. Where an error of the user's ends it before anything is done, what was made goes again.
+    If a UserError or OSError ends the work before anything is done, the folders created here are deleted.
+
+    Args:
+        out: the output folder.
+        begin: what the work begins with.
+        last: name of the file in `out` that finished work writes. Another process may have finished since
+            this one looked; then this raises UserError.
     """
-    work, made = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
+    work, created = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     try:
         work.mkdir(parents=True, exist_ok=True)
         for path in (work, *work.iterdir()):
@@ -99,39 +104,39 @@ def working(out: Path, begin: Begun, last: str | None = None) -> Iterator[Path]:
         ) from None
     try:
         with alone(work / LOCK, GONE_S), going_on(out):
-            left = begun(out, type(begin))  # by another process, since this one looked
-            if left is None:
+            earlier = begun(out, type(begin))  # another process may have begun since this one looked
+            if earlier is None:
                 for path in work.iterdir():
                     if path.name != LOCK:
                         shutil.rmtree(path) if path.is_dir() else path.unlink()
                 write_whole(work / CONFIG, msgspec.json.encode(begin))
-            elif left != begin or (last and (out / last).exists()):
+            elif earlier != begin or (last and (out / last).exists()):
                 raise BlockingIOError
             yield work
     except BlockingIOError:
         raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
     except (UserError, OSError):
-        with suppress(OSError):  # another process may be at work in any of them by now
+        with suppress(OSError):  # another process may be working in one of them by now
             if {path.name for path in work.iterdir()} <= {CONFIG, LOCK}:
                 shutil.rmtree(work)
-                for path in made:
+                for path in created:
                     path.rmdir()
         raise
 
 
 @contextmanager
 def going_on(out: Path) -> Iterator[None]:
-    """Have whoever interrupts this, or leaves parts of it undone, told that nothing is lost."""
+    """Add a note to an interrupt or `Unfinished` error: the folder keeps what is done."""
     try:
         yield
-    except (KeyboardInterrupt, Unfinished) as stopped:
-        stopped.add_note(f"{printable(out)} keeps what is done")
+    except (KeyboardInterrupt, Unfinished) as error:
+        error.add_note(f"{printable(out)} keeps what is done")
         raise
 
 
 def tidy(out: Path) -> None:
-    """Remove what the work left, and what kills left of files half written."""
-    with suppress(OSError):  # first, so that nothing goes on with half of it
+    """Delete the working folder, and temporary files that killed processes left in the output folder."""
+    with suppress(OSError):  # first, so that nothing resumes from a half-deleted folder
         os.unlink(out / WORK / CONFIG)
     shutil.rmtree(out / WORK, ignore_errors=True)
     forget_halves(out)

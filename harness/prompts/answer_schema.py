@@ -1,7 +1,7 @@
-"""What an answer looks like, as a JSON Schema made from the action names.
+"""Build the JSON Schema of an answer from the action names.
 
-The schema is published (to prompts, servers that constrain, readers of a dataset). A sum of one cannot be
-said in JSON Schema; `harness.parsing.parse` checks it.
+Prompts, servers that constrain answers and readers of a dataset use it. JSON Schema cannot express that
+probabilities sum to one; `harness.parsing.parse` checks that.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ EVIDENCE_CHARS = 200
 def answer_schema(
     role: str, actions: Sequence[str], scenario: str | None = None, form: str | None = None
 ) -> dict[str, Any]:
-    """JSON Schema, draft 2020-12, of one role's answer.
+    """Return the JSON Schema (draft 2020-12) of one role's answer.
 
     A helper answers in one of two forms: a recommended maneuver with a confidence (prompt v1) or a
     distribution (prompt v2).
@@ -26,7 +26,7 @@ def answer_schema(
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
         scenario: named in the title only.
-        form: the one that a helper is asked for, `recommendation` or `distribution`; None allows both.
+        form: the form that a helper is asked for, `recommendation` or `distribution`; None allows both.
 
     Raises:
         UserError: unknown role.

@@ -1,4 +1,4 @@
-"""The messages and the repair turns that take the most tokens, to count prompts with."""
+"""Messages and repair turns that take the most tokens, to find the longest prompts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 from harness.prompts.answer_schema import EVIDENCE_CHARS
 from harness.prompts.versions import Prompt
 
-ERROR_CHARS = 120  # of the parser's sentence, at most
+ERROR_CHARS = 120  # most characters of the parser's message
 
 
 def dense(characters: int) -> str:
-    """Digits and spaces in turn: a token a character for Qwen's tokenizers, and ASCII text has never more."""
+    """Return digits and spaces in turn: one token a character for Qwen's tokenizers, the most for ASCII."""
     return ("1 2 3 4 5 6 7 8 9 " * characters)[:characters]
 
 
@@ -18,7 +18,7 @@ EVIDENCE = dense(EVIDENCE_CHARS)
 
 
 def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """A message from each sender as `Prompt.render` takes it, its evidence as long and dense as allowed."""
+    """Return a message of each sender for `Prompt.render`, with evidence as long and dense as allowed."""
     share = round(1 / len(actions), 2)
     return [
         {
@@ -32,7 +32,7 @@ def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Map
 def densest_repair(
     prompt: Prompt, role: str, actions: tuple[str, ...], words: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """What a repair turn adds to a chat: an answer of all tokens that it may have, and what is said of it."""
-    said = prompt.repair(role, dense(ERROR_CHARS), actions, words)
+    """Return what a repair turn adds to a chat at most: the longest answer, and the request to repair it."""
+    request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
     answer = dense(prompt.max_answer_tokens[role])
-    return {"role": "assistant", "content": answer}, {"role": "user", "content": said}
+    return {"role": "assistant", "content": answer}, {"role": "user", "content": request}

@@ -1,4 +1,4 @@
-"""What differs between two prompts: their settings, and their texts word by word."""
+"""Compare two prompts: their settings, and their texts word by word."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,8 +15,8 @@ from harness.world.scenario import Scenario
 
 Kind = Literal["same", "removed", "added"]
 
-WORD = re.compile(r"\n|[^\S\n]*\S+|[^\S\n]+")  # a word with the space before it; a line's end is a word too
-CONTEXT = 8  # words that are shown before and after a change
+WORD = re.compile(r"\n|[^\S\n]*\S+|[^\S\n]+")  # a word with the space before it; a line break is a word too
+CONTEXT = 8  # words shown before and after a change
 MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
 SETTINGS = (
     "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts", "token_budget",
@@ -29,9 +29,9 @@ class Hunk:
     """A change with the words around it.
 
     Attributes:
-        line_a: of A, from 1, in which it begins.
-        line_b: of B.
-        pieces: what both texts have, what only A has and what only B has, in reading order.
+        line_a: line of A in which it begins, from 1.
+        line_b: line of B.
+        pieces: parts that both texts have, that only A has and that only B has, in reading order.
     """
 
     line_a: int
@@ -41,12 +41,12 @@ class Hunk:
 
 @dataclass(frozen=True)
 class TextChange:
-    """What differs between two texts.
+    """Differences between two texts.
 
     Attributes:
-        hunks: in order; empty where the texts are the same.
-        removed: how many words only A has.
-        added: how many words only B has.
+        hunks: changes in order; empty if the texts are the same.
+        removed: number of words that only A has.
+        added: number of words that only B has.
     """
 
     hunks: tuple[Hunk, ...]
@@ -56,11 +56,11 @@ class TextChange:
 
 @dataclass(frozen=True)
 class PromptChange:
-    """What differs between two versions.
+    """Differences between two versions.
 
     Attributes:
-        settings: name, A's value and B's of each that differs, but for what is said about a version.
-        texts: of each template by the name of its file.
+        settings: name, A's value and B's value of each setting that differs; descriptions are left out.
+        texts: change of each template by the name of its file.
     """
 
     settings: tuple[tuple[str, Any, Any], ...]
@@ -72,14 +72,14 @@ class PromptChange:
 
 @dataclass(frozen=True)
 class Sent:
-    """What a model is sent of one scene, its own chat template not applied, by A's text and by B's.
+    """The messages about one scene as versions A and B render them, before any chat template.
 
     Attributes:
         viewer: id of the vehicle that is asked.
         role: `ego`, `helper`, or `fusion` for the ego with messages.
-        words: A's and B's.
-        tokens: A's and B's; None where nobody counts them.
-        parts: what differs in the system's message, in the examples where there are any, and in the user's.
+        words: number of words in A's and in B's.
+        tokens: number of tokens in A's and in B's; None without a tokenizer.
+        parts: differences in the system message, in the examples if there are any, and in the user's message.
     """
 
     viewer: str
@@ -90,7 +90,7 @@ class Sent:
 
 
 def change(a: Prompt, b: Prompt) -> PromptChange:
-    """What differs from version A to B."""
+    """Compare version A with version B."""
     before, after = (dict(_settings(side)) for side in (a, b))
     return PromptChange(
         tuple((name, value, after[name]) for name, value in before.items() if value != after[name]),
@@ -99,12 +99,12 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 
 
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
-    """The ego's version with the helper's part of another."""
-    mine, others = (prompt.examples or Examples("") for prompt in (ego, helper))
-    both = Examples(mine.scenario or others.scenario, mine.ego, others.helper)
+    """Combine the ego's part of one version with the helper's part of another."""
+    of_ego, of_helper = (prompt.examples or Examples("") for prompt in (ego, helper))
+    examples = Examples(of_ego.scenario or of_helper.scenario, of_ego.ego, of_helper.helper)
     return replace(
         ego,
-        examples=both if both.seeds else None,
+        examples=examples if examples.seeds else None,
         texts={**ego.texts, "helper": helper.texts["helper"]},
         max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
         helper_answer=helper.helper_answer,
@@ -118,7 +118,7 @@ def _settings(prompt: Prompt) -> Iterator[tuple[str, Any]]:
         if isinstance(value, Examples):
             yield name, str(value)
         elif isinstance(value, Mapping):
-            yield from ((f"{name}.{key}", each) for key, each in sorted(value.items()))
+            yield from ((f"{name}.{key}", item) for key, item in sorted(value.items()))
         else:
             yield name, value
 
@@ -127,39 +127,39 @@ def sent(
     a: Prompt, b: Prompt, scene: Scene, scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
 ) -> list[Sent]:  # fmt: skip
-    """What the ego and its first helper are sent, and the ego with a message of every helper.
+    """Render what is sent to the ego, to its first helper, and to the ego with a message of every helper.
 
     Args:
         a: version A.
         b: version B.
-        scene: what is shown.
-        scenario: whose actions and words the prompts have.
-        count: counts the tokens of chat messages.
+        scene: the scene to render.
+        scenario: its scenario, which gives the actions and words of the prompts.
+        count: counts the tokens of chat messages; None leaves them uncounted.
     """
     ego, *helpers = scene.viewers
-    asked: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
+    questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
     if helpers:
-        asked += [(helpers[0], "helper", ()), (ego, "fusion", helpers)]
+        questions += [(helpers[0], "helper", ()), (ego, "fusion", helpers)]
     result = []
-    for viewer, role, senders in asked:
+    for viewer, role, senders in questions:
         graph = scene.record["graphs"][viewer]
-        heard = [
+        received = [
             {
                 **message,
                 "evidence": f"what {message['sender']} sees from where it stands, in twelve words or less",
             }
             for message in densest_messages(senders, scenario.actions)
         ]
-        old, new = (p.render(graph, scenario.actions, heard, scenario.prompt_words) for p in (a, b))
+        old, new = (p.render(graph, scenario.actions, received, scenario.prompt_words) for p in (a, b))
         pairs = zip(_parts(old).items(), _parts(new).values(), strict=True)
-        parts = {part: words(one, other) for (part, one), other in pairs if one or other}
+        parts = {part: words(before, after) for (part, before), after in pairs if before or after}
         lengths = _size(old), _size(new)
         result.append(Sent(viewer, role, lengths, (count(old), count(new)) if count else None, parts))
     return result
 
 
 def _parts(messages: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """The system's message, the turns of examples one after the other, and the user's."""
+    """Split a chat into the system message, the examples' turns as one text, and the user's message."""
     system, *turns, user = (message["content"] for message in messages)
     return {"system": system, "examples": "\n".join(turns), "user": user}
 
@@ -169,30 +169,30 @@ def _size(messages: Iterable[Mapping[str, str]]) -> int:
 
 
 def words(a: str, b: str) -> TextChange:
-    """What differs from text A to B."""
+    """Compare text A with text B word by word."""
     before, after = WORD.findall(a), WORD.findall(b)
     hunks, removed, added = [], 0, 0
     for group in SequenceMatcher(None, before, after, autojunk=False).get_grouped_opcodes(CONTEXT):
         pieces: list[tuple[Kind, str]] = []
         for tag, i, i_end, j, j_end in group:
-            gone, new = before[i:i_end], after[j:j_end]
+            old, new = before[i:i_end], after[j:j_end]
             if tag == "equal":
                 pieces.append(("same", "".join(new)))
                 continue
-            pieces += [("removed", "".join(gone))] if gone else []
+            pieces += [("removed", "".join(old))] if old else []
             pieces += [("added", "".join(new))] if new else []
-            removed, added = removed + _count(gone), added + _count(new)
+            removed, added = removed + _count(old), added + _count(new)
         _, i, _, j, _ = group[0]
         hunks.append(Hunk(1 + before[:i].count("\n"), 1 + after[:j].count("\n"), tuple(pieces)))
     return TextChange(tuple(hunks), removed, added)
 
 
-def _count(some: Iterable[str]) -> int:
-    return sum(not word.isspace() for word in some)
+def _count(tokens: Iterable[str]) -> int:
+    return sum(not token.isspace() for token in tokens)
 
 
 def marked(hunk: Hunk) -> list[tuple[Kind, str]]:
-    """The pieces for people, safe to print: `[-removed-]`, `{+added+}`, and ↵ where a line's end is one."""
+    """Mark a hunk's pieces, safe to print: `[-removed-]`, `{+added+}`, and ↵ for a changed line break."""
     pieces: list[tuple[Kind, str]] = []
     for kind, text in hunk.pieces:
         first = "" if text.isspace() else text[: len(text) - len(text.lstrip(" "))]

@@ -1,7 +1,7 @@
-"""Examples: earlier turns of a chat, whose questions are answered as they should be.
+"""Few-shot examples of a prompt version: earlier turns of the chat with the right answers.
 
-They lie in a version's `examples.json`. Their layouts have train seeds, so that no number is reported of what
-a model was shown.
+They are in the version's `examples.json`. Their layouts have train seeds, so that no result is reported on a
+layout that a model was shown.
 """
 
 from typing import Any
@@ -22,9 +22,9 @@ class Example(Struct, frozen=True):
     """One earlier turn.
 
     Attributes:
-        layout_seed: of the layout that it is from.
-        graph: the viewer's scene graph, which the version's template puts into words.
-        answer: what the model should have said.
+        layout_seed: seed of the layout that it comes from.
+        graph: the viewer's scene graph, which the version's template renders.
+        answer: the answer that the model should have given.
     """
 
     layout_seed: int
@@ -33,12 +33,12 @@ class Example(Struct, frozen=True):
 
 
 class Examples(Struct, frozen=True):
-    """The examples of a version, those of each role in the order in which they are shown.
+    """The examples of a version by role, in the order in which they are shown.
 
     Attributes:
-        scenario: the one that they are from, and the only one in which they may be shown.
-        ego: whose questions are the ego's.
-        helper: whose questions are a helper's.
+        scenario: the scenario that they come from, and the only one in which they may be shown.
+        ego: examples with a question to the ego.
+        helper: examples with a question to a helper.
     """
 
     scenario: str
@@ -46,12 +46,12 @@ class Examples(Struct, frozen=True):
     helper: tuple[Example, ...] = ()
 
     def of(self, role: str) -> tuple[Example, ...]:
-        """Those of a role."""
+        """Return the examples of a role."""
         return self.ego if role == "ego" else self.helper
 
     @property
     def seeds(self) -> frozenset[int]:
-        """Layout seeds that they are from."""
+        """Layout seeds of all examples."""
         return frozenset(example.layout_seed for example in (*self.ego, *self.helper))
 
     def __str__(self) -> str:
@@ -64,14 +64,15 @@ class Examples(Struct, frozen=True):
 
 
 def read(text: str, where: str) -> Examples:
-    """The examples in a file's text.
+    """Read examples from a file's text.
 
     Args:
         text: JSON.
-        where: what the file is called in messages.
+        where: name of the file in messages.
 
     Raises:
-        UserError: it is no JSON, lacks something, or an example is of another role or of no train seed.
+        UserError: the text is not JSON or lacks something, or an example is of another role or not of a train
+            seed.
     """
     try:
         table = msgspec.json.decode(text)
@@ -99,11 +100,11 @@ def _check(example: Example, role: str, what: str) -> None:
 
 
 def text_of(examples: Examples) -> str:
-    """What the file holds, an example a line."""
+    """Return the text of the file, with one example a line."""
     lines = [f'{{"scenario": {_json(examples.scenario)}']
     for role in ("ego", "helper"):
-        shown = ",\n".join(map(_json, examples.of(role)))
-        lines.append(f'"{role}": [\n{shown}\n]')
+        items = ",\n".join(map(_json, examples.of(role)))
+        lines.append(f'"{role}": [\n{items}\n]')
     return ",\n".join(lines) + "}\n"
 
 

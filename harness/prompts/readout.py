@@ -1,7 +1,7 @@
-"""The read-out: the model is asked for one letter, and the letters' probabilities are its answer.
+"""The read-out answer mode: ask the model for one letter, and take the letters' probabilities as its answer.
 
-Letters, because labels may begin with the same token (`LANE_LEFT` and `LANE_RIGHT` share two in Qwen's
-vocabulary), so that the first token of a label says nothing of which one it is.
+Letters stand for the actions because labels may begin with the same tokens (`LANE_LEFT` and `LANE_RIGHT`
+share two in Qwen's vocabulary), so the first token of a label does not tell which one it is.
 """
 
 import math
@@ -15,14 +15,14 @@ LETTERS = "ABCDEFGHIJ"
 
 
 def letters(actions: Sequence[str]) -> str:
-    """One letter an action, in order. Raises UserError for more actions than there are letters."""
+    """Return one letter for each action, in order. Raises UserError if there are too few letters."""
     if len(actions) > len(LETTERS):
         raise UserError(f"--answer readout: {len(actions)} actions, and {len(LETTERS)} letters; use json")
     return LETTERS[: len(actions)]
 
 
 def question(actions: Sequence[str]) -> str:
-    """The line that asks for a letter."""
+    """Return the line that asks for a letter."""
     options = ", ".join(f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True))
     return f"Answer with one letter: {options}."
 
@@ -30,25 +30,25 @@ def question(actions: Sequence[str]) -> str:
 def asked(
     messages: Sequence[Mapping[str, str]], actions: Sequence[str], answered: Sequence[str] = ()
 ) -> tuple[Mapping[str, str], ...]:
-    """The same chat, each of whose questions asks for one letter in the end.
+    """Append to every question of a chat the line that asks for one letter.
 
     Args:
         messages: the chat.
-        actions: what the letters stand for.
-        answered: the action that each earlier answer is likeliest to take, which it then says by its letter.
+        actions: the actions that the letters stand for.
+        answered: the likeliest action of each earlier answer, whose letter replaces the answer.
     """
     letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
 
-    def said(message: Mapping[str, str]) -> str:
+    def content(message: Mapping[str, str]) -> str:
         if message["role"] == "assistant":
             return letter[next(earlier)]
         return message["content"] + (f"\n{question(actions)}" if message["role"] == "user" else "")
 
-    return tuple({**message, "content": said(message)} for message in messages)
+    return tuple({**message, "content": content(message)} for message in messages)
 
 
 def stated(actions: Sequence[str], shares: Sequence[float]) -> str:
-    """A read-out as an answer's text: the actions' shares, divided by their sum, in millionths."""
-    whole = math.fsum(shares)
-    p = rounded([share / whole for share in shares], parts=10**6)
+    """Write a read-out as an answer's text: the actions' shares, normalised, in millionths."""
+    total = math.fsum(shares)
+    p = rounded([share / total for share in shares], parts=10**6)
     return canonical_json({"action_distribution": dict(zip(actions, p, strict=True))})

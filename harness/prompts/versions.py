@@ -35,17 +35,17 @@ FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
-OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions that speak of nothing else
-LOOP = frozenset({"first", "last", "index", "index0"})  # what a loop says of itself in plain values
+OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions that only describe crossings
+LOOP = frozenset({"first", "last", "index", "index0"})  # attributes of a loop that are plain values
 
-WIDE = re.compile(r"\d{3}|\*")  # in a format: a hundred characters or more, or a width from elsewhere
+WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more, or one given as an argument
 PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """What a template may do. `graph.ego` is the member of that name: no method of a mapping hides it.
+    """Jinja environment for untrusted templates: nothing in it can build a text or number that fills memory.
 
-    Nothing in it makes a text or a number that fills memory.
+    `graph.ego` always means the member of that name; no method of a mapping hides it.
     """
 
     intercepted_binops = frozenset({"*", "**", "%"})
@@ -57,19 +57,19 @@ class Sandbox(ImmutableSandboxedEnvironment):
         self.filters["format"] = _formatted
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
-        """The value, of numbers alone, and of small powers."""
+        """Allow the intercepted operators on numbers only, and only small powers."""
         numbers = all(isinstance(side, int | float) for side in (left, right))
         if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
             raise SecurityError(f"{operator} is not allowed on such values")
         return super().call_binop(context, operator, left, right)
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        """No method of a text that pads."""
+        """Refuse the methods of strings that pad."""
         return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
 
     def getattr(self, obj: Any, attribute: str) -> Any:
-        """The member, or what the sandbox allows."""
-        # These are nearly all that a template reads, and plain data needs none of the sandbox's checks.
+        """Return a member of a mapping, or whatever else the sandbox allows."""
+        # These cases are nearly all that a template reads, and plain data needs no check of the sandbox.
         if type(obj) is dict and attribute in obj:
             return obj[attribute]
         if type(obj) is LoopContext and attribute in LOOP:
@@ -80,7 +80,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
 
 def _formatted(text: str, *values: Any) -> str:
-    """Jinja's `format`, of narrow fields."""
+    """Apply Jinja's `format` filter, for narrow fields only."""
     if WIDE.search(text):
         raise SecurityError(f"a format as wide as {text!r} is not allowed")
     return text % values
@@ -88,25 +88,25 @@ def _formatted(text: str, *values: Any) -> str:
 
 @dataclass(frozen=True)
 class Prompt:
-    """One version.
+    """One prompt version.
 
     Attributes:
         version: name of its folder.
         sha256: digest of its files.
         released: whether it is pinned; a draft may still change.
-        description: one line.
+        description: one line for people.
         helper_answer: what a helper is asked for: `distribution`, or `recommendation` with a confidence.
-        max_objects: how many objects are listed, one fewer where messages are; those in conflict first, then
-            the nearest.
+        max_objects: most objects that are listed, one fewer if there are messages; those in conflict come
+            first, then the nearest.
         token_budget: least and most tokens a rendered prompt may have.
         max_answer_tokens: most tokens an answer may have, by role.
-        changed: what is new in it.
-        known_failures: what it is known to provoke.
-        max_conflicts: how many conflicts the variable `conflicts` has, the soonest first; None for all.
-        reasons_first: roles asked for reasons before the answer, which are then no fault of the answer.
+        changed: what is new in this version.
+        known_failures: failures that it is known to provoke.
+        max_conflicts: most conflicts in the variable `conflicts`, the soonest first; None for all.
+        reasons_first: roles that are asked for reasons before the answer; the parser then allows such text.
         texts: template text by role.
         examples: earlier turns of the chat, from one scenario; None without any.
-        image: the picture before the user's text: what the viewer's `camera` sees; None if there is none.
+        image: picture before the user's text: what the viewer's `camera` sees; None if there is none.
     """
 
     version: str
@@ -135,7 +135,7 @@ class Prompt:
             raise ValueError("image and examples.json exclude each other: an example shows no picture")
 
     def __getstate__(self) -> dict[str, Any]:
-        """What goes to another process: all but what is compiled."""
+        """Return the fields only, for pickling: compiled templates cannot go to another process."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -154,16 +154,16 @@ class Prompt:
 
     @cached_property
     def _contexts(self) -> dict[str, Context]:
-        """What every prompt of a role begins with: Jinja's own functions and the template's blocks."""
+        """Contexts without variables by role: Jinja's own functions and the template's blocks."""
         return {role: template.new_context() for role, template in self._templates.items()}
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
-        """Roles whose template has a block `repair`: an answer that cannot be read is asked for once more."""
+        """Roles whose template has a block `repair`: an unreadable answer is asked for once more."""
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
-        """What a viewer is told whose answer cannot be read, for the reason `error`."""
+        """Render the message to a viewer whose answer could not be read, for the reason `error`."""
         variables = {"error": error, "actions": actions, "words": words}
         [text] = self._rendered(
             role, variables, ("repair",), "its block repair may use error, actions, words"
@@ -177,27 +177,27 @@ class Prompt:
         messages: Sequence[Mapping[str, Any]] = (),
         words: Mapping[str, str] = NO_WORDS,
     ) -> tuple[dict[str, str], ...]:
-        """Chat messages for one viewer's scene graph; exactly what a model is sent.
+        """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
 
-        The examples stand as earlier turns behind the system's message. A message with the key `image` has
-        a picture before its text.
+        Examples follow the system message as earlier turns. A message with the key `image` has a picture
+        before its text.
 
         Args:
             graph: the viewer's scene graph; its `role` chooses the template.
             actions: meta-action names.
-            messages: what helpers have sent, for the ego: `sender`, `evidence`, `risk`, `intent`,
-                `recommended_maneuver`, `confidence`.
-            words: what the scenario says of itself, by name.
+            messages: helpers' messages to the ego, with `sender`, `evidence`, `risk`, `intent`,
+                `recommended_maneuver` and `confidence`.
+            words: texts by which the scenario describes itself, by name.
         """
-        system, user = self._said(graph, actions, messages, words, "system", "user")
+        system, user = self._render_graph(graph, actions, messages, words, "system", "user")
         turns = self._turns(graph["role"], actions, words)
-        asked = {"role": "user", "content": user} | ({"image": self.image} if self.image else {})
-        return ({"role": "system", "content": system}, *turns, asked)
+        question = {"role": "user", "content": user} | ({"image": self.image} if self.image else {})
+        return ({"role": "system", "content": system}, *turns, question)
 
     def _turns(
         self, role: str, actions: tuple[str, ...], words: Mapping[str, str]
     ) -> tuple[dict[str, str], ...]:
-        """A role's examples as turns of the chat; the same for every question."""
+        """Return a role's examples as turns of the chat; they are the same for every question."""
         if self.examples is None:
             return ()
         key = role, actions, *words.items()
@@ -206,7 +206,7 @@ class Prompt:
                 {"role": part, "content": text}
                 for example in self.examples.of(role)
                 for part, text in (
-                    ("user", *self._said(example.graph, actions, (), words, "user")),
+                    ("user", *self._render_graph(example.graph, actions, (), words, "user")),
                     ("assistant", example.answer),
                 )
             )
@@ -216,11 +216,11 @@ class Prompt:
     def _kept_turns(self) -> dict[Any, tuple[dict[str, str], ...]]:
         return {}
 
-    def _said(
+    def _render_graph(
         self, graph: Graph, actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
         words: Mapping[str, str], *blocks: str,
     ) -> list[str]:  # fmt: skip
-        """What a template's blocks say of a scene graph."""
+        """Render some blocks of a template for a scene graph."""
         objects = shown(graph, self.max_objects - bool(messages))
         variables = {
             "graph": graph,
@@ -240,19 +240,19 @@ class Prompt:
     def _rendered(
         self, role: str, variables: Mapping[str, Any], blocks: Sequence[str], needs: str
     ) -> list[str]:
-        """What a role's blocks say. Raises UserError, which ends with what they need."""
+        """Render blocks of a role's template. Raises UserError, whose message ends with `needs`."""
         template, empty = self._templates[role], self._contexts[role]
         try:
             shared = _context(empty, variables)
             return ["".join(template.blocks[block](shared)) for block in blocks]
-        except Exception as error:  # a template is its author's program and may fail in any way
+        except Exception as error:  # a template is a program and may fail in any way
             raise UserError(
                 f"prompt {self.version} {role}.j2 does not render: {printable(error)}; {needs}"
             ) from None
 
 
 def _context(empty: Context, variables: Mapping[str, Any]) -> Context:
-    """A context of its own with these variables. `Template.new_context` takes a fifth of a prompt's time."""
+    """Return a new context with these variables. `Template.new_context` takes a fifth of a prompt's time."""
     context = object.__new__(Context)
     vars(context).update(
         vars(empty), vars={}, parent={**empty.parent, **variables}, eval_ctx=EvalContext(empty.environment)
@@ -261,7 +261,7 @@ def _context(empty: Context, variables: Mapping[str, Any]) -> Context:
 
 
 def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
-    """The objects a prompt lists: those in conflict with the ego first, then the nearest to the viewer."""
+    """Return the objects that a prompt lists: those in conflict with the ego first, then the nearest."""
     in_conflict = {c["with"] for c in graph["conflicts"]}
 
     def order(node: Mapping[str, Any]) -> tuple[bool, float]:
@@ -271,7 +271,7 @@ def shown(graph: Graph, most: int) -> list[Mapping[str, Any]]:
 
 
 def soonest(conflicts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Conflicts, those first that the ego comes to first at present speeds; those it never comes to last."""
+    """Sort conflicts by when the ego reaches them at present speeds; those that it never reaches are last."""
 
     def order(conflict: Mapping[str, Any]) -> tuple[float, float]:
         ego_s, distance_m = conflict["ego"]["time_s"], conflict["ego"]["arc_m"] + conflict["other"]["arc_m"]
@@ -281,13 +281,13 @@ def soonest(conflicts: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def names(where: Path | None = None) -> list[str]:
-    """Versions there are: those that ship and the project's, or those in one folder if it is given."""
+    """List the versions that ship and the project's, or only those in a folder."""
     files = where.glob("*/prompt.toml") if where else entries("prompts", "*/prompt.toml")
     return sorted({file.parent.name for file in files})
 
 
 def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
-    """Why a version may not speak to a scenario; None if it may."""
+    """Return why a version may not be used in a scenario; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
     if prompt.examples and prompt.examples.scenario != scenario.name:
@@ -296,7 +296,7 @@ def unfit(prompt: Prompt, scenario: Scenario) -> str | None:
 
 
 def load(version: str, where: Path | None = None) -> Prompt:
-    """A version by name.
+    """Load a version by name, from a folder if one is given.
 
     Raises:
         UserError: there is no such version, its files are wrong, or it was released and has changed.
@@ -316,15 +316,15 @@ def load(version: str, where: Path | None = None) -> Prompt:
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **table}
-    shown = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
+    examples = [read_examples(texts[file], f"prompt {version} {file}") for file in optional]
     return convert(
         table, Prompt, what, version=version, sha256=sha256, released=version in released,
-        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(shown), None),
+        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=next(iter(examples), None),
     )  # fmt: skip
 
 
 def as_it_was(version: str, sha256: str) -> Prompt | None:
-    """A version if its files here have this digest; None if they have not, or it is not here."""
+    """Load a version if its files have this digest; None if they differ or it is not installed here."""
     try:
         prompt = load(version)
     except UserError:
@@ -333,7 +333,7 @@ def as_it_was(version: str, sha256: str) -> Prompt | None:
 
 
 def lock(version: str, where: Path | None = None) -> str:
-    """Release a version: pin its digest. Returns the digest."""
+    """Release a version by pinning its digest. Returns the digest."""
     prompt = load(version, where)
     base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
@@ -344,12 +344,12 @@ def lock(version: str, where: Path | None = None) -> str:
 
 
 def _base(version: str, where: Path | None) -> Path:
-    """The folder of versions that has one."""
+    """Return the folder of versions in which a version lies."""
     return where or find("prompts", version).parent
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Digest of a version's files, in the order of `FILES`, its examples last."""
+    """Return the digest of a version's files, which are in the order of `FILES`, with the examples last."""
     return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 
 

@@ -1,7 +1,7 @@
-"""CSMA/CA of broadcasts with one contention window: when the medium is free, taken, and taken twice at once.
+"""CSMA/CA of broadcasts with one contention window: free time, access delay, and collisions in one slot.
 
-All vehicles that share a medium hear each other here; packets are as long as each other and come at random.
-`tests/test_its_g5.py` simulates the slots beside each of these.
+All vehicles that share a medium hear each other here; packets have equal length and arrive at random.
+`tests/test_its_g5.py` simulates the slots to check each function.
 """
 
 import math
@@ -13,28 +13,28 @@ from numpy.typing import NDArray
 from harness.core.arrays import Floats
 
 SLOT_S = 13e-6  # IEEE 802.11-2012, 10 MHz OFDM
-TICK_S, TICKS = 1e-6, 1 << 17  # of the access delay's distribution: 131 ms
-RAREST = 1e-7  # share of the longest waits, which are cut off
-SATURATED = 0.6  # busier, vehicles that all hear each other never catch up
+TICK_S, TICKS = 1e-6, 1 << 17  # resolution and length of the access delay's distribution: 131 ms
+RAREST = 1e-7  # this share of the longest waits is cut off
+SATURATED = 0.6  # above this busy ratio, vehicles that all hear each other never catch up
 
 
 def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
-    """Packets that begin in a second of idle time, where so much of the time is busy."""
+    """Return how many packets begin in a second of idle time at a busy ratio."""
     return busy / (1 - busy) / packet_s
 
 
 def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
-    """Share of time in which a vehicle that hears this busy ratio may begin to send.
+    """Return the share of time in which a vehicle that hears this busy ratio may begin to send.
 
-    Of idle time, what is left of its gaps after an AIFS: their lengths are taken as exponential.
+    It is the idle time without the AIFS of each gap, whose lengths are assumed to be exponential.
     """
     return (1 - np.asarray(busy)) * np.exp(-aifs_s * begin_per_s(busy, packet_s))
 
 
 def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
-    """Mean seconds from the wish to send until the medium is taken.
+    """Return the mean seconds from the wish to send until the medium is taken.
 
-    Whatever is under way ends; then the medium must be idle for an AIFS, and for each slot of the back-off; a
+    A packet on air ends first; then the medium must be idle for an AIFS, and for each slot of the back-off. A
     packet in between costs its airtime and another AIFS. Packets begin at random in idle time.
     """
     per_s = float(begin_per_s(busy, packet_s))
@@ -44,16 +44,18 @@ def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> f
 
 
 def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
-    """Mean time until the medium has been idle for so long on end, where interruptions cost so much each."""
+    """Return the mean time until the medium has been idle without a break; interruptions cost `cost_s`."""
     return needed_s if per_s == 0 else math.expm1(per_s * needed_s) * (1 / per_s + cost_s)
 
 
 @lru_cache(maxsize=64)
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
-    """The distribution of which `mean_access_s` is the mean, from its generating function.
+    """Return the distribution of the access delay, whose mean is `mean_access_s`.
+
+    It is computed from its generating function.
 
     Returns:
-        Probabilities and seconds; with probability p it takes no longer.
+        Probabilities and seconds: with each probability the delay is no longer than the seconds.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time
@@ -76,18 +78,18 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
 
 @lru_cache(maxsize=64)
 def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: int) -> tuple[float, float]:
-    """How often packets that all can hear begin in the same slot, and the busy ratio.
+    """Return how often packets that all can hear begin in the same slot, and the busy ratio.
 
-    Who wants to send while the medium is busy ends its back-off soon after, as others do, so packets meet
-    more often than if they began at random. This follows the mean number of vehicles with each count of
-    back-off, slot by slot after a busy period, until the next. Numbers are taken as Poisson; what a busy
-    period leaves behind is a fixed point.
+    Vehicles that want to send while the medium is busy end their back-off soon after it, so packets collide
+    more often than if they began at random. The model follows the mean number of vehicles with each back-off
+    count, slot by slot from one busy period to the next. Numbers are assumed to be Poisson; the vehicles that
+    a busy period leaves waiting are a fixed point.
 
     Args:
-        per_slot: packets of all that come in a slot.
-        packet_slots: airtime in slots.
-        aifs_slots: in slots.
-        window: back-off is uniform from 0 to so many slots.
+        per_slot: packets of all vehicles that arrive in a slot.
+        packet_slots: time on air in slots.
+        aifs_slots: AIFS in slots.
+        window: back-off is uniform from 0 to this number of slots.
 
     Returns:
         Share of packets that begin with another, and share of time that the medium is busy.
@@ -112,9 +114,10 @@ def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: i
 
 
 def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
-    """How many times as often packets begin in the same slot as if they began at random in free time.
+    """Return how many times as often packets begin in one slot as if they began at random in free time.
 
-    That of vehicles which all hear each other and send as much as is heard; above `SATURATED` as there.
+    It is that of vehicles which all hear each other and together cause this busy ratio; above `SATURATED` it
+    is constant.
     """
     packet_slots = packet_s / SLOT_S
     per_slot = min(busy, SATURATED) / packet_slots

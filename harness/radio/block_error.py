@@ -1,6 +1,6 @@
-"""How often a block is lost at a signal-to-interference-and-noise ratio (SINR), by modulation and coding.
+"""Block error rates over the signal-to-interference-and-noise ratio (SINR), by modulation and coding.
 
-Every curve has fast fading in it already, so a model adds none. `block_error_points.csv` has points read off
+Every curve already includes fast fading, so a model adds none. `block_error_points.csv` has points read off
 3GPP R1-160284 (190 bytes, 280 km/h, vehicles on a highway), and those of Goubet et al. (IEEE TVT 64(9), 2015,
 figure 14, L = 1) as Sepulcre et al. use them, over the energy of a bit (`its_g5`). `block_error_fits.csv` has
 logistic curves that were fitted to the tables of packet error that come with WiLabV2Xsim (root mean square
@@ -19,12 +19,15 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 
 BlockError = Callable[[Floats], Floats]
-"""SINR in dB to the probability that the block is lost, of the same shape."""
+"""Maps SINR in dB to the probability that a block is lost, of the same shape."""
 
 
 @cache
 def block_error(curve: str) -> BlockError:
-    """The curve of this name; points are joined by straight lines and held beyond the ends."""
+    """Return a curve by name; points are interpolated linearly, and the end values hold beyond them.
+
+    Raises UserError for an unknown name.
+    """
     points = [row for row in _rows("block_error_points.csv") if row["curve"] == curve]
     if points:
         snr_db = [float(row["snr_db"]) for row in points]
@@ -39,10 +42,10 @@ def block_error(curve: str) -> BlockError:
 
 
 def threshold(bits_per_s_per_hz: float, efficiency: float) -> BlockError:
-    """A block that is lost below one SINR and never above: 2^(spectral efficiency / efficiency) - 1.
+    """Return a step curve: blocks are lost below the SINR 2^(spectral efficiency / efficiency) - 1.
 
-    For codings without a curve (Wu et al., arXiv 2203.17114). `efficiency` is what an implementation reaches
-    of Shannon's bound: 0.37 for LTE and 802.11p, 0.4 for NR.
+    It is for codings without a curve (Wu et al., arXiv 2203.17114). `efficiency` is the share of Shannon's
+    bound that an implementation reaches: 0.37 for LTE and 802.11p, 0.4 for NR.
     """
     least_db = 10 * np.log10(2 ** (bits_per_s_per_hz / efficiency) - 1)
     return lambda sinr_db: np.where(sinr_db < least_db, 1.0, 0.0)

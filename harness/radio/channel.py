@@ -1,7 +1,7 @@
-"""The V2V channel: which replies cross it, and when they have arrived.
+"""The interface of a V2V channel: which replies cross it, and when they arrive.
 
 A consultation is a round trip, so the request and the reply must both cross. A new model is a file beside
-this one, with a frozen record that has `request` and `deliver`; its profiles are in `profiles.py`.
+this one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
 """
 
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
 class Unit(NamedTuple):
-    """A roadside unit, which stays where it is.
+    """A fixed roadside unit.
 
     Attributes:
-        x_m: m to the east of the centroid of the conflict zone.
-        y_m: m to the south of it.
-        antenna_m: height of its antenna.
+        x_m: position, m to the east of the centroid of the conflict zone.
+        y_m: position, m to the south of it.
+        antenna_m: height of the antenna.
     """
 
     x_m: float
@@ -35,16 +35,16 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class Site:
-    """Where the ego and its helpers truly are, and what stands between them.
+    """The true positions of the ego and its helpers, and what stands between them.
 
     Attributes:
-        xy_m: places, `(..., 1+H, 2)`, the ego's first; NaN for a helper that is not there.
+        xy_m: positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper.
         sight: what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING.
-        blocker_m: height of the tallest vehicle between them, `(..., H)`; 0 where there is none.
+        blocker_m: height of the tallest vehicle between them, `(..., H)`; 0 without one.
         corner_m: distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN
-            where the streets do not cross.
-        first_m: height of the antenna at the first place; None where it is as high as all others.
-        units: the same from roadside units: of each a site with the unit first, the ego, then the helpers.
+            if the streets do not cross.
+        first_m: height of the antenna at the first position; None if it is as high as all others.
+        units: the sites of roadside units: each has the unit first, then the ego, then the helpers.
     """
 
     xy_m: Floats
@@ -56,28 +56,28 @@ class Site:
 
     @property
     def distance_m(self) -> Floats:
-        """Between the ego and each helper, `(..., H)`."""
+        """Distance between the ego and each helper, `(..., H)`."""
         apart: Floats = np.linalg.norm(self.xy_m[..., 1:, :] - self.xy_m[..., :1, :], axis=-1)
         return apart
 
     @property
     def between(self) -> tuple[Ints, Floats, Floats, float | None]:
-        """What `Propagation` wants to know besides distances: sight, blocker, corner, the first's antenna."""
+        """The inputs of `Propagation` besides distances: sight, blocker, corner, first antenna's height."""
         return self.sight, self.blocker_m, self.corner_m, self.first_m
 
     def take(self, at: Any) -> "Site":
-        """The sites at these places of the leading dimension."""
+        """Select sites by places of the leading dimension."""
         units = {unit: its.take(at) for unit, its in self.units.items()}
         return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at], self.first_m, units)
 
     def to(self, links: slice) -> "Site":
-        """Some of the links alone, `(..., h)`."""
+        """Select some of the links, `(..., h)`."""
         xy_m = np.concatenate([self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2)
         sight, blocker_m = self.sight[..., links], self.blocker_m[..., links]
         return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
     def of_helpers(self, places: Ints) -> "Site":
-        """The same with the helpers of these places, `(n, H')`; one may come again."""
+        """Select helpers by their places, `(n, H')`; a helper may be repeated."""
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return Site(
             np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
@@ -91,14 +91,14 @@ class Site:
 
 @dataclass(frozen=True)
 class Draws:
-    """The channel's draws in [0, 1); every operating point has the same.
+    """The channel's draws in [0, 1), which are the same for every operating point.
 
     Attributes:
-        link: request and reply of each helper, `(..., H, 2)`. Equal for all steps of an episode under
-            block fading.
-        jitter: delay of each reply, `(..., H)`.
-        trips: whose the other draws are, which only physical radios make; None where there are none.
-        given: draws of packets, `(..., 1+2H)`, in place of the trips'.
+        link: draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
+            episode under block fading.
+        jitter: draw of each reply's delay, `(..., H)`.
+        trips: the keys of further draws, which only physical radios make; None if there are none.
+        given: draws of packets, `(..., 1+2H)`, instead of those of `trips`.
     """
 
     link: Floats
@@ -107,41 +107,41 @@ class Draws:
     given: Floats | None = None
 
     def take(self, at: Any) -> "Draws":
-        """The draws at these places of the leading dimension."""
+        """Select draws by places of the leading dimension."""
         given = None if self.given is None else self.given[at]
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
-        """The draws of the helpers of these places, `(n, H')`; voices of one share its link."""
+        """Select the draws of helpers by their places, `(n, H')`; a repeated helper has the same link."""
         link = np.take_along_axis(self.link, places[..., None], axis=-2)
         return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
 
     @cached_property
     def packet(self) -> Floats:
-        """Request and reply of each helper, `(..., H, 2)`, anew at every step."""
+        """Draws of the request and the reply of each helper, `(..., H, 2)`, new at every step."""
         return self._uniforms[..., 1:].reshape(*self.jitter.shape, 2)
 
     @cached_property
     def wait(self) -> Floats:
-        """The request's wait for its turn, `(...)`, anew at every step."""
+        """Draw of the request's wait for its turn, `(...)`, new at every step."""
         return self._uniforms[..., 0]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
-        """Shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
+        """Return the shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
         return self._trips.shadow(xy_m, decorrelation_m)
 
     def of(self, links: str) -> "Draws":
-        """Draws of other links, by what they are for, such as those of a roadside unit."""
+        """Return the draws of other links, such as those of a roadside unit, by the links' name."""
         return replace(self, trips=replace(self._trips, links=links), given=None)
 
     @cached_property
     def first_packets(self) -> Floats:
-        """A wait and two packets of a link that is there without helpers too, `(..., 3)`."""
+        """Draws of one wait and two packets for a link that exists even without helpers, `(..., 3)`."""
         return self._trips.uniforms(1)
 
     @cached_property
     def requested(self) -> "Draws":
-        """The same where every request crosses, however much is lost."""
+        """The same draws, but with requests that always cross, whatever the loss."""
         given = self._uniforms.copy()
         given[..., 1::2] = 1.0
         return replace(self, given=given)
@@ -165,18 +165,18 @@ NO_SITE = (
 
 @dataclass(frozen=True)
 class Links:
-    """What a channel may need to know of the links between the ego and its helpers.
+    """The inputs of a channel about the links between the ego and its helpers.
 
     Attributes:
-        asked: who was asked, `(..., H)`. What is said of the others may be anything, NaN included.
+        asked: which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN.
         ready_s: seconds from the start of the request until the helper has heard it and has its own answer,
             `(..., H)`.
-        range_m: ego-helper distance, `(..., H)`, as the ego knows it: a beacon's error off the true one.
+        range_m: ego-helper distance, `(..., H)`, as the ego knows it, with the beacon's error.
         payload_bits: size of the reply, `(..., H)`.
-        in_radius: who is there and in the ego's radius, asked or not, `(..., H)`.
+        in_radius: which helpers are present and in the ego's radius, asked or not, `(..., H)`.
         rounds: which of these open a round of their own, `(..., H)`.
         request_bits: size of the request.
-        site: where they are; None where the channel is not `Physical`, or the world has no places.
+        site: positions; None if the channel is not `Physical`, or the world has no positions.
     """
 
     asked: Bools
@@ -190,13 +190,13 @@ class Links:
 
     @property
     def where(self) -> Site:
-        """The site. Raises UserError in a world without places."""
+        """The site. Raises UserError in a world without positions."""
         if self.site is None:
             raise UserError(NO_SITE)
         return self.site
 
     def take(self, at: Any) -> "Links":
-        """The links of these places of the leading dimension."""
+        """Select links by places of the leading dimension."""
         return Links(
             self.asked[at], self.ready_s[at], self.range_m[at], self.payload_bits[at], self.in_radius[at],
             self.rounds[at], self.request_bits, self.site and self.site.take(at),
@@ -204,10 +204,10 @@ class Links:
 
 
 class Broadcast(NamedTuple):
-    """What the broadcast of a request takes.
+    """The times of a request's broadcast.
 
     Attributes:
-        heard_s: seconds from the decision to ask until the helpers have it, `(...)` or one number.
+        heard_s: seconds from the decision to ask until the helpers have the request, `(...)` or one number.
         airtime_s: seconds that it occupies the medium, `(...)` or one number.
     """
 
@@ -216,16 +216,16 @@ class Broadcast(NamedTuple):
 
 
 class Delivery(NamedTuple):
-    """What a channel does to the replies.
+    """What becomes of the replies on a channel.
 
     Attributes:
-        up: request and reply cross, `(..., H)`; anything where not asked.
-        delay_s: seconds from the request to the end of the reply's slot, `(..., H)`; inf where not asked. A
-            lost reply keeps its slot.
-        loss: probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` where all
-            links have the same.
-        airtime_s: seconds that the reply occupies the medium, `(..., H)`; anything where not asked, NaN where
-            the model does not know.
+        up: whether request and reply cross, `(..., H)`; anything for helpers that were not asked.
+        delay_s: seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that
+            were not asked. A lost reply keeps its slot.
+        loss: probability that one crossing (request or reply) is lost, `(..., H)`, or `(..., 1)` if it is the
+            same on all links.
+        airtime_s: seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not
+            asked, NaN if the model does not know it.
     """
 
     up: Bools
@@ -236,43 +236,43 @@ class Delivery(NamedTuple):
 
 @runtime_checkable
 class Channel(Protocol):
-    """A frozen dataclass. The operating point's overrides replace the fields of these names."""
+    """A channel model: a frozen dataclass. Overrides of an operating point replace fields by name."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """When helpers have a request, or any other broadcast, of so many bits, `(...)` or one number."""
+        """Return when helpers have a request or other broadcast of so many bits, `(...)` or one number."""
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """What happens to the request and the reply of each link."""
+        """Return what happens to the request and the reply of each link."""
 
 
 @runtime_checkable
 class Physical(Channel, Protocol):
-    """A channel whose losses follow from where vehicles are and what stands between them.
+    """A channel whose losses follow from the vehicles' positions and what stands between them.
 
-    Only such a channel looks at `Links.site` and the draws of trips.
+    Only such a channel reads `Links.site` and the draws of trips.
     """
 
     @property
     def decorrelation_m(self) -> float:
-        """How far shadowing reaches (`fading.Trips.shadow`); inf where there is none."""
+        """Decorrelation distance of shadowing (`fading.Trips.shadow`); inf without shadowing."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Share of packets of the background's size that are received at these distances `(n,)`.
+        """Return the share of packets of the background's size that are received at distances `(n,)`.
 
-        Averaged over shadowing; without `sight`, over what stands between as the model's source has it.
+        It is averaged over shadowing, and without `sight` also over obstacles as in the model's source.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Probability that a message of so many bits is lost, `(..., H)`, given each link's shadowing."""
+        """Return the probability that a message is lost, `(..., H)`, given each link's shadowing."""
 
     def busy_ratio(self) -> float:
-        """Channel busy ratio under the background load; NaN where the model does not say."""
+        """Return the channel busy ratio under the background load; NaN if the model does not have it."""
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
-    """When each slot `(..., H)` on a serial medium ends: first come, first served; of equals, the nearest."""
+    """Return when each slot `(..., H)` on a serial medium ends: first come, first served, nearest first."""
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)
     busy_s = np.cumsum(served_slot_s, axis=-1)

@@ -1,7 +1,7 @@
-"""One latency and one loss for all links: the paper's declared assumptions, not a link budget.
+"""A channel with one latency and one loss for all links: the paper's declared assumptions, no link budget.
 
-Nothing here was measured on a radio. Fading is block fading where the draws of a link are the same at every
-step of an episode: a blocked link then stays blocked.
+Nothing here was measured on a radio. If the draws of a link are the same at every step of an episode, fading
+is block fading: a blocked link stays blocked.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,16 @@ class Radio:
 
     Attributes:
         latency_s: nominal seconds of one exchange, the request included, without serialisation.
-        loss: probability that one crossing is lost. Where helpers open rounds of their own, the loss under
-            so many active vehicles, if that is larger.
+        loss: probability that one crossing is lost. If helpers open rounds of their own, it is the loss with
+            that many active vehicles, if that is larger.
         bandwidth_bps: bits per second while a message is on air.
-        access: `serial`, replies share one medium and are served one after another, so that the k-th
-            pays k slots; `parallel`, all replies are on air at once.
+        access: `serial`: replies share one medium and are served one after another, so the k-th pays k slots;
+            `parallel`: all replies are on air at once.
         jitter_s: largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s).
-        density_coupled: the loss follows from the vehicles in the radius, the ego included, asked or not.
-        roadside_edge: replies also travel over a roadside edge node, in a second hop as long as the first,
-            its jitter included. The two paths are declared independent. Requests are direct.
+        density_coupled: whether the loss follows from the vehicles in the radius, the ego included, asked or
+            not.
+        roadside_edge: whether replies also travel over a roadside edge node, in a second hop as long as the
+            first, with its jitter. The two paths are declared independent. Requests are direct.
     """
 
     latency_s: Seconds
@@ -41,11 +42,11 @@ class Radio:
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Serialisation alone: the rest of a request's time is in the nominal latency."""
+        """A request takes its serialisation only; the rest of its time is in the nominal latency."""
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """A serial medium serves whoever is ready first, so a slow helper holds nobody up."""
+        """A serial medium serves the first helper that is ready, so a slow helper delays no other."""
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + np.sum(active, axis=-1, keepdims=True))
         loss = loss if self.density_coupled else np.maximum(self.loss, loss)
@@ -60,20 +61,20 @@ class Radio:
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
-    """Loss of one crossing when `n_active` vehicles `(...)`, the ego included, share the channel.
+    """Return the loss of one crossing if `n_active` vehicles `(...)`, the ego included, share the channel.
 
-    The line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles), clipped
-    to [0, 1]; a vehicle alone loses nothing.
+    It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles), clipped
+    to [0, 1]; a single vehicle loses nothing.
     """
     return np.where(n_active > 1, np.clip(0.006 + 0.03 * (n_active - 2), 0.0, 1.0), 0.0)
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Which helpers are reached and heard, `(..., H)`: both crossings succeed, probability (1 - loss)^2.
+    """Return which helpers' request and reply both cross, `(..., H)`; the probability is (1 - loss)^2.
 
     Args:
         uniforms: draws in [0, 1), `(..., H, 2)`: the request's and the reply's.
         loss: probability that one crossing is lost, `(..., H)` or `(..., 1)`.
-        roadside_edge: a reply has a second path, and so is lost with probability loss^2.
+        roadside_edge: whether a reply has a second path, so that it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -1,10 +1,10 @@
-"""Draws of physical radios, keyed by the seed of the channel and by the layout: fading of links and packets.
+"""Random draws of physical radios for shadowing and packets, keyed by the channel's seed and the layout.
 
-A world may be walked in any order and from any point, so a draw may not need the one before it. Shadowing
-is therefore a field over the places of both ends, and not a chain along the trip: a sum of waves whose
-directions and lengths are drawn once for a link. With wave vectors of a multivariate Cauchy distribution its
-correlation is exp(-moved / decorrelation), that of the usual chain S' = exp(-moved/D) S + noise, and it is
-nearly normal (kurtosis 3 - 1.5 / WAVES).
+A world may be walked in any order and from any point, so a draw must not depend on the one before it.
+Shadowing is therefore a field over the positions of both ends, and not a chain along the trip: a sum of waves
+whose directions and lengths are drawn once for a link. With wave vectors of a multivariate Cauchy
+distribution its correlation is exp(-moved / decorrelation), that of the usual chain S' = exp(-moved/D) S +
+noise, and it is nearly normal (kurtosis 3 - 1.5 / WAVES).
 """
 
 import math
@@ -18,19 +18,19 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 
 WAVES = 16
-BLOCK = 1024  # decisions at once, so that their waves stay in the processor's cache
+BLOCK = 1024  # decisions computed at once, so that their waves stay in the processor's cache
 
 
 @dataclass(frozen=True)
 class Trips:
-    """Which draws belong to each decision.
+    """The keys of each decision's draws.
 
     Attributes:
-        seed: of the channel, `(...)`.
-        layout_seed: of the episode's layout, `(...)`.
-        step: of the decision, `(...)`.
-        steps: how many an episode can have.
-        links: which links' draws: those among vehicles, or others, by what they are for.
+        seed: seed of the channel, `(...)`.
+        layout_seed: seed of the episode's layout, `(...)`.
+        step: step of the decision, `(...)`.
+        steps: most steps of an episode.
+        links: name of the links; empty for those among vehicles.
     """
 
     seed: Ints
@@ -40,20 +40,20 @@ class Trips:
     links: str = ""
 
     def take(self, at: Any) -> "Trips":
-        """The trips at these places of the leading dimension."""
+        """Select trips by places of the leading dimension."""
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:
-        """The draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
+        """Return the draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
         of_pairs, place = self._of_pairs(_packets, self.steps, helpers)
         return of_pairs[place, self.step]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
-        """Shadowing of the link to each helper, `(..., H)`, standard normal.
+        """Return the shadowing of the link to each helper, `(..., H)`, standard normal.
 
         Args:
-            xy_m: places of the ego and its helpers, `(..., 1+H, 2)`.
-            decorrelation_m: how far the two ends move, the root of the sum of squares, until the correlation
+            xy_m: positions of the ego and its helpers, `(..., 1+H, 2)`.
+            decorrelation_m: distance that both ends move (root of the sum of squares) until the correlation
                 is 1/e.
         """
         helpers = xy_m.shape[-2] - 1
@@ -68,13 +68,13 @@ class Trips:
             block = slice(start, start + BLOCK)
             of = waves[place[block]]
             turns = of[..., 0] + np.matmul(of[..., 1:], ends[block])[..., 0]
-            # What is left of a turn has digits enough in single precision, with a much faster cosine.
+            # The fraction of a turn is exact enough in single precision, whose cosine is much faster.
             angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
             total[block] = np.cos(angle).sum(axis=-1)
         return total.reshape(*xy_m.shape[:-2], helpers) * math.sqrt(2 / WAVES)
 
     def _of_pairs(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
-        """What is drawn for each seed and layout, (P, ...), and each decision's place there, `(...)`."""
+        """Return the draws for each seed and layout, (P, ...), and each decision's index in them, `(...)`."""
         seeds, seed = np.unique(self.seed, return_inverse=True)
         layouts, layout = np.unique(self.layout_seed, return_inverse=True)
         pairs, place = np.unique(seed * len(layouts) + layout, return_inverse=True)
@@ -82,7 +82,7 @@ class Trips:
         return np.array([drawn(self.links, *pair, *args) for pair in keys]), place.reshape(self.seed.shape)
 
 
-# Each helper's draws come after the last one's, so that a batch with more helpers changes nobody's.
+# Helpers' draws follow each other, so that a batch with more helpers changes no other helper's draws.
 @lru_cache(maxsize=1 << 14)
 def _packets(links: str, seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
     return noise.uniforms((1 + 2 * helpers, steps), f"packets{links}", seed, layout_seed).T
@@ -90,7 +90,7 @@ def _packets(links: str, seed: int, layout_seed: int, steps: int, helpers: int) 
 
 @lru_cache(maxsize=1 << 14)
 def _waves(links: str, seed: int, layout_seed: int, helpers: int) -> Floats:
-    """A phase and a wave vector in four dimensions, in turns a decorrelation distance, (H, WAVES, 5)."""
+    """Draw phases and 4-dimensional wave vectors, in turns per decorrelation distance, (H, WAVES, 5)."""
     drawn = noise.generator(f"shadowing{links}", seed, layout_seed).standard_normal((helpers, WAVES, 7))
     phase = np.arctan2(drawn[..., :1], drawn[..., 1:2])
     return np.concatenate([phase, drawn[..., 2:6] / np.abs(drawn[..., 6:])], axis=-1) / (2 * np.pi)

@@ -1,24 +1,25 @@
-"""802.11p (ITS-G5, DSRC): broadcast under CSMA/CA in 10 MHz, beside the beacons of background traffic.
+"""802.11p (ITS-G5, DSRC): broadcast under CSMA/CA in 10 MHz, with the beacons of background traffic.
 
 Sepulcre, Gonzalez-Martín, Gozalvez, Molina-Masegosa, Coll-Perales, "Analytical Models of the Performance of
 IEEE 802.11p Vehicle to Vehicle Communications", IEEE TVT 71(1), 2022 (arXiv 2104.07923): numbers in brackets
 are its equations, and the defaults its own. A packet is lost below the sensing threshold (12), to a receiver
 that is locked to another one's packet (14), to noise (24) or to a collision (26): with a hidden node, or with
-one that hears the sender and ends its back-off in the same slot. What is done otherwise here:
+one that hears the sender and ends its back-off in the same slot. This model differs from the source:
 
 - A link keeps its shadowing: `loss` is that at the power received, and `reception` the mean over shadowing,
   where the source multiplies means.
 - Background traffic is a line of equal density, so a product over vehicles is the exponential of an integral.
-- Nobody begins to send in the AIFS after a busy period either (`free_share`), where the source counts the
-  busy time alone in (16), (18) and (22); who waited for its end begins soon after, as others do (`crowding`).
-- A message of another size than the background's collides with who begins while it is on air, for as long as
-  it is, and with who was on air before, for as long as that is.
+- Nobody begins to send in the AIFS after a busy period either (`free_share`); the source counts only the busy
+  time in (16), (18) and (22). Vehicles that waited for its end begin soon after it, close together
+  (`crowding`).
+- A message of another size than the background's collides with packets that begin while it is on air (so its
+  own length counts), and with packets that were on air before (so their length counts).
 - Replies that end their back-off in one slot are lost together; one that becomes ready while another is on
-  air waits for its end. All helpers of an ego are taken to hear each other. `loss` is without that.
+  air waits for its end. All helpers of an ego are assumed to hear each other. `loss` does not include that.
 
-As in the source, a block error curve holds for frames of any size, a receiver does not leave a packet that it
-has locked to for a stronger one, and all vehicles of the background are in line of sight. A message is one
-frame however long it is; 802.11 would split one of more than 2304 bytes.
+As in the source, a block error curve holds for frames of any size, a receiver that has locked to a packet
+does not leave it for a stronger one, and all background vehicles are in line of sight. A message is one frame
+of any length; 802.11 would split one of more than 2304 bytes.
 """
 
 import math
@@ -41,21 +42,22 @@ from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 BANDWIDTH_HZ = 10e6
 SIFS_S, SYMBOL_S, PREAMBLE_S = 32e-6, 8e-6, 40e-6  # IEEE 802.11-2012, 10 MHz OFDM
 SERVICE_AND_TAIL_BITS = 22
-REACH_M, SENSED_M = 1000.0, 1500.0  # of interferers round a receiver; of who is sensed
-STRONGEST_DB = 80.0  # of the tables
-QUANTILES = 400  # of shadowing, in `reception`
+REACH_M, SENSED_M = 1000.0, 1500.0  # distances up to which vehicles interfere, and are sensed
+STRONGEST_DB = 80.0  # highest power in the tables, above the sensing threshold
+QUANTILES = 400  # quantiles of shadowing in `reception`
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 BY_BIT = "11p-goubet"  # a curve over the energy of a bit
-CURVES_MBPS = {"11p-mcs2": 6.0, "11p-mcs4": 12.0}  # what others' names begin with
-IMPLEMENTATION = 0.37  # of Shannon's rate: Wu et al., arXiv 2203.17114
+CURVES_MBPS = {"11p-mcs2": 6.0, "11p-mcs4": 12.0}  # data rate of other curves, by the beginning of their name
+IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arXiv 2203.17114
 
 
 class Hazards(NamedTuple):
-    """What a packet meets on average, by distance in STEP_M, and by power received in STEP_DB.
+    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of STEP_DB).
 
     Attributes:
-        before: packets begun before it or with it that the receiver is locked to or that spoil it, `(D, P)`.
-        during: others that spoil it, for each second that it is on air, `(D, P)`.
+        before: packets that began earlier or at the same time and that the receiver is locked to, or that
+            spoil this one, `(D, P)`.
+        during: later packets that spoil it, for each second that it is on air, `(D, P)`.
     """
 
     before: Floats
@@ -64,20 +66,21 @@ class Hazards(NamedTuple):
 
 @dataclass(frozen=True)
 class ItsG5(Transceiver):
-    """802.11p beside background traffic, which sends packets of one size at one rate.
+    """802.11p with background traffic, which sends packets of one size at one rate.
 
     Attributes:
-        frequency_ghz: carrier, here the control channel's.
+        frequency_ghz: carrier frequency, here the control channel's.
         environment_height_m: see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m.
-        packet_bytes: size of the background's packets.
-        header_bytes: what the layers below add to a packet and to a message.
-        data_rate_mbps: of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
+        packet_bytes: size of a background packet.
+        header_bytes: bytes that the layers below add to a packet and to a message.
+        data_rate_mbps: one of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27.
         aifs_slots: slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663).
-        contention_window: back-off is uniform from 0 to so many slots; a broadcast never doubles it.
-            There is always one, as after a packet of one's own.
-        curve: block error of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's, is by
-            energy of a bit, and so for every rate; one of MCS 2 or 4 (6 or 12 Mb/s) holds at another rate
-            shifted by what that needs more, if an implementation reaches 0.37 of Shannon's rate.
+        contention_window: back-off is uniform from 0 to this number of slots; a broadcast never doubles it.
+            There is always a back-off, as after a packet of one's own.
+        curve: block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's,
+            is over the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or 12 Mb/s) is
+            shifted for another rate by the additional SINR that an implementation at 0.37 of Shannon's rate
+            needs.
     """
 
     frequency_ghz: float = 5.89
@@ -92,7 +95,7 @@ class ItsG5(Transceiver):
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:
-        """Refuse settings that are no radio's."""
+        """Raise UserError for impossible settings."""
         numbers = {
             "density_per_km": (0.0, 10_000.0), "rate_hz": (0.0, 1000.0), "packet_bytes": (1, 2304),
             "header_bytes": (0, 2304), "aifs_slots": (0, 15), "contention_window": (1, 1023),
@@ -110,40 +113,40 @@ class ItsG5(Transceiver):
 
     @property
     def aifs_s(self) -> float:
-        """How long the medium must be idle before anybody counts down."""
+        """Time that the medium must be idle before anybody counts down."""
         return SIFS_S + self.aifs_slots * SLOT_S
 
     def airtime_s(self, size_bytes: Floats | float) -> Floats:
-        """How long frames of so many bytes, headers included, are on air (IEEE 802.11-2012, 18.4.3)."""
+        """Return the time on air of frames of a size with headers (IEEE 802.11-2012, 18.4.3)."""
         bits_per_symbol = self.data_rate_mbps * 1e6 * SYMBOL_S
         symbols = np.ceil((8 * np.asarray(size_bytes) + SERVICE_AND_TAIL_BITS) / bits_per_symbol)
         return PREAMBLE_S + SYMBOL_S * symbols
 
     @property
     def packet_bits(self) -> int:
-        """Without headers."""
+        """Size of a background packet without headers."""
         return 8 * self.packet_bytes
 
     @property
     def packet_s(self) -> float:
-        """How long a packet of the background is on air."""
+        """Time on air of a background packet."""
         return float(self.airtime_s(self.packet_bytes + self.header_bytes))
 
     def message_s(self, bits: Floats | float) -> Floats:
-        """How long a message of so many bits is on air, its header included."""
+        """Return the time on air of a message of so many bits, with its header."""
         return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
 
     def busy_ratio(self) -> float:
-        """Channel busy ratio (35): a fit of the source to its simulations of a load (34) of up to 1.3.
+        """Return the channel busy ratio (35): the source's fit to its simulations of a load (34) up to 1.3.
 
-        It is held where the fit's parabola turns, 0.84 at a load of 1.84.
+        Beyond the maximum of the fit's parabola, 0.84 at a load of 1.84, it stays constant.
         """
         sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
         load = min(self.density_per_km / 1000 * self.rate_hz * self.packet_s * sensed_m, 0.913 / 0.4962)
         return (-0.2481 * load + 0.913) * load + 0.003844 * (load > 0)
 
     def lost_share(self, sinr_db: Floats) -> Floats:
-        """Share of frames lost at these ratios of signal to interference and noise."""
+        """Return the share of frames lost at these ratios of signal to interference and noise."""
         if self.curve == BY_BIT:
             more_db = 10 * math.log10(self.data_rate_mbps * 1e6 / BANDWIDTH_HZ)
         else:
@@ -151,9 +154,9 @@ class ItsG5(Transceiver):
         return block_error(self.curve)(sinr_db - more_db)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Share of the background's packets received at these distances `(n,)`, averaged over shadowing.
+        """Return the share of background packets received at distances `(n,)`, averaged over shadowing.
 
-        Without `sight` over links clear and blocked too, where the environment has shares of them.
+        Without `sight`, it is also averaged over clear and blocked links by the environment's shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]
@@ -171,7 +174,7 @@ class ItsG5(Transceiver):
     def _turns(
         self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
     ) -> tuple[Bools, Floats]:
-        """One after another; those that end their back-off in one slot are lost together."""
+        """Replies are sent one after another; those that end their back-off in one slot are lost together."""
         begins_s = np.where(links.asked, begins_s, np.inf)
         alone = np.sum(_near(begins_s, SLOT_S / 2), axis=-1) == 1
         return alone, served_s(begins_s, np.where(links.asked, airtime_s, 0.0), links.range_m)
@@ -181,9 +184,9 @@ class ItsG5(Transceiver):
         return 1 - unspoilt * np.exp(-self.message_s(bits) * spoils_hz)
 
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> tuple[Floats, Floats]:
-        """Probability that a message gets through all that does not depend on its length.
+        """Return the probability to survive all losses that do not depend on a message's length.
 
-        And the packets that would spoil it, for each second that it is on air.
+        And the mean number of packets that would spoil it, for each second that it is on air.
         """
         sinr_db = power_dbm - noise_dbm(BANDWIDTH_HZ, self.noise_figure_db)
         before, during_hz = (self._read(met, distance_m, power_dbm, 0.0) for met in _hazards(self))
@@ -191,19 +194,19 @@ class ItsG5(Transceiver):
         return sensed * (1 - self.lost_share(sinr_db)) * np.exp(-before), during_hz
 
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Seconds from the wish to send until the medium is taken: the quantiles at these draws."""
+        """Return the seconds from the wish to send until the medium is taken: quantiles at these draws."""
         return np.interp(
             uniforms, *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window)
         )
 
 
 def _shannon_db(rate_mbps: float) -> float:
-    """SINR that a rate needs under the implementation loss."""
+    """Return the SINR in dB that a rate needs with the implementation loss."""
     return 10 * math.log10(2 ** (rate_mbps * 1e6 / BANDWIDTH_HZ / IMPLEMENTATION) - 1)
 
 
 def _sensed(radio: ItsG5, distance_m: Floats) -> Floats:
-    """Probability (13) that vehicles so far apart sense each other's packets."""
+    """Return the probability (13) that vehicles at these distances sense each other's packets."""
     mean_dbm = radio.received_dbm(radio.path_loss_db(distance_m))
     return np.asarray(ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db()))
 
@@ -230,14 +233,14 @@ def _hazards(radio: ItsG5) -> Hazards:
 
 
 def _overlap(radio: ItsG5, apart_m: Floats) -> Floats:
-    """How much of what one vehicle senses another one senses, by the distance between them (20)."""
+    """Return the share of what one vehicle senses that another senses as well, by their distance (20)."""
     sensed = _sensed(radio, np.abs(np.arange(-SENSED_M, SENSED_M + 1)))
     shared = np.correlate(sensed, sensed, "full")[sensed.size - 1 :]
     return np.asarray(np.interp(apart_m, np.arange(shared.size), shared / shared[0]))
 
 
 def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
-    """Probability (31) that a packet on air at once spoils one that noise would not, `(P, interferers)`."""
+    """Return the probability (31) that a concurrent packet spoils one, `(P, interferers)`, noise excluded."""
     noise = noise_dbm(BANDWIDTH_HZ, radio.noise_figure_db)
     shadow, weights = np.polynomial.hermite_e.hermegauss(15)
     mean_dbm = radio.received_dbm(radio.path_loss_db(interferer_m))
@@ -248,6 +251,6 @@ def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
 
 
 def _near(at: Floats, within: float) -> Bools:
-    """Which of these times `(..., H)` are how near each other, `(..., H, H)`; infinite ones to nobody."""
+    """Return which of these times `(..., H)` are near each other, `(..., H, H)`; infinite ones never are."""
     finite = np.where(np.isfinite(at), at, np.nan)
     return np.asarray(np.abs(finite[..., :, None] - finite[..., None, :]) < within)

@@ -2,7 +2,7 @@
 
 Parameters are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019):
 10 MHz at 5.9 GHz, packets of 190 bytes in sub-channels of a 1 ms subframe, WINNER+ B1 with an effective
-antenna height of 1.5 m, block errors of 3GPP R1-160284. They held it against simulation at 100 to 300
+antenna height of 1.5 m, block errors of 3GPP R1-160284. They validated it by simulation at 100 to 300
 vehicles a kilometre, 10 and 20 Hz, 20 and 23 dBm, distances up to 500 m.
 """
 
@@ -14,7 +14,7 @@ from harness.radio.block_error import BlockError, block_error
 from harness.radio.propagation import noise_dbm
 from harness.radio.sidelink import Sidelink
 
-# Sub-channels to the packet's coding and its resource blocks, of 50 in 10 MHz.
+# Coding and resource blocks (of 50 in 10 MHz) of a packet, by number of sub-channels.
 CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 
 
@@ -31,7 +31,7 @@ class LteMode4(Sidelink):
     ranks: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuse settings that are no radio's."""
+        """Raise UserError for impossible settings."""
         super().__post_init__()
         if self.subchannels not in CODINGS:
             raise UserError(f"subchannels is {self.subchannels}: block errors are known for 2 and 4")

@@ -1,4 +1,4 @@
-"""Round trips from a car to a cloud, by what somebody measured: files `networks/*.toml`."""
+"""Measured distributions of round trips from a car to a cloud: files `networks/*.toml`."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,13 +15,13 @@ from harness.core.errors import UserError, printable, unknown
 
 @dataclass(frozen=True)
 class Network:
-    """A distribution of round trips, without what the answer takes at the other end.
+    """A distribution of round trips, without the time of the answer at the other end.
 
     Attributes:
         description: one sentence for lists.
-        source: who measured them, where and how many.
+        source: who measured the round trips, where and how many.
         status: `cited` from a publication or its data, `measured` by oneself, or `assumed`.
-        quantiles_ms: round trips by the percentage of all that are no longer, from 0 to 100.
+        quantiles_ms: quantiles of the round trips by percentage, from 0 to 100.
     """
 
     description: str
@@ -30,18 +30,18 @@ class Network:
     quantiles_ms: dict[str, float]
 
     def round_trip_s(self, uniforms: Floats) -> Floats:
-        """The quantiles at these draws, on straight lines between those that are given."""
+        """Return the quantiles at these draws, interpolated linearly."""
         shares = [float(percent) / 100 for percent in self.quantiles_ms]
         return np.interp(uniforms, shares, [ms / 1000 for ms in self.quantiles_ms.values()])
 
 
 def names() -> list[str]:
-    """Of the networks that there are, a project's among them."""
+    """Return the names of all networks, with a project's."""
     return resources.names("networks")
 
 
 def network(name: str) -> Network:
-    """A network by its name. Raises UserError for an unknown one and for a file that does not work."""
+    """Load a network by name. Raises UserError if it is unknown or its file is wrong."""
     if name not in names():
         raise unknown("round_trip", name, names())
     path = resources.find("networks", f"{name}.toml")

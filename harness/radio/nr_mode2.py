@@ -1,4 +1,4 @@
-"""NR-V2X Mode 2: vehicles choose their resources themselves, by what control information they decoded.
+"""NR-V2X Mode 2: vehicles choose their resources themselves, from the control information they decoded.
 
 The model of Mode 4 with slots for subframes and without ranking: a vehicle takes any resource that it has
 not sensed as taken (TS 38.214, 8.1.4), which is Step 2 of that model alone. The chance that two vehicles
@@ -26,12 +26,12 @@ from harness.radio.sidelink import Sidelink
 # Resource blocks by bandwidth in MHz, for subcarriers of 15, 30 and 60 kHz (TS 38.101-1, table 5.3.2-1).
 BLOCKS = {10: (52, 24, 11), 20: (106, 51, 24), 30: (160, 78, 38), 40: (216, 106, 51)}
 
-# Of 12 subcarriers in 13 symbols, those with reference signals, by numerology (WiLabV2Xsim's).
+# Resource elements with reference signals, of 12 subcarriers in 13 symbols, by numerology (WiLabV2Xsim's).
 REFERENCES = (24, 18, 12)
 
 CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 EFFICIENCY = 0.4
-"""Of codings without a curve: `threshold`."""
+"""Efficiency in `threshold` of codings without a curve."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class NrMode2(Sidelink):
         subchannel_blocks: resource blocks of a sub-channel. A packet takes as many of these as it needs.
         mcs: modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block error,
             the others a threshold of SINR.
-        packet_bytes: of a background packet.
+        packet_bytes: size of a background packet.
     """
 
     environment: Environment = "tr37885-highway"
@@ -59,7 +59,7 @@ class NrMode2(Sidelink):
     ranks: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse settings that are no radio's."""
+        """Raise UserError for impossible settings."""
         super().__post_init__()
         numbers = {"mcs": (0, 28), "packet_bytes": (1, 10_000), "subchannel_blocks": (10, 100)}
         for name, (least, most) in numbers.items():
@@ -87,7 +87,7 @@ class NrMode2(Sidelink):
 
     @property
     def block_bits(self) -> int:
-        """What the packet's sub-channels carry."""
+        """Bits in the sub-channels of a packet."""
         return int(self._subchannels * self._subchannel_bits)
 
     @property
@@ -108,7 +108,7 @@ class NrMode2(Sidelink):
 
     @property
     def _subchannels(self) -> int:
-        """Sub-channels that a packet takes."""
+        """Number of sub-channels that a packet takes."""
         return math.ceil(8 * self.packet_bytes / self._subchannel_bits)
 
 

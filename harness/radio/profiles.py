@@ -1,7 +1,7 @@
-"""Channel profiles by name: files `channels/*.toml`, shipped and a project's, and what packages add.
+"""Channel profiles by name: files `channels/*.toml`, shipped and a project's, and those that packages add.
 
-A file names a model and its parameters, and says what they rest on. A package adds a profile by an entry
-point in the group `swarmdrive.channels`.
+A file names a model and its parameters, and states their source. A package adds a profile by an entry point
+in the group `swarmdrive.channels`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from harness.core.plugins import FilesAndPlugins
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 
-# Name of a model to its class, or to a function of a file's parameters, its folder and what to call them in
-# messages. A physical one takes a while to import, so only what is named is.
+# Models by name: a class, or a function of a file's parameters, its folder and their name in messages.
+# Physical models are slow to import, so a model is imported only when a profile names it.
 MODELS = {
     "constant": "harness.radio.constant:Radio",
     "lte-v2x-mode4": "harness.radio.lte_mode4:LteMode4",
@@ -33,16 +33,15 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Profile:
-    """What a file of `channels/` says.
+    """The content of a file of `channels/`.
 
     Attributes:
         model: one of `MODELS`.
         description: one sentence for lists.
-        source: where model and parameters come from.
-        status: what they are: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`.
-        parameters: of the model.
-        limits: least and largest value of some of them within which the source held the model against
-            something.
+        source: source of the model and its parameters.
+        status: their kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`.
+        parameters: parameters of the model.
+        limits: for some parameters, the least and largest value for which the source validated the model.
     """
 
     model: str
@@ -59,11 +58,11 @@ class Profiles(FilesAndPlugins[Channel]):
     folder = "channels"
 
     def read(self, file: Path) -> Channel:
-        """The file's channel."""
+        """Read the channel of a file."""
         return _read(file, file.stat().st_mtime_ns)[1]
 
     def profile(self, name: str) -> Profile:
-        """What the file says; of a package's channel, what it is."""
+        """Return the profile in the channel's file, or one made up for a package's channel."""
         if file := self.file(name):
             return _read(file, file.stat().st_mtime_ns)[0]
         kind = type(self[name])
@@ -71,7 +70,7 @@ class Profiles(FilesAndPlugins[Channel]):
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
 
     def record(self, name: str) -> dict[str, Any]:
-        """All that decides what the channel does, as plain values."""
+        """Return all that decides what the channel does, as plain values."""
         parameters = asdict(self[name])
         plain = {**asdict(self.profile(name)), "parameters": parameters}
         record: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
@@ -79,7 +78,7 @@ class Profiles(FilesAndPlugins[Channel]):
 
 
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
-    """Which of a channel's settings leave what its source held the model against, a sentence each."""
+    """Return a sentence for each setting outside the limits for which the source validated the model."""
     return [
         f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "
         f"{low:g} to {high:g}."
@@ -89,7 +88,7 @@ def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) 
 
 
 def _number(value: object) -> float:
-    """A number, or the text of one, as a float; NaN for anything else."""
+    """Convert a number or its text to a float; anything else becomes NaN."""
     try:
         return float(value) if isinstance(value, str | int | float) else np.nan
     except ValueError:
@@ -117,5 +116,5 @@ def _read(path: Path, mtime_ns: int) -> tuple[Profile, Channel]:
 
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})
 
-# A vehicle without a radio: no comparison with a NaN loss holds, so nothing ever crosses.
+# A vehicle without a radio: comparisons with a NaN loss are false, so nothing ever crosses.
 NO_CHANNEL = Radio(latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0)

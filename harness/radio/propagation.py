@@ -1,4 +1,4 @@
-"""What a signal loses on its way: path loss, blockage, shadowing, noise.
+"""Radio propagation: path loss, blockage, shadowing and noise.
 
 Sources: 3GPP TR 37.885 (tables 6.2-1, 6.2.1-1 and 6.2.1-2) for highway and urban links, WINNER+ D5.3 B1 as
 Gonzalez-Martin et al. (IEEE TVT 68(2), 2019) use it, and Mangel, Klemp and Hartenstein (EURASIP JWCN
@@ -19,22 +19,22 @@ Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
 
 LIGHT_M_PER_S = 3e8
 NEAREST_M = 3.0
-"""No formula here holds nearer; a link that is shorter has the loss of this distance."""
+"""No formula here is valid below this distance; a shorter link has the loss of this distance."""
 
 
 @dataclass(frozen=True)
 class Propagation:
-    """Which laws hold, and the heights and widths in them. A radio model inherits these as settings.
+    """The laws of propagation with their heights and widths. A radio model inherits these as settings.
 
     Attributes:
-        environment: law of links without a building between; LOS probabilities and decorrelation as well.
-        frequency_ghz: carrier.
+        environment: law of links without a building between, with its LOS probabilities and decorrelation.
+        frequency_ghz: carrier frequency.
         antenna_m: height of every antenna.
-        environment_height_m: average height of what surrounds the vehicles, for `winner-b1` alone. The
+        environment_height_m: average height of the vehicles' surroundings, for `winner-b1` only. The
             effective antenna height is `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m
             with 1 (TR 36.885), 12 dB more at 100 m.
-        blocker_m: height of a vehicle that stands between, where no scene has it: 1.6 m is a car, 3.0 m a
-            lorry (TR 37.885, 6.1.2).
+        blocker_m: height of a blocking vehicle if no scene gives it: 1.6 m is a car, 3.0 m a lorry (TR
+            37.885, 6.1.2).
         street_m: width of the receiver's street, in the law of the corner.
         wall_m: distance of the transmitter from its wall, in the law of the corner.
         suburban: adds 2.94 dB round a corner.
@@ -57,15 +57,15 @@ class Propagation:
         corner_m: Floats | None = None,
         first_m: float | None = None,
     ) -> Floats:
-        """Mean loss `(...)` of links `(...)` with what stands between them, a vehicle's blockage included.
+        """Return the mean loss `(...)` of links `(...)`, with the blockage of a vehicle between.
 
         Args:
             distance_m: straight distance.
             sight: `CLEAR`, `VEHICLE` or `BUILDING`.
-            blocker_m: height of the vehicle between; without, the model's own.
-            corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN where a building
-                does not stand at a corner. Then it is the NLOS law of TR 37.885, on the straight distance.
-            first_m: height of the antenna at one end, where it is not `antenna_m`.
+            blocker_m: height of the vehicle between; None means the model's own.
+            corner_m: distances of the two ends to the crossing's centre, `(..., 2)`; NaN if the building is
+                not at a corner. Then the NLOS law of TR 37.885 holds for the straight distance.
+            first_m: height of the antenna at one end, if it is not `antenna_m`.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
         clear_db = self.clear_db(distance_m, first_m)
@@ -79,12 +79,12 @@ class Propagation:
         return np.select(
             [np.equal(sight, CLEAR), np.equal(sight, VEHICLE)],
             [clear_db, clear_db + blocked_db],
-            # Close to the corner the fitted law falls below that of the open street.
+            # Close to the corner the fitted law would fall below that of the open street.
             np.maximum(behind_db, clear_db),
         )
 
     def clear_db(self, distance_m: Floats, first_m: float | None = None) -> Floats:
-        """Loss in line of sight."""
+        """Return the loss in line of sight."""
         if self.environment == "winner-b1":
             effective_m = self._mean_height_m(first_m, self.environment_height_m)
             return winner_b1_db(distance_m, self.frequency_ghz, effective_m)
@@ -93,7 +93,7 @@ class Propagation:
         return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
 
     def _mean_height_m(self, first_m: float | None, less_m: float = 0.0) -> float:
-        """Geometric mean of both antennas' heights above `less_m`, by whose square two rays go."""
+        """Return the geometric mean of both antennas' heights above `less_m`, as in two-ray propagation."""
         heights_m = (self.antenna_m, self.antenna_m if first_m is None else first_m)
         one_m, other_m = (max(height - less_m, 0.1) for height in heights_m)
         return one_m if first_m is None else math.sqrt(one_m * other_m)
@@ -104,10 +104,10 @@ class Propagation:
         blocker_m: Floats | float | None = None,
         first_m: float | None = None,
     ) -> tuple[Floats, Floats]:
-        """What a vehicle between adds (TR 37.885, 6.2.1): mean and deviation of max(0, X), `(...)`.
+        """Return the additional loss of a vehicle between (TR 37.885, 6.2.1): mean and deviation, `(...)`.
 
-        X is taken as normal in dB, of mean 9 and deviation 4.5 where both antennas are lower than the
-        blocker, and 5 and 4 where not both are. Nothing where both are higher. Beyond 541 m the mean grows by
+        The loss is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both antennas are lower than
+        the blocker, 5 and 4 if only one is. There is none if both are higher. Beyond 541 m the mean grows by
         15 log10 d - 41.
         """
         blocker_m = self.blocker_m if blocker_m is None else blocker_m
@@ -119,9 +119,9 @@ class Propagation:
         return np.where(higher < 0, 0.0, mean_db[higher] + growth_db), deviation_db[higher]
 
     def corner_db(self, corner_m: Floats, first_m: float | None = None) -> Floats:
-        """Loss `(...)` round a corner, from the ends' distances to the crossing's centre, `(..., 2)`.
+        """Return the loss `(...)` round a corner, from the ends' distances to its centre, `(..., 2)`.
 
-        The law is not quite reciprocal, a radio link is: the mean of both directions, in dB.
+        The law is not quite reciprocal, but a radio link is, so the mean of both directions in dB is taken.
         """
         one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
         height_m = self._mean_height_m(first_m)
@@ -129,7 +129,7 @@ class Propagation:
         return 0.5 * (there_db + self._corner_one_way_db(other_m, one_m, height_m))
 
     def _corner_one_way_db(self, transmitter_m: Floats, receiver_m: Floats, height_m: float) -> Floats:
-        # The breakpoint is that of two rays, which Abbas et al. write with the same symbol.
+        # The breakpoint is that of the two-ray model; Abbas et al. use the same symbol for it.
         wave_m = LIGHT_M_PER_S / (self.frequency_ghz * 1e9)
         break_m = 4 * height_m**2 / wave_m
         spread: Floats = transmitter_m**0.957 / (self.wall_m * self.street_m) ** 0.81
@@ -143,7 +143,7 @@ class Propagation:
         corner_m: Floats | None = None,
         first_m: float | None = None,
     ) -> Floats:
-        """Standard deviation `(...)` of shadowing and blockage together.
+        """Return the standard deviation `(...)` of shadowing and blockage together.
 
         3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a building
         (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a corner (Mangel et al.).
@@ -158,15 +158,15 @@ class Propagation:
     def decorrelation_m(self) -> float:
         """Distance over which shadowing's correlation falls to 1/e: 25 m on a highway and 10 m in a town.
 
-        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links that are not
-        in line of sight; here these have 10 m as well, so that shadowing does not jump where sight is lost.
+        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links without line
+        of sight; here these have 10 m as well, so that shadowing does not jump when sight is lost.
         """
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 
     def clear_probability(self, distance_m: Floats) -> Floats:
-        """Share of links without a building between that no vehicle blocks (TR 37.885, table 6.2-1).
+        """Return the share of links that no vehicle blocks, without buildings (TR 37.885, table 6.2-1).
 
-        `winner-b1` has none blocked.
+        In `winner-b1` no link is blocked.
         """
         if self.environment == "winner-b1":
             return np.ones_like(distance_m)
@@ -177,19 +177,22 @@ class Propagation:
 
 
 def _clipped(mean: float, deviation: float) -> tuple[float, float]:
-    """Mean and standard deviation of max(0, X) of a normal X."""
+    """Return mean and standard deviation of max(0, X) for a normal X."""
     z = mean / deviation
     above, at = float(ndtr(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
     first = mean * above + deviation * at
     return first, math.sqrt((mean**2 + deviation**2) * above + mean * deviation * at - first**2)
 
 
-# Of a blocker as high as the antennas, higher, and lower.
+# Mean and deviation for a blocker between the antennas' heights, higher than both, and lower than both.
 _BLOCKAGE_DB = [_clipped(5.0, 4.0), _clipped(9.0, 4.5), (0.0, 0.0)]
 
 
 def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:
-    """WINNER+ B1 in line of sight, never below free space; `effective_m` is the effective antenna height."""
+    """Return the loss of WINNER+ B1 in line of sight, at least that of free space.
+
+    `effective_m` is the effective antenna height.
+    """
     far = distance_m >= 4 * effective_m**2 * frequency_ghz * 1e9 / LIGHT_M_PER_S
     log_m, log_ghz = np.log10(distance_m), math.log10(frequency_ghz)
     near_db = 22.7 * log_m + 27 + 20 * log_ghz
@@ -199,10 +202,10 @@ def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -
 
 
 def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
-    """Behind a building (TR 37.885, table 6.2.1-1)."""
+    """Return the loss behind a building (TR 37.885, table 6.2.1-1)."""
     return 36.85 + 30 * np.log10(distance_m) + 18.9 * math.log10(frequency_ghz)
 
 
 def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Thermal noise at 290 K and the receiver's own: -95 dBm in 10 MHz with a noise figure of 9 dB."""
+    """Return thermal noise at 290 K plus the receiver's: -95 dBm in 10 MHz with a noise figure of 9 dB."""
     return -174 + 10 * math.log10(bandwidth_hz) + noise_figure_db

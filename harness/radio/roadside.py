@@ -1,8 +1,8 @@
-"""A roadside unit: a place with an antenna, a link of its own to each vehicle, and a delay between them.
+"""A roadside unit: an antenna with a link to each vehicle, which relays replies or fuses them.
 
-Its links are the channel's: the unit is one end, with its own antenna height and what stands between it and
-each vehicle; their shadowing and packets are drawn apart, so that a unit changes nobody else's. In both modes
-`delay_s` lies between all that the unit has received and what it sends for that: its processing and its
+Its links are the channel's: the unit is one end, with its own antenna height and its own obstacles to each
+vehicle. Their shadowing and packets are drawn separately, so a unit changes no other link. In both modes
+`delay_s` lies between the end of what the unit receives and what it sends for that: its processing and its
 backhaul.
 
 As a relay it sends every reply that reaches it once more. As a place of fusion it gets the ego's request and
@@ -20,20 +20,20 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Delivery, Draws, Links, Physical, Site, Unit
 from harness.radio.wrapped import Wrapped
 
-EGO, HELPERS = slice(0, 1), slice(1, None)  # of a unit's links
+EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
 
 
 @dataclass(frozen=True)
 class Relay(Wrapped):
-    """A channel beside a unit that sends replies once more; requests go directly.
+    """A channel with a unit that sends replies once more; requests go directly.
 
-    A reply arrives if it crosses to the ego, or to the unit and from there; the ego takes what comes first,
-    the direct one. Copies are on air whether or not the ego needs them, since the unit cannot know, and wait
-    for no one.
+    A reply arrives if it crosses to the ego, or to the unit and from there to the ego. The ego takes the one
+    that comes first, which is the direct one. Copies are sent whether or not the ego needs them, since the
+    unit cannot know, and do not wait for other messages.
 
     Attributes:
-        unit: where it is.
-        delay_s: from a reply's end at the unit until its copy is to be sent.
+        unit: the unit.
+        delay_s: time from a reply's end at the unit until its copy is to be sent.
     """
 
     unit: Unit
@@ -64,19 +64,19 @@ class Relay(Wrapped):
 
 
 class Consulted(NamedTuple):
-    """What became of a question to the helpers, in seconds from the ego's request.
+    """Result of a consultation, in seconds from the ego's request.
 
     Attributes:
-        asked: helpers that were asked, `(..., H)`: by a unit, nobody where the ego's request was lost.
-        up: request and reply crossed, `(..., H)`; with a unit its policy as well, if it sent one.
-        end_s: end of each reply at whoever fuses, `(..., H)`; inf where not asked.
-        fused: replies that a policy may have in it, `(..., H)`.
+        asked: which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost.
+        up: whether request and reply crossed, `(..., H)`; with a unit also its policy, if it sent one.
+        end_s: end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked.
+        fused: which replies may be part of the policy, `(..., H)`.
         acts_s: when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy.
         loss: probability that a reply is lost, `(..., H)` or `(..., 1)`.
-        requests: the ego's and the unit's, `(...)`.
-        request_bits: of these, with the ego's intent in its request to a unit, `(...)`.
-        policy_bits: of what a unit sent back, `(...)`.
-        airtime_s: of all messages, `(...)`.
+        requests: number of requests of the ego and the unit, `(...)`.
+        request_bits: their size, with the ego's intent in its request to a unit, `(...)`.
+        policy_bits: size of the unit's policy, `(...)`.
+        airtime_s: time on air of all messages, `(...)`.
     """
 
     asked: Bools
@@ -100,20 +100,20 @@ def by_unit(
     ready: Callable[[Floats], Floats],
     left_s: Floats,
 ) -> Consulted:
-    """A unit asks the helpers for the ego, and sends the ego a policy in time.
+    """Let a unit ask the helpers for the ego, and send the ego a policy in time.
 
-    The unit sends when the last reply's slot has ended, or as late as its own wait and time on air leave the
-    policy within the window: it knows the slot that it has taken, and until when the ego waits. An ego that
-    has no policy by then acts alone.
+    The unit sends when the last reply's slot has ended, but not so late that its own wait and time on air
+    take the policy out of the window: it knows the slot that it has taken, and until when the ego waits. An
+    ego without a policy by then acts alone.
 
     Args:
-        channel: of all links.
-        unit: where it is.
-        delay_s: between what the unit has received and what it sends for that.
-        links: whom the ego wants to be asked; when they are ready counts for nothing.
-        draws: of the channel.
-        ready: when replies can leave, `(..., H)`, by when helpers have the request, `(..., 1)`.
-        left_s: until the window closes, `(...)`.
+        channel: the channel of all links.
+        unit: the unit.
+        delay_s: time between what the unit has received and what it sends for that.
+        links: the helpers that the ego wants to be asked; their `ready_s` is not used.
+        draws: the channel's draws.
+        ready: gives when replies can leave, `(..., H)`, from when helpers have the request, `(..., 1)`.
+        left_s: time until the window closes, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
     to_ego, to_helpers = draws.of(".roadside-ego"), draws.of(".roadside")
@@ -155,5 +155,5 @@ def by_unit(
 
 
 def loss_of(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Probability that one crossing of so many bits is lost on each link, `(..., H)`."""
+    """Return the probability that one crossing of so many bits is lost on each link, `(..., H)`."""
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

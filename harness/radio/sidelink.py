@@ -1,4 +1,4 @@
-"""Vehicles that broadcast on a sidelink under background load: what crosses, and when.
+"""The base of sidelink radios (LTE Mode 4, NR Mode 2): broadcasts under background load.
 
 The model of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019; equation numbers
 are theirs): a packet is lost because the receiver was sending (half duplex), because it came too faintly to
@@ -6,9 +6,9 @@ be sensed, because of noise, or because others chose its resource. The paper ave
 links in line of sight. `loss` is that of one link whose shadowing and obstacles are known; `reception`
 averages it again, and in line of sight is the paper's curve.
 
-Background vehicles stand evenly along a straight road through the receiver, with vehicles between them where
-the surroundings have a probability of that. Swarm messages add no load to it. Two replies in one slot and
-sub-channel are both lost; `loss` is without that.
+Background vehicles stand evenly along a straight road through the receiver, with vehicles between them if the
+environment has a probability for that. Swarm messages add no load. Two replies in one slot and sub-channel
+are both lost; `loss` does not include that.
 """
 
 from abc import abstractmethod
@@ -27,23 +27,23 @@ from harness.radio.sps import Scheduling
 from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
 FURTHEST_M = 1000
-"""Interferers further from the receiver do not count, as in the source; beyond, links have its collisions."""
+"""Interferers farther away do not count, as in the source; longer links have this length's collisions."""
 
 CELLS = 160
-"""Of power, from the sensing threshold on; with the distances the grid on which success is computed once."""
+"""Power cells above the sensing threshold; with the distances they form the grid of the success table."""
 
 
 @dataclass(frozen=True)
 class Sidelink(Transceiver):
-    """What LTE Mode 4 and NR Mode 2 have in common; its fields and `Transceiver`'s are settings of both.
+    """The common part of LTE Mode 4 and NR Mode 2; its fields and `Transceiver`'s are settings of both.
 
     Attributes:
-        keep: probability that a vehicle keeps its resource when it might choose anew.
-        transmissions: how often each block is sent, blindly, everyone's. Copies are received independently
-            and not combined, given the link's shadowing.
+        keep: probability that a vehicle keeps its resource when it might choose a new one.
+        transmissions: how often every vehicle sends each block (blind repetition). Given the link's
+            shadowing, copies are received independently, and not combined.
         t1_slots: first slot of the selection window.
-        t2_slots: its last slot. A message takes one of the window at random (one-shot), since what is
-            triggered has no reservation.
+        t2_slots: last slot. A message takes a random slot of the window (one-shot), since a triggered message
+            has no reservation.
     """
 
     keep: float = 0.0
@@ -52,10 +52,10 @@ class Sidelink(Transceiver):
     t2_slots: int = 100
 
     ranks: ClassVar[bool]
-    """Whether vehicles rank what they have left by received power (Step 3 of Mode 4)."""
+    """Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4)."""
 
     def __post_init__(self) -> None:
-        """Refuse settings that are no radio's."""
+        """Raise UserError for impossible settings."""
         least = {
             "density_per_km": 0.0, "rate_hz": 0.1, "keep": 0.0, "transmissions": 1, "t1_slots": 0,
             "t2_slots": self.t1_slots, "antenna_m": self.environment_height_m + 0.1,
@@ -74,39 +74,39 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def blocks_per_slot(self) -> int:
-        """How many blocks fit beside each other in one slot."""
+        """Number of blocks that fit beside each other in one slot."""
 
     @property
     @abstractmethod
     def block_bits(self) -> int:
-        """What one block carries; a larger message takes several, and each must cross."""
+        """Bits in one block; a larger message takes several blocks, and each must cross."""
 
     @property
     def packet_bits(self) -> int:
-        """One block."""
+        """Size of a background packet: one block."""
         return self.block_bits
 
     @property
     @abstractmethod
     def noise_dbm(self) -> float:
-        """Noise in the bandwidth of a block."""
+        """Noise power in the bandwidth of a block."""
 
     @property
     @abstractmethod
     def block_error(self) -> BlockError:
-        """How often a block is lost at a signal-to-interference-and-noise ratio."""
+        """Block error rate as a function of the signal-to-interference-and-noise ratio."""
 
     def busy_ratio(self) -> float:
-        """Channel busy ratio under the background load (34)."""
+        """Return the channel busy ratio under the background load (34)."""
         return self._scheduling().busy_ratio
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Share of background packets received over these distances, averaged over shadowing, `(n,)` (6).
+        """Return the share of background packets received, averaged over shadowing, `(n,)` (6).
 
         Args:
-            distance_m: `(n,)`.
-            sight: what stands between, `(n,)` or one for all; without, no building does, and vehicles do with
-                the surroundings' probability.
+            distance_m: distances, `(n,)`.
+            sight: what stands between, `(n,)` or one value for all; None means no building, and vehicles with
+                the environment's probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array([np.interp(distance_m, _DISTANCE_M, column) for column in _success(self).T]).T
@@ -114,20 +114,20 @@ class Sidelink(Transceiver):
         return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
 
     def wait_s(self, uniforms: Floats) -> Floats:
-        """From the wish to send to the start of the slot chosen."""
+        """Return the time from the wish to send to the start of the chosen slot."""
         return (self.t1_slots + np.floor(uniforms * self._window)) * self.slot_s
 
     def message_s(self, bits: Floats | float) -> Floats:
-        """One slot a block and copy, one after another."""
+        """Return the time on air: one slot for each block and copy, one after another."""
         return self._blocks(bits) * (self.transmissions * self.slot_s)
 
     def _turns(
         self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
     ) -> tuple[Bools, Floats]:
-        """Each reply takes a slot and a sub-channel at random; what another has in part is lost."""
+        """Each reply takes a random slot and sub-channel; replies that overlap are lost."""
         first = np.floor(begins_s / self.slot_s + 1e-6)
         after = first + np.rint(airtime_s / self.slot_s)
-        # What of the draw did not choose the slot chooses the sub-channel.
+        # The rest of the draw that chose the slot chooses the sub-channel.
         lane = np.floor(np.mod(uniforms * self._window, 1.0) * self.blocks_per_slot)
         meet = (first[..., None] < after[..., None, :]) & (first[..., None, :] < after[..., None])
         meet &= (lane[..., None] == lane[..., None, :]) & replied[..., None, :]
@@ -145,7 +145,7 @@ class Sidelink(Transceiver):
         return 1 - (1 - fate) ** self._blocks(bits)
 
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Floats:
-        """Probability that a block is lost in all its copies."""
+        """Return the probability that all copies of a block are lost."""
         success = self._read(_success(self), distance_m, power_dbm, STEP_DB / 2)
         copies = np.where(power_dbm >= self.sensing_dbm, (1 - success) ** self.transmissions, 1.0)
         return np.clip(copies, 0.0, 1.0)
@@ -154,14 +154,14 @@ class Sidelink(Transceiver):
         return Scheduling(
             per_m=self.density_per_km / 1000 * self.transmissions,
             resources=self.blocks_per_slot / (self.slot_s * self.rate_hz),
-            # A vehicle chooses anew once a second (5 to 15 packets at 10 Hz, 10 to 30 at 20 Hz).
+            # A vehicle may choose a new resource once a second (5 to 15 packets at 10 Hz, 10 to 30 at 20 Hz).
             forgotten=min(1.0, (1 - self.keep) / self.rate_hz),
             sensed=self._sensed,
             threshold_dbm=self.sensing_dbm,
         )
 
     def _states(self, distance_m: Floats, sight: Ints | int | None) -> list[tuple[Floats, Floats, float]]:
-        """What may stand between: shares `(n,)`, mean received powers `(n,)` and their deviation in dB."""
+        """Return for each kind of obstacle: share `(n,)`, mean received power `(n,)` and deviation in dB."""
         clear = self.clear_probability(distance_m)
         shares = {CLEAR: clear, VEHICLE: 1 - clear}
         if sight is not None:
@@ -173,12 +173,12 @@ class Sidelink(Transceiver):
         ]
 
     def _sensed(self, distance_m: Floats, threshold_dbm: float) -> Floats:
-        """Share of the packets from so far away that are above a threshold (11)."""
+        """Return the share of packets from these distances that are above a threshold (11)."""
         states = self._states(distance_m, None)
         return np.asarray(sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states))
 
     def _shares(self, distance_m: Floats, sight: Ints | int | None) -> Floats:
-        """Shares of the power cells, `(n, CELLS)`; what is missing to 1 is below the threshold (10)."""
+        """Return the shares of the power cells, `(n, CELLS)`; the rest to 1 is below the threshold (10)."""
         edges = self.sensing_dbm + STEP_DB * np.arange(CELLS + 1)
         edges[-1] = np.inf
         states = self._states(distance_m, sight)
@@ -191,7 +191,7 @@ _DISTANCE_M: Floats = np.arange(0.0, FURTHEST_M + STEP_M, STEP_M)
 
 @lru_cache(maxsize=64)
 def _success(radio: Sidelink) -> Floats:
-    """Share of packets received of those that are sensed, by distance and received power, `(D, CELLS)`."""
+    """Return the share of sensed packets that are received, by distance and received power, `(D, CELLS)`."""
     power_dbm: Floats = radio.sensing_dbm + STEP_DB * (np.arange(CELLS, dtype=np.float64) + 0.5)
     noise_lost = radio.block_error(power_dbm - radio.noise_dbm)
     shares = radio._shares(_DISTANCE_M, None) * (1 - noise_lost)
@@ -214,7 +214,7 @@ def _success(radio: Sidelink) -> Floats:
             mean_hit = shares @ hit
             free_on_average += weight * _none(*(side * mean_hit for side in sides))
     # The source multiplies the interferers' average collisions. A link's own power is the same against all of
-    # them, so that the average of products is a little larger; the curve shall be the source's.
+    # them, so the average of the products is a little larger; it is scaled to the source's curve.
     average_free = np.sum(shares * free, axis=-1)
     scale = np.where(average_free > 0, free_on_average / np.maximum(average_free, 1e-300), 1.0)
     free *= scale[:, None]
@@ -224,14 +224,14 @@ def _success(radio: Sidelink) -> Floats:
 
 
 def _none(left: Floats, right: Floats) -> Floats:
-    """Probability that no interferer hits, over the last dimension."""
+    """Return the probability that no interferer hits, over the last dimension."""
     return np.asarray(np.prod((1 - np.minimum(left, 1.0)) * (1 - np.minimum(right, 1.0)), axis=-1))
 
 
 def _hit(radio: Sidelink, power_dbm: Floats, noise_lost: Floats, interferers_m: Floats) -> Floats:
-    """Probability that an interferer on the same resource destroys a packet that noise would not, `(P, K)`.
+    """Return the probability that an interferer on the same resource destroys a packet, `(P, K)` (17, 18).
 
-    (17, 18), over the interferer's shadowing by 15 nodes.
+    Packets that noise would destroy are excluded. The interferer's shadowing is integrated with 15 nodes.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     lost = np.zeros((len(power_dbm), len(interferers_m)))

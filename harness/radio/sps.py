@@ -1,4 +1,4 @@
-"""Semi-persistent scheduling on a sidelink: how many resources are taken, how often two choose the same.
+"""Semi-persistent scheduling on a sidelink: how many resources are taken, and how often two vehicles collide.
 
 Vehicles stand evenly along a road, all send at one rate, and each chooses at random from the resources that
 it has not sensed as taken. Equation numbers are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and
@@ -15,27 +15,27 @@ from scipy.fft import irfft, next_fast_len, rfft
 from harness.core.arrays import Floats
 
 REACH_M = 1500
-"""Vehicles further away are not sensed."""
+"""Vehicles farther away are not sensed."""
 
 LEAST_SHARE = 0.2
 """Share of the resources that must be left to choose from (TS 36.213, 14.1.1.6; TS 38.214, 8.1.4)."""
 
 STEP_DB = 0.1
-"""By which Step 3 raises the threshold until so many are left."""
+"""Step by which Step 3 raises the threshold until enough resources are left."""
 
 
 @dataclass(frozen=True)
 class Scheduling:
-    """What each vehicle knows of the resources of one period, and chooses by.
+    """The inputs of a vehicle's choice among the resources of one period.
 
     Attributes:
-        per_m: packets a period of the vehicles on one metre of road.
-        resources: how many there are in a period (28).
+        per_m: packets that the vehicles on one metre of road send in a period.
+        resources: number of resources in a period (28).
         forgotten: share of the choices in which a vehicle that could sense another does not know of the
             other's choice, since both were made anew within one period (24).
         sensed: share of the packets of a vehicle so many metres away whose power is above a threshold in dBm
             (11), for an array of metres; the second argument is the threshold.
-        threshold_dbm: what a receiver senses.
+        threshold_dbm: sensing threshold of a receiver.
     """
 
     per_m: float
@@ -50,17 +50,18 @@ class Scheduling:
         return self._taken(self.threshold_dbm, 1) / self.resources
 
     def same_by_exclusion(self, apart_m: Floats) -> Floats:
-        """Probability that another, `apart_m` away, takes one's own resource; both exclude what they sense.
+        """Return the probability that a vehicle `apart_m` away takes the same resource, by Step 2 (23).
 
-        Step 2, (23). The source does not bound what is excluded; no more than 80 % can be.
+        Both exclude the resources that they sense. The source does not limit them; at most 80 % can be
+        excluded.
         """
         taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
         return self._same(apart_m, taken, self.threshold_dbm)
 
     def same_by_ranking(self, apart_m: Floats) -> Floats:
-        """The same where both then keep the fifth of the resources that was received most faintly.
+        """Return the same probability if both then keep the fifth of the resources with the least power.
 
-        Step 3, (31) to (33): as if the threshold had been raised until no more were left.
+        Step 3, (31) to (33): as if the threshold had been raised until only these were left.
         """
         threshold_dbm = self.threshold_dbm
         while (taken := self._taken(threshold_dbm, 2)) > (1 - LEAST_SHARE) * self.resources:
@@ -68,15 +69,15 @@ class Scheduling:
         return self._same(apart_m, taken, threshold_dbm)
 
     def _taken(self, threshold_dbm: float, times: int) -> float:
-        """Resources taken for taken: those of `times` the packets sensed (29, 29.1; 32, 33)."""
+        """Count the resources taken: those of `times` the sensed packets (29, 29.1; 32, 33)."""
         metres = np.abs(np.arange(-REACH_M, REACH_M + 1.0))
         return taken(times * self.per_m * float(self.sensed(metres, threshold_dbm).sum()), self.resources)
 
     def _same(self, apart_m: Floats, taken: float, threshold_dbm: float) -> Floats:
-        """(24) to (27) and (30): they choose from what both have left, the nearer, the more in common.
+        """Apply (24) to (27) and (30): the nearer two vehicles are, the more remaining resources they share.
 
-        Not less than what two have in common who sense independently: the source's equations fall below that
-        at a busy ratio of about 0.75 and more.
+        The result is at least that of two vehicles that sense independently; the source's equations fall
+        below that at a busy ratio of about 0.75 and more.
         """
         sensed = self.sensed(np.abs(np.arange(-REACH_M, REACH_M + 1.0)), self.threshold_dbm)
         size = 2 * sensed.size - 1
@@ -94,9 +95,9 @@ class Scheduling:
 
 
 def taken(packets: float, resources: float) -> float:
-    """Resources taken by packets (29): half of them lie apart, and the others fall at random.
+    """Return the resources taken by packets (29): half of them do not overlap, the others fall at random.
 
-    Never more than there are, which the equation does not say and which holds where it was meant.
+    There are never more than `resources`; the equation does not state that, but it holds in its range.
     """
     half = packets / 2
     free = resources - half

@@ -1,8 +1,8 @@
-"""Packet reception by distance from a table of one's own, such as a run of ns-3 or Veins gives.
+"""A channel from a user's table of packet reception by distance, such as a run of ns-3 or Veins gives.
 
-A CSV file with the columns `distance_m` and `reception` (share of packets received), and if it has them
-`sight` (`clear`, `vehicle` or `building`: a curve for each) and `latency_ms`. Between two distances both are
-interpolated on a straight line; nearer than the first they are the first's.
+The table is a CSV file with the columns `distance_m` and `reception` (share of packets received), and
+optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and `latency_ms`. Values are
+interpolated linearly between distances; below the first distance its values hold.
 """
 
 import csv
@@ -30,10 +30,10 @@ class Point(NamedTuple):
     """One row of the table.
 
     Attributes:
-        distance_m: between sender and receiver.
+        distance_m: distance between sender and receiver.
         reception: share of packets received.
-        sight: one of `SIGHTS`; None in a table that does not tell them apart.
-        latency_s: from the wish to send until received; None where the table does not say.
+        sight: one of `SIGHTS`; None in a table without this column.
+        latency_s: time from the wish to send until reception; None in a table without this column.
     """
 
     distance_m: float
@@ -47,8 +47,8 @@ class Table:
     """A file of receptions.
 
     Attributes:
-        file: where it was read.
-        sha256: of the file.
+        file: path of the file.
+        sha256: its digest.
         points: its rows.
     """
 
@@ -59,17 +59,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Trace:
-    """A channel that receives as a table says.
+    """A channel with the reception of a table.
 
-    The table has averaged over shadowing and knows one size, so a link's own shadowing and a message's bits
-    change nothing, and replies do not wait for each other. The helpers have a request when the table's
-    longest latency is over.
+    The table is averaged over shadowing and for one packet size, so a link's own shadowing and a message's
+    bits change nothing, and replies do not wait for each other. The helpers have a request after the table's
+    longest latency.
 
     Attributes:
         receptions: the table.
-        latency_s: of each message, where the table has none.
-        beyond: reception farther away than the last distance: `zero`, since a table usually ends where
-            packets do and none was measured beyond, or `held`, the last row's, for one that ends early.
+        latency_s: latency of each message if the table has none.
+        beyond: reception beyond the last distance: `zero`, since a table usually ends where packets are no
+            longer received, or `held`, that of the last row, for a table that ends early.
     """
 
     receptions: Table
@@ -78,19 +78,19 @@ class Trace:
     decorrelation_m: ClassVar[float] = math.inf
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Share of packets received at these distances; in clear sight if nothing else is said."""
+        """Return the share of packets received at these distances; in clear sight unless given."""
         return self._at(distance_m, CLEAR if sight is None else sight, "reception")
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Probability that one crossing is lost, `(..., H)`."""
+        """Return the probability that one crossing is lost, `(..., H)`."""
         return 1 - self._at(site.distance_m, site.sight, "reception")
 
     def busy_ratio(self) -> float:
-        """Channel busy ratio, of which a table of receptions says nothing."""
+        """Return NaN, since a table of receptions has no channel busy ratio."""
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Heard when the longest latency is over; how much of it is time on air is not known."""
+        """Helpers have a request after the longest latency; its time on air is not known."""
         return Broadcast(max(self._latency_s(p) for p in self.receptions.points), math.nan)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
@@ -104,7 +104,7 @@ class Trace:
         return self.latency_s if point.latency_s is None else point.latency_s
 
     def _at(self, distance_m: Floats, sight: Ints | int, what: Literal["reception", "latency_s"]) -> Floats:
-        """A column of the table at these distances, under what stands between."""
+        """Interpolate a column of the table at these distances, for what stands between."""
         found = np.full(np.broadcast_shapes(np.shape(distance_m), np.shape(sight)), np.nan)
         for name, number in SIGHTS.items():
             rows = [p for p in self.receptions.points if p.sight in (None, name)]
@@ -116,7 +116,7 @@ class Trace:
 
 
 def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
-    """The channel of a profile that names a `file` beside it. Raises UserError."""
+    """Build the channel of a profile that names a `file` beside it. Raises UserError if it is wrong."""
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
     path = folder / parameters["file"]
@@ -127,7 +127,7 @@ def of_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace
 
 
 def read(path: Path) -> tuple[Point, ...]:
-    """The rows of a table, by sight and distance. Raises UserError: file, line, value and what is allowed."""
+    """Read the rows of a table, sorted by sight and distance. Raises UserError if the table is wrong."""
     shown = printable(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

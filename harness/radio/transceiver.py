@@ -1,4 +1,4 @@
-"""What the radios beside background traffic have in common: a power budget, and a message's way over it."""
+"""The base of radio models with background traffic: a power budget, and requests and replies over it."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, Site
 from harness.radio.propagation import Propagation
 
 STEP_M, STEP_DB = 10.0, 0.5
-"""Between the rows and the columns of a model's tables: distance and power received."""
+"""Steps of a model's tables: of distance between rows, and of received power between columns."""
 
 
 @dataclass(frozen=True)
 class Transceiver(Propagation):
-    """Everybody's radio, and the background that sends packets of one size at one rate.
+    """The radio of all vehicles, and background traffic with packets of one size at one rate.
 
     Attributes:
-        density_per_km: background vehicles on one kilometre of road, all lanes and both ways together.
-        rate_hz: packets a second of each of them.
-        power_dbm: transmit power of everyone.
+        density_per_km: background vehicles on one kilometre of road, all lanes and both directions together.
+        rate_hz: packets that each of them sends a second.
+        power_dbm: transmit power of every vehicle.
         gain_dbi: gain of each antenna.
-        noise_figure_db: of the receivers.
-        sensing_dbm: least power at which a packet is received or sensed; of the whole packet.
+        noise_figure_db: noise figure of the receivers.
+        sensing_dbm: least power of a whole packet at which it is received or sensed.
     """
 
     density_per_km: float = 100.0
@@ -37,64 +37,64 @@ class Transceiver(Propagation):
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Seconds from the wish to send until it begins: the quantiles at these draws."""
+        """Return the seconds from the wish to send until sending begins: the quantiles at these draws."""
 
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
-        """How long a message of so many bits is on air."""
+        """Return how long a message of so many bits is on air."""
 
     @abstractmethod
     def busy_ratio(self) -> float:
-        """Channel busy ratio under the background load."""
+        """Return the channel busy ratio under the background load."""
 
     @abstractmethod
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Share of the background's packets received at these distances, `(n,)`: `channel.Physical`."""
+        """Return the share of background packets received at distances, `(n,)`: see `channel.Physical`."""
 
     @property
     @abstractmethod
     def packet_bits(self) -> int:
-        """Size of the background's packets."""
+        """Size of a background packet."""
 
     @abstractmethod
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Any:
-        """What becomes of messages that are received with these powers, whatever their size."""
+        """Return the part of the losses at these received powers that does not depend on message size."""
 
     @abstractmethod
     def _lost(self, fate: Any, bits: Floats | float) -> Floats:
-        """Probability that a message of so many bits is lost, of its fate."""
+        """Return the probability that a message of so many bits is lost, given the result of `_fate`."""
 
     @abstractmethod
     def _turns(
         self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
     ) -> tuple[Bools, Floats]:
-        """What replies do to each other, all `(..., H)`: whom none destroys, and when each has ended.
+        """Resolve how replies affect each other: which survive, and when each has ended, all `(..., H)`.
 
         Args:
-            links: who was asked.
-            begins_s: when each would begin.
+            links: the links, with the helpers that were asked.
+            begins_s: when each reply would begin.
             airtime_s: how long it is on air.
             uniforms: the draws that chose when it begins.
-            replied: who has the request.
+            replied: which helpers have received the request.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Probability that a message of so many bits is lost on each link, `(..., H)`, given its shadowing.
+        """Return the probability that a message is lost on each link, `(..., H)`, given its shadowing.
 
         Args:
-            site: where the links are; links to helpers that are not there have any loss.
+            site: positions of the links; links to absent helpers have any loss.
             shadow: standard normal, `(..., H)`.
-            bits: `(..., H)` or one number.
+            bits: size of the message, `(..., H)` or one number.
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """All helpers have it when it has waited for its turn and been on air."""
+        """All helpers have the request after it has waited for its turn and been on air."""
         airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Each reply waits for a turn of its own."""
+        """Each reply waits for its own turn."""
         fate = self._fate_at(links.where, draws.shadow(links.where.xy_m, self.decorrelation_m))
         request_loss, loss = (self._lost(fate, bits) for bits in (links.request_bits, links.payload_bits))
         airtime_s = self.message_s(links.payload_bits)
@@ -104,7 +104,7 @@ class Transceiver(Propagation):
         return Delivery(replied & (draws.packet[..., 1] >= loss) & clear, end_s, loss, airtime_s)
 
     def received_dbm(self, path_loss_db: Floats) -> Floats:
-        """Power received over such a loss."""
+        """Return the received power for a path loss."""
         return self.power_dbm + 2 * self.gain_dbi - path_loss_db
 
     def _fate_at(self, site: Site, shadow: Floats) -> Any:
@@ -112,7 +112,7 @@ class Transceiver(Propagation):
         return self._fate(site.distance_m, mean_dbm + self.shadowing_db(*site.between) * shadow)
 
     def _read(self, table: Floats, distance_m: Floats, power_dbm: Floats, first_db: float) -> Floats:
-        """A table `(D, P)` at these places; its first column is of `first_db` above the sensing threshold."""
+        """Interpolate a table `(D, P)` whose first column is `first_db` above the sensing threshold."""
         at = np.broadcast_arrays(distance_m / STEP_M, (power_dbm - self.sensing_dbm - first_db) / STEP_DB)
-        # A helper that is not there has no place, and the table must be read somewhere.
+        # An absent helper has NaN coordinates, but the table must be read somewhere.
         return map_coordinates(table, np.nan_to_num(at), order=1, mode="nearest")

@@ -1,4 +1,4 @@
-"""Channels round another one, with something about it changed."""
+"""Channels that wrap another one and change part of its behaviour."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Ph
 
 @dataclass(frozen=True)
 class Wrapped:
-    """A physical channel that does what another one does.
+    """A physical channel that forwards everything to another one.
 
     Attributes:
-        channel: the other one.
+        channel: the wrapped channel.
     """
 
     channel: Physical
@@ -45,30 +45,30 @@ class Wrapped:
 
 
 def innermost(channel: Channel) -> Channel:
-    """The channel itself, without what is round it."""
+    """Return the innermost channel, without wrappers."""
     return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
 
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """A physical channel, every crossing of which is lost with one probability, wherever its ends are.
+    """A physical channel that loses every crossing with one probability, wherever its ends are.
 
     Attributes:
-        probability: that one crossing is lost.
+        probability: probability that one crossing is lost.
     """
 
     probability: float
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """When replies arrive is the channel's; they do nothing to each other besides."""
+        """Replies arrive when the channel says, but do not affect each other otherwise."""
         _, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
         up = np.all(draws.packet >= self.probability, axis=-1)
         return Delivery(up, delay_s, np.full_like(loss, self.probability), airtime_s)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """The same at any distance, behind anything."""
+        """Return the same share at any distance, whatever stands between."""
         return np.full(np.shape(distance_m), 1 - self.probability)
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """The same on every link."""
+        """Return the same probability for every link."""
         return np.full(site.sight.shape, self.probability)

@@ -1,7 +1,8 @@
-"""Light and weather, and what they take from a camera. Other sensors are as by day.
+"""Light and weather, and how they limit a camera. Other sensors are as by day.
 
-Contrast falls with distance as exp(-d / `fades_m`) (Koschmieder 1924); what meteorologists call visibility,
-where 5 % are left, is three times that. The figures are declared for this harness.
+Contrast falls with distance as exp(-d / `fades_m`) (Koschmieder 1924). Meteorological visibility, the
+distance at which 5 % of the contrast are left, is three times `fades_m`. The figures are declared for this
+harness.
 """
 
 from dataclasses import dataclass
@@ -17,12 +18,12 @@ class Ambient:
     """One kind of light and weather.
 
     Attributes:
-        camera_m: how far a camera tells class, indicator and brake lamps.
+        camera_m: distance up to which a camera tells class, indicator and brake lamps.
         fades_m: distance over which contrast falls to 1/e.
-        light: how bright what is lit by the sky is, 1 by day. Lamps are as bright as ever.
-        haze: what everything fades to.
-        sky: overhead.
-        glare_rad: how near to a low sun a camera tells nothing; 0 where none shines into it.
+        light: brightness of what the sky lights, 1 by day; lamps keep their brightness.
+        haze: colour to which everything fades.
+        sky: colour overhead.
+        glare_rad: angle around a low sun within which a camera tells nothing; 0 without a low sun.
     """
 
     camera_m: float
@@ -44,5 +45,5 @@ AMBIENTS = {
 
 
 def sun_rad(episode_seed: int) -> float:
-    """Where a low sun stands in an episode, as a bearing; drawn of nothing but the seed."""
+    """Return the bearing of a low sun in an episode; it depends on the seed only."""
     return float(noise.uniforms((1,), "sun", episode_seed)[0]) * radians(360.0)

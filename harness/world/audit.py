@@ -1,9 +1,9 @@
-"""Whether a scenario gives its hidden danger away: what the ego sees must not tell what it cannot see.
+"""Audit whether a scenario gives its hidden danger away: what the ego sees must not tell what it cannot see.
 
 A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of sight,
-whether there is one and where it comes from. A layout is never on both sides of the cross-validation, and
-only moments of one step are compared, since fewer dangers are still hidden the later it is, and only answers
-of one fold's model. Where it does better than chance, so can any model: then being alone is not being blind.
+whether there is a danger and where it comes from. A layout is never on both sides of the cross-validation.
+Only moments of one step are compared, since fewer dangers are still hidden at later steps, and only answers
+of one fold's model. If the classifier does better than chance, any model can: then an ego alone is not blind.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -24,8 +24,8 @@ from harness.world.road import Road
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
-MOST_AUC = 0.60  # above it, a scenario tells
-LEAST_AUC_LOST = 0.01  # by shuffling a number, for it to be named
+MOST_AUC = 0.60  # above it, a scenario gives its danger away
+LEAST_AUC_LOST = 0.01  # a number is named if shuffling it costs at least this much AUC
 FOLDS = 5
 RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
@@ -39,14 +39,14 @@ class Audit:
     """How well a danger that is out of sight can be told from what is in sight.
 
     Attributes:
-        scenario: its name.
-        layouts: how many.
-        seed: layout seed of the first.
+        scenario: name of the scenario.
+        layouts: number of layouts.
+        seed: layout seed of the first one.
         steps: decision points that were compared: those at which at least half of the dangers are hidden.
-            Later, an empty road is an observation and no tell.
-        auc: of each question, the probability that a layout with it ranks above one without: `danger`, and
-            the sectors it can come from. Intervals are a bootstrap over layouts, for these models.
-        told_by: the numbers that gave it away and the AUC that is lost without each; none unless it tells.
+            Later, an empty road is an observation and gives nothing away.
+        auc: for each question (`danger`, and each sector that it can come from) the probability that a layout
+            with it ranks above one without. Intervals are a bootstrap over layouts, for these models.
+        told_by: the numbers that gave it away, with the AUC lost without each; empty unless it `tells`.
     """
 
     scenario: str
@@ -58,12 +58,12 @@ class Audit:
 
     @property
     def worst(self) -> str:
-        """The question that is answered best."""
+        """The question with the highest AUC."""
         return max(self.auc, key=lambda question: self.auc[question].value)
 
     @property
     def tells(self) -> bool:
-        """Whether some question is answered too well."""
+        """Whether the scenario gives its danger away."""
         return self.auc[self.worst].value > MOST_AUC
 
 
@@ -72,11 +72,11 @@ class Moments:
     """Moments of some layouts at which the danger is out of sight.
 
     Attributes:
-        layout: (m,) of which layout each is.
-        step: (m,) at which decision.
-        danger: (m,) the sector its danger comes from; `NONE` where there is none.
-        names: what each number is.
-        numbers: (m, k), NaN where the ego knows none.
+        layout: index of each moment's layout, (m,).
+        step: index of its decision, (m,).
+        danger: sector that its danger comes from, (m,); `NONE` without a danger.
+        names: name of each number.
+        numbers: numbers of the scene graphs, (m, k); NaN if the ego does not know one.
     """
 
     layout: Ints
@@ -102,9 +102,9 @@ def audit(
 
 
 def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[str, float]]]]:
-    """The sector of a layout's danger, and the ego's numbers at every step until it is in sight.
+    """Return the sector of a layout's danger, and the ego's numbers at every step until it is in sight.
 
-    So it is where somebody who brakes for it is in sight; and who brakes for something else counts alike.
+    A braking vehicle counts as the danger in sight, since it may brake for the danger.
     """
     start = World.start(scenario, seed)
     going: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
@@ -129,7 +129,7 @@ def _hidden(scenario: Scenario, seed: int) -> tuple[str, list[tuple[int, dict[st
 
 
 def numbers(graph: Mapping[str, Any], road: Road) -> Iterator[tuple[str, float]]:
-    """A scene graph as numbers with names, the same names for every graph of a road."""
+    """Yield a scene graph's numbers with names, the same names for every graph of a road."""
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
         yield f"ego {name}", graph["ego"][name]
     for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
@@ -234,7 +234,7 @@ def judge(moments: Moments, sectors: tuple[str, ...]) -> tuple[dict[str, Estimat
 
 
 def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
-    """A column whose values have changed places within their step."""
+    """Shuffle the values of a column within each step."""
     shuffled, draws = column.copy(), noise.generator("audit", name)
     for k in np.unique(step):
         at = np.flatnonzero(step == k)
@@ -244,11 +244,12 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Pairs of a layout with what is asked for and one without, over their moments that compare.
+    """Comparisons between layouts with the danger in question and layouts without.
 
     Attributes:
-        above: (with, without) pairs of moments in which the one with it is ranked higher; a tie is half.
-        pairs: (with, without) all pairs of moments.
+        above: number of pairs of moments in which the layout with it ranks higher, (with, without); a tie
+            counts half.
+        pairs: number of all compared pairs of moments, (with, without).
     """
 
     above: Floats
@@ -256,9 +257,9 @@ class Ranks:
 
     @classmethod
     def of(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
-        """Ranks by the score of moments (m,), of layouts where it is there (m,) and where it is not.
+        """Compare the scores of moments (m,) of layouts with the danger (`there`, (m,)) and without.
 
-        Only moments whose `alike` (m,) is the same are compared.
+        Only moments with the same value of `alike` (m,) are compared.
         """
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
@@ -272,17 +273,17 @@ class Ranks:
 
     @property
     def auc(self) -> float:
-        """Share of pairs in which the one with it is ranked higher."""
+        """Share of pairs in which the layout with the danger ranks higher."""
         return float(self.above.sum() / self.pairs.sum())
 
     def estimate(self) -> Estimate:
-        """The AUC with a 95 % interval: percentiles of a bootstrap over layouts, n of them."""
+        """Return the AUC with a 95 % interval: percentiles of a bootstrap over the n layouts."""
         have, have_not = self.pairs.shape
         draws = noise.generator("audit", "bootstrap")
         one = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)
         other = draws.multinomial(have_not, np.full(have_not, 1 / have_not), RESAMPLES)
         above, pairs = (((one @ of) * other).sum(axis=1) for of in (self.above, self.pairs))
         low, high = np.quantile((above / pairs)[pairs > 0], [0.025, 0.975])
-        if low == high:  # all or nothing: layouts that are drawn again cannot differ
+        if low == high:  # AUC of 0 or 1: resampled layouts cannot differ
             low, high = wilson(self.auc, min(have, have_not))
         return Estimate(self.auc, float(low), float(high), have + have_not, 0)

@@ -1,8 +1,8 @@
-"""Beacons: what vehicles know of each other before anybody asks.
+"""Beacons: how vehicles know of each other before anybody asks.
 
-The ego and the helpers broadcast where they are, as with a CAM or a BSM; nobody else has a radio. A receiver
-knows a sender from the last beacon that got through, and takes it to have driven on from there at constant
-speed along its heading, as receivers do. The dials are the scenario's (`Parameters`):
+The ego and the helpers broadcast their position, as with a CAM or a BSM; nobody else has a radio. A receiver
+knows a sender from the last beacon that it received, and extrapolates from there at constant speed along the
+heading, as real receivers do. The settings are the scenario's (`Parameters`):
 
     rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second, finds the
               vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last CAM says; or that
@@ -18,9 +18,9 @@ speed along its heading, as receivers do. The dials are the scenario's (`Paramet
               so all receivers read the same, rounded to 1 cm, 1 cm/s and 1 mrad.
     content   pose and speed, and the ego's target speed, which no CAM has: that is assumed.
 
-Until its start an episode's vehicles have driven at constant speed, and the first beacon, up to LEAD_S
-before the start, gets through to everybody. Draws are keyed by layout seed, sender, receiver and number of
-the beacon, so no condition, no seed of the channel and no order of asking changes what anybody knows.
+Before the start of an episode, its vehicles have driven at constant speed, and the first beacon, up to LEAD_S
+before the start, is received by everybody. Draws are keyed by layout seed, sender, receiver and number of the
+beacon, so no condition, no seed of the channel and no order of asking changes what anybody knows.
 """
 
 import math
@@ -42,12 +42,12 @@ LEAD_S = 1.0
 BITS = 8 * 190
 SHORTEST_S, LONGEST_S, UNMOVED = 0.1, 1.0, 3  # T_GenCam_DCC, T_GenCamMax and N_GenCam of EN 302 637-2
 TURN_RAD, MOVE_M, CHANGE_MPS = math.radians(4), 4.0, 0.5
-NO_SEED = -1  # of a run's channel: beacons are the layout's
+NO_SEED = -1  # in place of the channel's seed, since beacons belong to the layout
 ROUNDING_S = 1e-9
 
 
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
-    """The newest beacon of the sender that the receiver has; None where it knows the truth instead."""
+    """Return the newest beacon of the sender that the receiver has; None if it knows the truth instead."""
     heard = [
         b
         for b in state.beacons
@@ -57,7 +57,7 @@ def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
 
 
 def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
-    """Where the receiver takes the sender to be now: the truth of itself, and under perfect knowledge."""
+    """Return the sender's state as the receiver estimates it; the truth for itself or perfect knowledge."""
     vehicle, beacon = state.vehicle(sender), last_heard(state, sender, receiver)
     if beacon is None:
         return vehicle
@@ -72,7 +72,7 @@ def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
 
 
 def lead_in(p: Parameters, poses: Floats) -> Floats:
-    """Poses (F, V, 4) from the first beacon to the start, where they are (V, 4), at constant speed."""
+    """Extrapolate the poses at the start, (V, 4), back to the first beacon at constant speed, (F, V, 4)."""
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz
     course = [x + speed * np.cos(heading) * time_s, y + speed * np.sin(heading) * time_s]
@@ -83,14 +83,14 @@ def broadcast(
     p: Parameters, seed: int, before: Sequence[Beacon], radios: Sequence[str], target_mps: float,
     poses: Floats, first_frame: int, loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:  # fmt: skip
-    """The beacons that matter after some more frames: the last ones heard, and those under way.
+    """Return the beacons that matter after some more frames: the last ones received, and those under way.
 
     Args:
-        p: the dials.
-        seed: of the layout.
+        p: the scenario's parameters.
+        seed: the layout's seed.
         before: the beacons that mattered before these frames.
-        radios: ids of who broadcasts, the ego first, then the helpers, whom it hears and who hear it.
-        target_mps: what the ego's speed controller aims at.
+        radios: ids of the senders, the ego first, then the helpers; the ego and a helper hear each other.
+        target_mps: target of the ego's speed controller.
         poses: x, y, heading and speed of each in each frame, (F, V, 4).
         first_frame: number of the first of these frames; 0 is the start.
         loss: probability that a beacon of one of these frames, counted from 0, is lost on the link to each
@@ -114,7 +114,7 @@ def broadcast(
 
 
 def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: float) -> list[Beacon]:
-    """Of one sender's beacons those under way, the last that each receiver has, and under `cam` the last."""
+    """Keep a sender's beacons under way, the last that each receiver has, and under `cam` the last sent."""
     kept = list[Beacon]()
     for beacon in newest_first:
         if not receivers:
@@ -130,9 +130,9 @@ def _sent(
     p: Parameters, seed: int, sender: str, receivers: tuple[str, ...], target_mps: float | None,
     poses: Floats, first_frame: int, before: Sequence[Beacon], loss: Callable[[int], Floats], links: slice,
 ) -> Iterator[Beacon]:  # fmt: skip
-    """What one vehicle, whose poses these are, (F, 4), broadcasts in these frames, the last first.
+    """Yield the beacons of one vehicle with poses (F, 4) in these frames, the last first.
 
-    `links` are those of `loss` to its receivers.
+    `links` selects the values of `loss` for its receivers.
     """
     phase, errors, uniforms = _draws(p, seed, sender, receivers)
     every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
@@ -146,7 +146,7 @@ def _sent(
         )  # fmt: skip
 
     def hear(number: int, frame: int) -> tuple[str, ...]:
-        """To whom it gets through."""
+        """Return the receivers that receive it."""
         if not number:
             return receivers
         crosses = uniforms[:, number] >= loss(frame - first_frame)[links]
@@ -171,7 +171,7 @@ def _sent(
 
 
 def _cam(said: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
-    """What is said, if a CAM is due by the last one (EN 302 637-2, 6.1.3) and the vehicle's true pose."""
+    """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2, 6.1.3)."""
     if last is None or last.interval_s is None:
         return replace(said, interval_s=LONGEST_S)
     age_s = said.time_s - last.time_s + ROUNDING_S
@@ -201,11 +201,11 @@ def _lead_frames(p: Parameters) -> int:
 def losses(
     p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
 ) -> Callable[[int], Floats]:
-    """Probability that a beacon is lost on the link to each helper, `(H,)`, by frame.
+    """Return a function that gives, for a frame, each helper's probability to lose a beacon, `(H,)`.
 
     Args:
-        p: the dials.
-        world: who is there.
+        p: the scenario's parameters.
+        world: returns the state of the world.
         radios: ids of the ego and of the helpers.
         poses: x, y, heading and speed of all in each frame, (F, V, 4).
     """
@@ -228,7 +228,7 @@ def losses(
 
 @lru_cache(maxsize=1024)
 def _draws(p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]) -> tuple[float, Floats, Floats]:
-    """When a sender begins, as a share of its period; its errors, (n, 4); each receiver's draws, (R, n)."""
+    """Draw a sender's phase as a share of its period, its errors, (n, 4), and draws for receivers, (R, n)."""
     n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
     own = noise.generator("beacons", seed, sender)
     phase = float(own.random())

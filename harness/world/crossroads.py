@@ -30,7 +30,7 @@ PRIORITY = {"left": {"straight": 3, "left": 2}, "right": {"straight": 3, "left":
 
 @cache
 def road() -> Road:
-    """The intersection. Its conflict zone is the centroid of the conflict points of three dangers."""
+    """Return the intersection. Its conflict zone is the centroid of the conflict points of three dangers."""
     ways, ego = paths(), ("own", "straight")
     # A path that merges into the ego's lane brings no danger here.
     meetings = {key: at for key, at in crossings(ways, ego).items() if at.kind == "crossing"}
@@ -55,7 +55,7 @@ def road() -> Road:
 
 @cache
 def paths() -> dict[PathKey, Path]:
-    """Every path, by (approach, route)."""
+    """Return every path by (approach, route)."""
     built = {}
     for corner, approach in enumerate(APPROACHES):
         turn = np.pi / 2 * corner
@@ -79,7 +79,7 @@ def paths() -> dict[PathKey, Path]:
 
 
 def _southern(route: str) -> Floats:
-    """Points of a path that starts on the south arm."""
+    """Return the points of a path that starts on the south arm."""
     half, end = LANE_WIDTH_M / 2, JUNCTION_M + ARM_M
     count = int(ARM_M / STEP_M)
     approach = np.column_stack([np.full(count, half), np.linspace(end, JUNCTION_M, count, endpoint=False)])
@@ -96,14 +96,14 @@ def _southern(route: str) -> Floats:
 
 
 def _approach(path: Path) -> Floats:
-    """(15, 2) m, points of an approach lane that are looked at."""
+    """Return the watched points of an approach lane, (15, 2) m."""
     back_m = np.linspace(*SECTOR_REACH_M, 15)
     return np.array([path.at(path.ends_m[0] + JUNCTION_M - back)[:2] for back in back_m])
 
 
 @cache
 def network() -> Any:
-    """highway-env's own road network."""
+    """Return highway-env's own road network."""
     from highway_env.envs.intersection_env import IntersectionEnv
 
     env = IntersectionEnv.__new__(IntersectionEnv)
@@ -113,7 +113,7 @@ def network() -> Any:
 
 
 def ground(far_m: float) -> Ground:
-    """Its two roads up to `far_m`, with the centre line and the stop line of each arm."""
+    """Return the ground: both roads up to `far_m`, with the centre line and the stop line of each arm."""
     half = LANE_WIDTH_M
     # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
     angle = np.linspace(np.pi, 1.5 * np.pi, 9)

@@ -1,6 +1,6 @@
-"""Reference drivers: baselines for every model, which need none.
+"""Reference drivers: rule-based baselines to compare models with.
 
-`cruise` keeps going, `brake` always brakes, `local-view` plans with what the ego's sensors know and
+`cruise` keeps its speed, `brake` always brakes, `local-view` plans with what the ego's sensors know and
 `full-view` plans with everything in view.
 """
 
@@ -17,7 +17,7 @@ Graph = Mapping[str, Any]
 
 
 def choose(scenario: Scenario, driver: str, graph: Graph, truth: Graph | None) -> str:
-    """The driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
+    """Return a driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
     if driver == "cruise":
         return "IDLE"
     if driver == "brake":

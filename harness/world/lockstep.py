@@ -1,12 +1,12 @@
-"""Worlds of one scenario, simulated together: a frame of all of them is one pass over arrays.
+"""Simulate many worlds of one scenario together: a frame of all of them is one pass over arrays.
 
 The arithmetic is that of `simulator` and of highway-env, operation by operation, so worlds end up the same to
-the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. What
-seldom happens, two vehicles that touch and the end of an episode, is highway-env's and `World`'s own. A test
-drives both side by side.
+the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. Rare
+events (two vehicles touch, an episode ends) are left to highway-env and to `World`. A test drives both side
+by side.
 
-Arrays are (B, V): worlds, and the vehicles of each by their number, the ego first. Where a world has fewer,
-the rest stand in lanes of their own and are in nobody's way.
+Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer vehicles,
+the other columns stand for vehicles in lanes of their own, which affect nobody.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,13 +26,13 @@ from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M,
 from harness.world.state import separation_m
 from harness.world.world import World, least_gaps_m
 
-ALONE = 2  # so many worlds are as fast one by one
-SLOW_MPS = 1e-2  # where one divides by a slower speed, it is taken to be this: highway-env's `not_zero`
-AT_ONCE = 128  # more do not fit into the processor's cache
+ALONE = 2  # up to this many worlds are as fast one by one
+SLOW_MPS = 1e-2  # least speed to divide by, as in highway-env's `not_zero`
+AT_ONCE = 128  # more worlds do not fit into the processor's cache
 
 
 def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
-    """Simulate each of some worlds of one scenario as its own `advance` would."""
+    """Simulate some worlds of one scenario, each until its frame, exactly as `World.advance` would."""
     going = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
@@ -44,7 +44,7 @@ def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
         for world, until in going:
             world.advance(until)
         return
-    # Those that end together are simulated together, so that arrays stay full.
+    # Worlds with similar numbers of frames are simulated together, so that arrays stay full.
     going.sort(key=lambda pair: pair[1] - pair[0].frame)
     bounds = [*range(0, len(going), AT_ONCE), len(going)]
     for begin, end in pairwise(bounds):
@@ -87,21 +87,21 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
 
 @dataclass(frozen=True)
 class _Lanes:
-    """A network's lanes by number: straight ones, and arcs.
+    """The lanes of a network as arrays; each is a straight lane or an arc.
 
     Attributes:
-        number: of each.
-        names: of each number.
-        base: where it begins, or its centre, (L, 2).
-        along: direction of a straight one, (L, 2).
-        across: to its right, (L, 2).
-        heading: of a straight one.
+        number: number of each lane.
+        names: lane of each number.
+        base: beginning of a straight lane, or centre of an arc, (L, 2).
+        along: direction of a straight lane, (L, 2).
+        across: direction to its right, (L, 2).
+        heading: heading of a straight lane.
         length: m.
         width: m.
-        arc: whether it is an arc.
-        radius: of an arc.
-        phase: of an arc's beginning, rad.
-        sign: 1 where an arc turns clockwise as the picture shows it, else -1.
+        arc: whether the lane is an arc.
+        radius: radius of an arc.
+        phase: phase of an arc's beginning, rad.
+        sign: 1 if an arc turns clockwise as pictures show it, else -1.
     """
 
     number: dict[Lane, int]
@@ -118,7 +118,7 @@ class _Lanes:
     sign: Floats
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """`local_coordinates`: along and to the right of lanes (...), m."""
+        """Return the positions along and to the right of lanes (...), m, like `local_coordinates`."""
         away = xy - self.base[lane]
         along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
         arcs = self.arc[lane]
@@ -131,7 +131,7 @@ class _Lanes:
         return along, lateral
 
     def heading_at(self, along: Floats, lane: Ints) -> Floats:
-        """Direction of lanes (...) at places along them, rad."""
+        """Return the heading of lanes (...) at positions along them, rad."""
         heading = self.heading[lane]
         arcs = self.arc[lane]
         if arcs.any():
@@ -143,7 +143,7 @@ class _Lanes:
 
 @lru_cache(maxsize=64)
 def _lanes(road: Callable[[], Road]) -> _Lanes | None:
-    """The lanes of a road; None where there are others than straight ones and arcs."""
+    """Return the lanes of a road; None if some are neither straight nor arcs."""
     graph = road().network().graph
     of = {
         (a, b, n): lane
@@ -188,7 +188,7 @@ class _Fleet:
         self.there = np.zeros(shape, dtype=bool)
         self.approach = np.full(shape, "", dtype="U32")
         self.lane = np.zeros(shape, dtype=int)
-        self.lane_now = np.tile(-1 - np.arange(most), (len(worlds), 1))  # nobody else's
+        self.lane_now = np.tile(-1 - np.arange(most), (len(worlds), 1))  # lanes of no other vehicle
         self.xy, self.impact = np.zeros((*shape, 2)), np.zeros((*shape, 2))
         self.pushed, self.crashed, self.stood, self.braking = (np.zeros(shape, bool) for _ in range(4))
         self.heading, self.speed, self.target = (np.zeros(shape) for _ in range(3))
@@ -222,14 +222,14 @@ class _Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Go on with some of the worlds."""
+        """Keep only some of the worlds."""
         self.worlds = [world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept]
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != "ways":
                 setattr(self, name, value[rows])
 
     def write(self, row: int, world: World) -> set[str]:
-        """Put a world where its row is; returns the ids of who had crashed before the last frame."""
+        """Write a row back to its world; return the ids of vehicles that had crashed before this frame."""
         world.frame = int(self.frame[row])
         names = self.lanes.names
         for n, v in enumerate(world.vehicles):
@@ -248,7 +248,7 @@ class _Fleet:
         return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
 
     def step(self) -> Bools:
-        """Simulate a frame; returns in which worlds something happened that `World.judge` is to see, (B,)."""
+        """Simulate a frame; return in which worlds something happened that `World.judge` must see, (B,)."""
         self.stood = self.crashed.copy()
         self._act()
         self._move()
@@ -268,7 +268,7 @@ class _Fleet:
         return np.asarray(~on_road | cleared | crashes | self.crashed[:, 0] | (self.frame >= self.last_frame))
 
     def _act(self) -> None:
-        """`_OnRoute.act`: steer, and keep the target speed."""
+        """Do what `_OnRoute.act` does: steer, and keep the target speed."""
         lanes = self.lanes
         along, lateral = lanes.coordinates(self.xy, self.lane)
         ends = along > lanes.length[self.lane] - AbstractLane.VEHICLE_LENGTH / 2
@@ -296,7 +296,7 @@ class _Fleet:
         return np.clip(steering, -self.most_steering, self.most_steering)
 
     def _acceleration(self) -> Floats:
-        """`speed_control` of the traffic, and of the ego."""
+        """Return the acceleration by `speed_control` of the traffic and of the ego."""
         found = np.zeros_like(self.speed)
         faster = (self.lane_now[:, :, None] == self.lane_now[:, None]) & (
             self.speed[:, :, None] > self.speed[:, None]
@@ -319,7 +319,7 @@ class _Fleet:
         return found
 
     def _move(self) -> None:
-        """`Vehicle.step`."""
+        """Do what `Vehicle.step` does."""
         steering, acceleration = self.steering, self.acceleration
         if self.crashed.any():
             steering = np.where(self.crashed, 0.0, steering)
@@ -348,7 +348,7 @@ class _Fleet:
             self.lane_now[:, 0] = self.ways[np.abs(off_m).argmin(axis=1)]
 
     def _collide(self) -> None:
-        """`_Road.step`: who is near enough to touch within the frame is looked at by highway-env."""
+        """Do what `_Road.step` does: highway-env checks the pairs that may touch within the frame."""
         x, y = self.xy[..., 0], self.xy[..., 1]
         dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
         within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M

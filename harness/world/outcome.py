@@ -1,4 +1,4 @@
-"""How an episode ends, and who was to blame for a collision."""
+"""The outcome of an episode, and who was at fault in a collision."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,11 +26,11 @@ class Outcome:
             intersection), `late` (cleared it too long after the full-view driver) or `off_road`;
             `running` while undecided.
         time_s: when it was decided; None while running.
-        partner: id of the vehicle the ego collided with.
-        striker: whose front hit: `ego`, `other`, `both` or `neither` (a side swipe).
-        fault: who should have given way by right of way, or drove into the other's back: `ego` or `other`.
+        partner: id of the vehicle that the ego collided with.
+        striker: whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe).
+        fault: who should have given way, or drove into the other's back: `ego` or `other`.
         least_gap_m: smallest distance so far between the ego's outline and any other vehicle's.
-        other_crashes: vehicles that crashed without the ego.
+        other_crashes: number of vehicles that crashed without the ego.
     """
 
     result: Result = "running"
@@ -48,29 +48,29 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """Cleared the intersection without a collision and without a forced failure."""
+        """Whether the ego cleared the intersection without a collision and without a forced failure."""
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", parameters: Parameters) -> "Outcome":
-        """The same outcome, `late` where the ego cleared too long after the full-view `reference`."""
+        """Return this outcome, as `late` if the ego cleared too long after the full-view `reference`."""
         if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
             return self
         late = self.time_s - reference.time_s > parameters.delay_allowance_s + ROUNDING_S
         return replace(self, result="late") if late else self
 
     def ending(self, result: Result, time_s: float, **how: str) -> "Outcome":
-        """The same episode, decided."""
+        """Return the outcome with the episode decided."""
         gap = 0.0 if result == "collision" else self.least_gap_m
         return replace(self, result=result, time_s=time_s, least_gap_m=gap, **how)  # type: ignore[arg-type]
 
 
 def outline(v: VehicleState) -> Polygon:
-    """A vehicle's rectangle as a shapely polygon, metres."""
+    """Return a vehicle's outline as a shapely polygon, in metres."""
     return Polygon(v.corners())
 
 
 def striker(ego: VehicleState, other: VehicleState) -> str:
-    """Whose front bumper was at the point of contact."""
+    """Return whose front bumper was at the point of contact."""
     contact = nearest_points(outline(ego), outline(other))[0]
     overlap = outline(ego).intersection(outline(other))
     if not overlap.is_empty:
@@ -85,7 +85,7 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
 
 
 def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path]) -> str:
-    """Who should have given way: the one behind in a rear-end collision, else the one with less priority."""
+    """Return who is at fault: the one behind in a rear-end collision, or else the one with less priority."""
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
         ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)

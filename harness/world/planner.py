@@ -1,9 +1,9 @@
-"""The reference planner behind `local-view` and `full-view`: looks ahead along the ego's ways.
+"""The reference planner of `local-view` and `full-view`, which looks ahead along the ego's ways.
 
-It knows what a scene graph says, and nothing else. It plays every sequence of meta-actions over the next
-decisions, then FASTER, against the conflicts of the graph at constant speed, and takes the first action of
-the sequence that passes the conflict zone soonest without meeting anyone. Who is seen to brake is taken to
-brake until it stands. It does not guess at what it cannot see, which is what makes occlusion cost something.
+It knows only the scene graph. It plays every sequence of meta-actions over the next decisions, then FASTER,
+against the conflicts of the graph at constant speed, and takes the first action of the sequence that passes
+the conflict zone soonest without meeting anyone. A vehicle that is seen to brake is assumed to brake until it
+stands. The planner does not guess what it cannot see, so occlusion has a cost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,31 +19,31 @@ from harness.world.road import Path, Road
 from harness.world.scenario import Parameters, Scenario
 from harness.world.state import SIZES_M
 
-SPEED = {"FASTER": 1, "SLOWER": -1}  # levels that an action changes the target speed by
-SIDE = {"LANE_LEFT": -1, "LANE_RIGHT": 1}  # ways that it changes over, to the right
-# Among equals the calmest: compared decision by decision.
+SPEED = {"FASTER": 1, "SLOWER": -1}  # levels by which an action changes the target speed
+SIDE = {"LANE_LEFT": -1, "LANE_RIGHT": 1}  # ways to the right by which an action changes lane
+# Among equal sequences the calmest is taken, compared decision by decision.
 CALM = {"IDLE": 0, "FASTER": 1, "SLOWER": 2, "LANE_RIGHT": 3, "LANE_LEFT": 4}
-HORIZON = 4  # decisions that are played through; those after it are taken to be FASTER
-LOOK_AHEAD_S = 9.0  # how far into the future a conflict is looked for
-MARGIN_M = 0.5  # added to every outline, for noise and for what the model of motion leaves out
+HORIZON = 4  # decisions that are played through; later ones are assumed to be FASTER
+LOOK_AHEAD_S = 9.0  # conflicts are looked for this far into the future
+MARGIN_M = 0.5  # added to every outline, for noise and for errors of the motion model
 RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC), and of its steering
-EMERGENCY_MPS2 = 6.0  # how hard one that is seen to brake is taken to brake
-LATERAL_MPS2 = 7.0  # what dry tyres hold in a bend
-AWAY_S = 0.5  # what it costs to end beside one's way
+EMERGENCY_MPS2 = 6.0  # assumed deceleration of a vehicle that is seen to brake
+LATERAL_MPS2 = 7.0  # lateral acceleration that dry tyres hold in a bend
+AWAY_S = 0.5  # cost of ending beside the ego's own way
 STEP_S = 0.1
-LANE_M = 4.0  # between two ways
+LANE_M = 4.0  # distance between two ways
 Point = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """Sequences of actions, played through.
+    """Sequences of actions and the motion of the ego under each.
 
     Attributes:
         actions: the sequences, (n,).
         travelled_m: distance along the ego's way, (n, steps).
         right_m: distance to the right of the way that the ego is on now, (n, steps); None if it stays.
-        ends: ways to the right of it, (n,).
+        ends: final way, counted to the right from the present one, (n,).
     """
 
     actions: Sequence[tuple[str, ...]]
@@ -53,7 +53,7 @@ class Rollouts:
 
 
 def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
-    """The planner's meta-action for a scene graph."""
+    """Return the planner's meta-action for a scene graph."""
     p, road, ego = scenario.parameters, scenario.road(), graph["ego"]
     own = _way(road, ego)
     at_m = road.zone_arc_m - ego["zone_m"]
@@ -79,24 +79,24 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
 
 
 def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
-    """Whether a sequence takes a bend faster than tyres hold, (n,)."""
+    """Whether each sequence takes a bend faster than tyres hold, (n,)."""
     speed_mps = np.diff(tried.travelled_m, axis=1, prepend=tried.travelled_m[:, :1]) / STEP_S
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)
     return np.asarray(((speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
 
 
 def _way(road: Road, ego: Mapping[str, Any]) -> tuple[str, str]:
-    """The ego's way."""
+    """Return the key of the ego's way."""
     return (road.ego[0], ego["route"]) if "route" in ego else road.ego
 
 
-# Every viewer of a scene is told the ego's speed, so they share one set of rollouts.
+# Cached, since every viewer of a scene knows the ego's speed, so they share one set of rollouts.
 @lru_cache(maxsize=64)
 def _rollouts(
     actions: tuple[str, ...], speed_mps: float, target_mps: float, left: int, sides: tuple[int, int],
     parameters: Parameters,
 ) -> Rollouts:  # fmt: skip
-    """Every sequence that is played through. Shared: not to be written to."""
+    """Play every sequence through. The result is shared and must not be written to."""
     known = [a for a in actions if a in CALM and (a not in SIDE or sides[SIDE[a] > 0])]
     sequences = list(product(known, repeat=min(HORIZON, left)))
     ends = np.cumsum([[SIDE.get(a, 0) for a in s] for s in sequences], axis=1)
@@ -109,10 +109,10 @@ def _rollouts(
 def travelled_m(
     sequences: list[tuple[str, ...]], speed_mps: float, target_mps: float, left: int, parameters: Parameters
 ) -> Floats:
-    """Distance travelled (m) by each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
+    """Return the distance travelled (m) in each sequence, shape (sequences, LOOK_AHEAD_S / STEP_S).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
-    present speed, IDLE keeps the target. `left` is how many decisions there still are.
+    present speed, and IDLE keeps the target. `left` is the number of remaining decisions.
     """
     levels = np.array(parameters.target_speeds_mps)
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
@@ -138,7 +138,7 @@ def travelled_m(
 
 
 def _right_m(ends: Ints, parameters: Parameters) -> Floats:
-    """How far to the right of its way the ego is (n, steps), ways over after each decision being (n, k)."""
+    """Return the ego's distance to the right, (n, steps), from its way after each decision, (n, k)."""
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
     right = np.empty((len(ends), steps))
     now = np.zeros(len(ends))
@@ -150,14 +150,14 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 
 @dataclass(frozen=True)
 class Motion:
-    """How another vehicle is taken to move on, and how the ego would meet it.
+    """The assumed motion of another vehicle, and the ego's way on which they may meet.
 
     Attributes:
-        way: the ego's.
-        begin_m: where on it the ego is now.
-        path: the other's.
-        arc_m: where on its path it is, (steps,).
-        size_m: length and width.
+        way: the ego's way.
+        begin_m: the ego's present position on it.
+        path: the other's path.
+        arc_m: the other's position on its path, (steps,).
+        size_m: the other's length and width.
     """
 
     way: Path
@@ -168,7 +168,7 @@ class Motion:
 
 
 def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
-    """How those whom the ego could meet move on: they keep path and speed, and their place in the queue."""
+    """Predict the vehicles that the ego could meet: they keep path and speed, and their place in a queue."""
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph["ego"])
     way = road.paths[key]
@@ -189,7 +189,7 @@ def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
             continue
         begin, lane = road.zone_arc_m - graph["ego"]["zone_m"], conflict["lane"]
         if kind == "behind" and lane == "own":
-            continue  # it keeps off the ego by itself
+            continue  # it keeps its distance by itself
         arc = begin + ego["arc_m"] - other["arc_m"] + its_m
         if kind == "oncoming":
             arc = begin + ego["arc_m"] + other["arc_m"] - its_m
@@ -203,7 +203,7 @@ def predicted(road: Road, graph: Mapping[str, Any], steps: int) -> list[Motion]:
 
 
 def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
-    """How far a vehicle gets at its speed, or braking until it stands."""
+    """Return the distance that a vehicle travels at its speed, or while it brakes until it stands."""
     if not other.get("braking"):
         return np.asarray(other["speed_mps"] * time_s)
     until_s = np.minimum(time_s, other["speed_mps"] / EMERGENCY_MPS2)
@@ -211,11 +211,11 @@ def _travelled_m(other: Mapping[str, Any], time_s: Floats) -> Floats:
 
 
 def least_gap(tried: Rollouts, motion: Motion, under_way: Bools | bool = True) -> Floats:
-    """Smallest gap (m) to another vehicle while the ego is under way, per sequence; below zero they meet."""
+    """Return the smallest gap (m) to another vehicle while the ego is under way, (n,); below 0 they meet."""
     away, reach = cover(*motion.size_m)
     (x, y), own_reach = _ego_discs(tried, motion.way, motion.begin_m)
     squared = np.full(tried.travelled_m.shape, np.inf)
-    # The nearest pair is kept as it goes: arrays of all pairs would not fit into the processor's cache.
+    # A running minimum over pairs, since arrays of all pairs would not fit into the processor's cache.
     for its_x, its_y in zip(*_discs(motion.path, motion.arc_m, away), strict=True):
         np.minimum(squared, ((x - its_x) ** 2 + (y - its_y) ** 2).min(axis=0), out=squared)
     return np.asarray(
@@ -223,22 +223,22 @@ def least_gap(tried: Rollouts, motion: Motion, under_way: Bools | bool = True) -
     )
 
 
-@lru_cache(maxsize=8)  # whom the ego may meet, it meets on few ways
+@lru_cache(maxsize=8)  # the ego meets others on few ways
 def _ego_discs(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
-    """The ego's discs along a way, (discs, n, steps), and their radius. Shared: not to be written to."""
+    """Return the ego's discs along a way, (discs, n, steps), and their radius. Shared: do not write to it."""
     own, reach = cover(*SIZES_M["car"])
     return _discs(way, begin_m + tried.travelled_m, own, tried.right_m), reach
 
 
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Discs that cover a vehicle: where they are on its long axis, and their radius."""
+    """Return discs that cover a vehicle: their positions on its long axis, and their radius."""
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count
     return places, float(np.hypot(length_m / count / 2, width_m / 2))
 
 
 def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> Point:
-    """X and y (discs, ...) of a vehicle's discs at arc lengths (...) along a path, or to the right of it."""
+    """Return x and y (discs, ...) of a vehicle's discs at arc lengths (...) of a path, or to its right."""
     heading = path.headings_rad[np.searchsorted(path.arc_m, arc_m).clip(0, len(path.arc_m) - 1)]
     x, y = (np.interp(arc_m, path.arc_m, along) for along in path.columns)
     cos, sin = np.cos(heading), np.sin(heading)

@@ -1,4 +1,4 @@
-"""Reference drivers in closed loop, from start to outcome."""
+"""Drive the reference drivers in closed loop, from start to outcome."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,18 +15,18 @@ from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.scenario import Scenario
 from harness.world.world import World
 
-TOGETHER = 16  # episodes that are driven in step
+TOGETHER = 16  # episodes that are simulated together
 
 
 def decide(driver: str, world: World) -> str:
-    """A driver's meta-action now."""
+    """Return a driver's meta-action in the present state."""
     scenario, state = world.scenario, world.state()
     seen = scene_graph(scenario, state, state.ego.id) if driver == "local-view" else {}
     return choose(scenario, driver, seen, truth_graph(scenario, state) if driver == PRIVILEGED else None)
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
-    """Let each world's driver take every decision that is left; the worlds are of one scenario."""
+    """Let each world's driver take all remaining decisions; the worlds are of one scenario."""
     going = list(zip(worlds, drivers, strict=True))
     while going := [(world, driver) for world, driver in going if not world.outcome.ended]:
         p, driven = worlds[0].scenario.parameters, [world for world, _ in going]
@@ -39,13 +39,13 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
-    """One whole episode, not yet compared with the full-view driver's time."""
+    """Drive one whole episode; the outcome is not yet compared with the full-view driver's time."""
     [outcome] = finish([World.start(scenario, seed)], [driver])
     return outcome
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
-    """Episodes by every driver; who clears one too long after the full-view driver is `late`."""
+    """Drive episodes with every driver; one that clears too long after the full-view driver is `late`."""
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     ended = iter(finish(worlds, DRIVERS * len(seeds)))
     outcomes = [{driver: next(ended) for driver in DRIVERS} for _ in seeds]
@@ -58,9 +58,9 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
 def drive_apart(
     scenario: Scenario, seeds: Sequence[int], workers: Workers, progress: Callable[[int], None]
 ) -> list[dict[str, Outcome]]:
-    """`drive_all` by any workers; `progress` is called with how many episodes are done."""
+    """Run `drive_all` on workers; `progress` is called with the number of episodes just done."""
     chunks = [seeds[at : at + TOGETHER] for at in range(0, len(seeds), TOGETHER)]
-    sizes = iter(map(len, chunks))  # all but the last are of one size, whichever is done first
+    sizes = iter(map(len, chunks))  # all but the last have one size, so the order of completion is no matter
     parts = spread(
         partial(drive_all, scenario), chunks, workers, lambda done: progress(next(sizes)),
         lambda chunk: f"layout seeds {chunk[0]} to {chunk[-1]}",
@@ -74,15 +74,15 @@ def check(
     """Drive every reference driver through the same episodes.
 
     Returns:
-        Per driver: success, collisions, late, time-outs and road departures as `Estimate`s (Wilson, n is
-        episodes), collisions by fault, and how many crashes there were between other vehicles.
+        For each driver: success, collisions, late, time-outs and road departures as `Estimate`s (Wilson, n is
+        episodes), collisions by fault, and the number of crashes between other vehicles.
     """
     outcomes = drive_apart(scenario, range(seed, seed + episodes), workers, progress)
     return {driver: summary([o[driver] for o in outcomes]) for driver in DRIVERS}
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:
-    """Rates of each way to end, and who was to blame."""
+    """Return the rate of each result, and collisions by fault."""
     share = partial(_share, outcomes)
     return {
         "success": share("cleared"),

@@ -1,4 +1,4 @@
-"""A road as paths: where vehicles can go on it, where their ways cross, and what lies around.
+"""A road as a set of paths: where vehicles can drive, where paths cross, and what surrounds them.
 
 Frame: metres, x to the east, y to the *south* (highway-env's screen frame), headings in radians from +x
 towards +y.
@@ -19,27 +19,27 @@ from shapely import LineString, intersection
 from harness.core.arrays import Floats
 
 PathKey = tuple[str, str]  # approach and route
-Lane = tuple[str, str, int]  # highway-env's name of it: two nodes, and a number from the left
-STEP_M = 0.25  # between the points of a path
-ONE_LANE_M = 1.0  # ways nearer to each other than this are in one lane
-BEND_M = 3.0  # before and behind, over which a bend is measured
+Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
+STEP_M = 0.25  # distance between the points of a path
+ONE_LANE_M = 1.0  # ways nearer to each other than this share a lane
+BEND_M = 3.0  # distance before and after a point over which its curvature is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
-NORTH = np.array([1.0, -1.0])  # from this frame to that of pictures
+NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """One way along the road, in sections: one a lane of highway-env.
+    """One path along the road, in sections, each of which is a lane of highway-env.
 
     Attributes:
         approach: where it comes from.
-        route: what it does, such as `straight`. Who is to go `left` or `right` shows it.
-        points: (n, 2) m, evenly spaced.
-        arc_m: (n,) distance along the path.
+        route: what it does, such as `straight`. A vehicle on a route `left` or `right` indicates.
+        points: evenly spaced points, (n, 2) m.
+        arc_m: distance of each point along the path, (n,).
         ends_m: arc lengths at which a section ends and the next begins; paths of one approach share the first
             section.
-        roles: what each section is called in a scene graph.
-        lanes: the lane of each section.
+        roles: name of each section in a scene graph.
+        lanes: lane of each section.
         priority: right of way; the higher one goes first.
     """
 
@@ -57,9 +57,10 @@ class Path:
         cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str],
         priority: int, origin_m: tuple[float, float] = (0.0, 0.0), reach_m: float = math.inf,
     ) -> "Path":  # fmt: skip
-        """The middle of some of highway-env's lanes, each of which goes on where the one before it ends.
+        """Build a path along the middle of consecutive lanes of highway-env.
 
-        Of a lane as much as lies within `reach_m` of the origin of the road's frame, and at least a point.
+        Only the part of a lane within `reach_m` of the origin of the road's frame counts, but at least one
+        point.
         """
         middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
@@ -71,28 +72,28 @@ class Path:
 
     @cached_property
     def columns(self) -> Floats:
-        """(2, n) m, the points' coordinates, each in one piece."""
+        """The points' coordinates, (2, n) m, each in contiguous memory."""
         return np.ascontiguousarray(self.points.T)
 
     @cached_property
     def headings_rad(self) -> Floats:
-        """(n,) direction of travel."""
+        """Direction of travel at each point, (n,)."""
         along = np.gradient(self.points, axis=0)
         heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
 
     @cached_property
     def bends(self) -> Floats:
-        """(n,) curvature in 1/m, whichever way it turns."""
+        """Absolute curvature at each point in 1/m, (n,)."""
         reach = round(BEND_M / float(self.arc_m[1]))
         turned = np.unwrap(self.headings_rad)
         padded = np.pad(turned, reach, mode="edge")
         return np.asarray(np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * BEND_M))
 
-    # Every viewer of a scene looks at the same vehicles, and scenes that part share most of them.
-    @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is for good
+    # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene share most.
+    @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
-        """Arc length (m), unsigned lateral offset (m) and heading (rad) of the path's nearest point."""
+        """Return arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest point."""
         x, y = self.columns
         gap = np.hypot(x - x_m, y - y_m)
         i = int(gap.argmin())
@@ -104,29 +105,29 @@ class Path:
 
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
-        """Position (m, m) and heading (rad) at an arc length."""
+        """Return the position (m, m) and the heading (rad) at an arc length."""
         x, y = (float(np.interp(arc_m, self.arc_m, along)) for along in self.columns)
         nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
         return x, y, float(self.headings_rad[nearest])
 
     def section(self, arc_m: float) -> int:
-        """The section that an arc length is in."""
+        """Return the index of the section at an arc length."""
         return bisect_right(self.ends_m, arc_m)
 
     def lane_role(self, arc_m: float) -> str:
-        """What the section at an arc length is called."""
+        """Return the role of the section at an arc length."""
         return self.roles[self.section(arc_m)]
 
 
 def _middle(lane: Any, origin_m: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """(n, 2) m, points of the middle of one of highway-env's lanes, its ends among them."""
+    """Return points along the middle of a lane of highway-env, its ends included, (n, 2) m."""
     along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
     middle: Floats = np.array([lane.position(s, 0.0) for s in along]) - origin_m
     return middle
 
 
 def _within(points: Floats, reach_m: float) -> Floats:
-    """Those of the points that lie so near the origin, or the nearest."""
+    """Return the points within `reach_m` of the origin, or only the nearest if there are none."""
     away_m = np.hypot(*points.T)
     near: Floats = points[away_m <= max(reach_m, away_m.min())]
     return near
@@ -134,14 +135,14 @@ def _within(points: Floats, reach_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where another path meets the ego's: position and arc lengths along both, in metres.
+    """The point where another path meets the ego's.
 
     Attributes:
-        x_m: m to the east.
-        y_m: m to the south.
-        ego_arc_m: along the ego's path.
-        other_arc_m: along the other path.
-        kind: whether it goes across, or into a lane that the ego takes as well.
+        x_m: position, m to the east.
+        y_m: position, m to the south.
+        ego_arc_m: arc length along the ego's path.
+        other_arc_m: arc length along the other path.
+        kind: whether the other path crosses, or merges into a lane that the ego takes as well.
     """
 
     x_m: float
@@ -153,13 +154,13 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Ground:
-    """What a picture shows of a road, in m to the east and to the *north*.
+    """The parts of a road that pictures show, in m to the east and to the *north*.
 
     Attributes:
-        outlines: (n, 2) each, its edges: the outer one, and those of what it goes round.
+        outlines: edges of the surface, (n, 2) each: the outer one, and those of islands.
         marks: centre lines, (n, 2) each.
         stops: stop lines, (n, 2) each.
-        boxes: west-south and east-north corners (2, 2) of what labels keep off.
+        boxes: south-west and north-east corners (2, 2) of areas that labels must avoid.
     """
 
     outlines: tuple[Floats, ...]
@@ -173,21 +174,21 @@ class Road:
     """A road, and what matters on it for the ego.
 
     Attributes:
-        facts: what a frozen record says of it: texts, and numbers with their unit in the name.
+        facts: description in frozen records: texts, and numbers with their unit in the name.
         paths: every path, by approach and route.
-        ego: the ego's path.
-        ways: paths that the ego changes between by changing lane, from left to right, `ego` among them: side
-            by side, and as long.
-        form: of its scene graphs; 2 lists every relation to the ego's ways, 1 crossings alone, as
-            `occluded-intersection-v2` is frozen.
-        crossings: where the ego's path meets others, and so where conflicts are looked for.
-        zone_m: position of the conflict zone; distances to it weigh messages.
-        sectors: where danger can come from, and the points (k, 2) m that must be seen to know of it.
-        network: gives highway-env's network, always the same one; nobody writes to it.
-        ground: gives what a picture shows that reaches so many metres from the origin.
-        origin_m: where the origin is in highway-env's own frame.
-        goal_m: gives, of the scenario's parameters, the arc length of the ego's path at which its episode is
-            over: whom it would meet beyond does not matter. None where that is no place on its path.
+        ego: key of the ego's path.
+        ways: paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie side
+            by side and are equally long.
+        form: form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as
+            in the frozen dataset `occluded-intersection-v2`.
+        crossings: points where other paths meet the ego's, at which conflicts are looked for.
+        zone_m: position of the conflict zone; messages are weighted by the distance to it.
+        sectors: sectors that danger can come from, each with the points (k, 2) m that must be seen.
+        network: returns highway-env's network, always the same object, which must not be written to.
+        ground: returns the ground for a picture that reaches so many metres from the origin.
+        origin_m: position of the origin in highway-env's own frame.
+        goal_m: returns, for the scenario's parameters, the arc length of the ego's path at which the episode
+            ends; vehicles beyond do not matter. None if the goal is not a place on its path.
     """
 
     facts: Mapping[str, str | float]
@@ -204,9 +205,9 @@ class Road:
     goal_m: Callable[[Any], float] | None = None
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[str, PathKey]:
-        """The ego's ways from the one that it is on: `own`, and `left` and `right` where there are such.
+        """Return the way that the ego is on, `own`, and those to its `left` and `right` if there are any.
 
-        At an arc length, those alone that are in a lane of their own there.
+        With an arc length, only ways that are in a separate lane at that place.
         """
         if key not in self.ways:
             return {"own": key}
@@ -223,7 +224,7 @@ class Road:
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
-        """Sections, by path and number, that several paths of one approach share: an indicator tells them."""
+        """Sections (path and number) that several paths of one approach share; an indicator tells which."""
         of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
         for key, path in self.paths.items():
             for section, lane in enumerate(path.lanes):
@@ -242,12 +243,12 @@ class Road:
 
     @cached_property
     def watched(self) -> Floats:
-        """(points, 2) m of all sectors, one after the other."""
+        """The points of all sectors in order, (points, 2) m."""
         return np.concatenate(list(self.sectors.values()))
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
-    """Where paths from elsewhere first meet the ego's, by the other's approach and route."""
+    """Find where paths of other approaches first meet the ego's, by approach and route."""
     mine = paths[ego]
     found = {}
     for key, path in paths.items():
@@ -266,7 +267,10 @@ def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Cros
 
 
 def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple[int, int]]) -> Any:
-    """highway-env's network of lanes along x: of each its nodes, begin, end and y in metres, and lines."""
+    """Build a network of highway-env from straight lanes along x.
+
+    A lane is given by its two nodes, its begin, end and y in metres, and its line types.
+    """
     from highway_env.road.lane import StraightLane
     from highway_env.road.road import RoadNetwork
 
@@ -277,9 +281,10 @@ def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple
 
 
 def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: float) -> tuple[Any, Any]:
-    """Two of highway-env's arcs, as long as their longitudinal coordinate, unlike its `SineLane`.
+    """Build a shift to the left from two arcs of highway-env, the first to the left and the second back.
 
-    Both ends head east and the end lies farther north; metres. The first arc turns left, the second back.
+    Both ends (metres) head east, and the end lies farther north. Unlike those of highway-env's `SineLane`,
+    the arcs' longitudinal coordinate is their length.
     """
     from highway_env.road.lane import CircularLane, LineType
 
@@ -297,7 +302,7 @@ def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: f
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
-    """What a picture shows of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
+    """Build the ground of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
     strips = [
@@ -311,7 +316,7 @@ def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0
 
 
 def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> Iterator[Floats]:
-    """Lines between lanes that lie side by side, which may be either one's."""
+    """Yield the lines between lanes that lie side by side; a line may belong to either lane."""
     for lane, side in product(lanes, (0, 1)):
         if lane.line_types[side] == STRIPED:
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
@@ -323,7 +328,7 @@ def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> It
 
 
 def _boxes(strips: Sequence[Any], view: Any) -> Iterator[Floats]:
-    """Boxes around the lanes within the view."""
+    """Yield the bounding boxes of the lanes within the view."""
     for strip in strips:
         seen = strip.intersection(view)
         if not seen.is_empty:

@@ -1,4 +1,4 @@
-"""What a scenario provides. All other code takes one as an argument, and names none."""
+"""The interface of a scenario: parameters, layout, road, goal. Other code takes a scenario as an argument."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,32 +21,32 @@ ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000
 
 
 def frames(latency_s: float, simulation_hz: int) -> int:
-    """Whole frames that a decision takes."""
+    """Return the number of whole frames that a decision takes."""
     return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """The dials that every scenario has; a scenario's own are those of a subclass.
+    """The parameters that every scenario has; a scenario adds its own in a subclass.
 
     Attributes:
-        target_speeds_mps: what SLOWER, IDLE and FASTER step through.
+        target_speeds_mps: the levels that SLOWER, IDLE and FASTER step through.
         braking_mps2: hardest braking.
         acceleration_mps2: hardest acceleration.
-        decisions: decisions an episode.
+        decisions: number of decisions in an episode.
         decision_period_s: seconds between two decisions.
-        decision_lag_s: seconds from seeing to acting, below the period, in decision trees and of reference
+        decision_lag_s: seconds from seeing to acting, below the period, in decision trees and for reference
             drivers: the paper's inference. Until then the ego keeps to its last action.
         simulation_hz: frames a second.
-        time_limit_s: an ego that has not reached its goal by then never will.
+        time_limit_s: an ego that has not reached its goal by then has failed.
         delay_allowance_s: how much later than the full-view driver an ego may reach its goal.
-        perfect_knowledge: whether the ego and the helpers know each other's truth instead of beacons.
-        beacon_rule: when a vehicle sends one: `fixed`, or `cam`, as it moves (ETSI EN 302 637-2);
-            `harness.world.beacons` has the sources of these dials.
+        perfect_knowledge: whether the ego and the helpers know each other's true state instead of beacons.
+        beacon_rule: when a vehicle sends a beacon: `fixed`, or `cam`, depending on its motion (ETSI EN 302
+            637-2); `harness.world.beacons` has the sources of these parameters.
         beacon_hz: beacons a second; under `cam`, checks a second whether one is due.
-        beacon_delay_s: from a beacon's pose until receivers have it.
-        beacon_loss: probability that a beacon does not get through to a receiver.
-        beacon_channel: physical radio whose loss on each link it is instead, with settings of its own:
+        beacon_delay_s: time from a beacon's pose until receivers have it.
+        beacon_loss: probability that a receiver does not receive a beacon.
+        beacon_channel: physical radio that gives this loss on each link instead, with settings of its own:
             `its-g5+density_per_km=120+rate_hz=20`.
         beacon_noise_m: standard deviation of a beacon's position on each axis.
         beacon_noise_mps: standard deviation of a beacon's speed.
@@ -98,11 +98,11 @@ class Parameters:
 
     @property
     def light(self) -> Ambient:
-        """What `ambient` names."""
+        """The light and weather that `ambient` names."""
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
-        """All dials as plain values; those that came later only where they are not as they were before."""
+        """Return all parameters as plain values; those of `LATER` only if they differ from that value."""
         return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 
     @property
@@ -111,17 +111,18 @@ class Parameters:
         return frames(self.decision_lag_s, self.simulation_hz)
 
     def due_frame(self, step: int) -> int:
-        """The frame in which a decision is due; after the last one, that of the time limit."""
+        """Return the frame in which a decision is due; after the last decision, that of the time limit."""
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
         return round(due_s * self.simulation_hz)
 
 
+# Parameters that were added later, with the values of the earlier behaviour.
 LATER = (("ambient", DAY), ("beacon_rule", "fixed"), ("beacon_channel", ""))
 
 
 @lru_cache(maxsize=64)
 def beacon_radio(text: str) -> Physical | None:
-    """The radio of `beacon_channel`; None for none. Raises UserError."""
+    """Return the radio that `beacon_channel` names; None if it is empty. Raises UserError if it is wrong."""
     if not text:
         return None
     name, *settings = text.split("+")
@@ -137,7 +138,7 @@ def beacon_radio(text: str) -> Physical | None:
     return radio
 
 
-# What changes neither who is there nor how they drive, but what is known of them.
+# Parameters that change neither the vehicles nor their driving, but only what is known of them.
 DIALS = tuple(
     field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
 )
@@ -145,23 +146,23 @@ DIALS = tuple(
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws of one layout: every quantity has one of its own, so one dial does not move another's."""
+    """Random draws of one layout. Each quantity has its own, so one parameter does not change another's."""
 
     scenario: str
     seed: int
 
     def share(self, what: str) -> float:
-        """Uniform in [0, 1)."""
+        """Draw uniformly from [0, 1)."""
         return float(noise.uniforms((1,), self.scenario, self.seed, what)[0])
 
     def between(self, what: str, bounds: tuple[float, float]) -> float:
-        """Uniform between two bounds."""
+        """Draw uniformly between two bounds."""
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def numbers(self, count: int) -> list[int]:
-        """Numbers of vehicles in an order that says nothing of them.
+        """Draw numbers for the ids of vehicles, so that an id tells nothing about its vehicle.
 
-        Each has one whether it is there or not: a gap between two ids tells nothing.
+        Absent vehicles have numbers, too, so a gap between two ids tells nothing either.
         """
         order: list[int] = noise.generator(self.scenario, self.seed, "ids").permutation(count).tolist()
         return order
@@ -169,19 +170,19 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """One vehicle at the start: where on which path, how fast, and its id.
+    """One vehicle at the start of an episode.
 
     Attributes:
         id: `v1`, `v2`, …
-        kind: what it looks like.
+        kind: class of vehicle.
         part: `ego`, `helper` or `other`.
         approach: where its path comes from.
         route: what its path does.
-        arc_m: where on the path.
-        speed_mps: how fast.
+        arc_m: position along the path.
+        speed_mps: speed.
         brakes_at_s: when it begins to brake by itself; None if it does not.
-        brakes_mps2: how hard.
-        brakes_to_mps: down to which speed.
+        brakes_mps2: its deceleration then.
+        brakes_to_mps: the speed down to which it brakes.
     """
 
     id: str
@@ -202,9 +203,9 @@ class Layout:
 
     Attributes:
         spawns: vehicles in spawn order, the ego first, then the helpers.
-        buildings: what blocks sight besides vehicles.
-        danger: sector the danger comes from, or None.
-        danger_id: the dangerous vehicle, or None.
+        buildings: obstacles to sight besides vehicles.
+        danger: sector that the danger comes from; None without a danger.
+        danger_id: id of the dangerous vehicle; None without a danger.
     """
 
     spawns: tuple[Spawn, ...]
@@ -215,24 +216,24 @@ class Layout:
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario. It travels between processes as its name and its parameters.
+    """One scenario. It is pickled as its name and its parameters.
 
     Attributes:
-        name: how users, manifests and frozen states call it.
-        description: its first line is `Scenario <name>: <summary>`.
+        name: its name for users, and in manifests and frozen states.
+        description: text whose first line is `Scenario <name>: <summary>`.
         actions: names of highway-env's meta-actions that the ego chooses from, the most careful first.
-        parameters: its dials.
-        road: gives the road, always the same one.
-        layout: the start of the episode of a seed, `(seed, parameters)`.
-        cleared: whether the ego has reached its goal, asked after every frame of any number of worlds,
-            `(xy_m, approaches, parameters)`: the vehicles' centres in highway-env's own frame (..., V, 2),
-            the ego first, NaN where a world has fewer, and their approaches (..., V).
-        words: what prompts say of it: `task`, after "You drive car v1:", and `hiding`, after "Others may be
-            hidden by". Templates read `words.<name>`.
-        brake_lamps: whether vehicles show that they brake.
-        prompt: version that is taken where none is named.
-        one_sided: why its scenes with left and right swapped are no scenes of it; None if they are.
-        start: starts an episode that is not simulated by the harness, `(scenario, seed)`: a `World`.
+        parameters: its parameters.
+        road: returns the road, always the same object.
+        layout: draws the start of a seed's episode, `(seed, parameters)`.
+        cleared: tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called
+            after every frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's own
+            frame (..., V, 2), the ego first, NaN where a world has fewer, and `approaches` theirs (..., V).
+        words: texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be hidden
+            by". Templates read `words.<name>`.
+        brake_lamps: whether vehicles have brake lamps.
+        prompt: default prompt version.
+        one_sided: why scenes with left and right swapped are not valid scenes; None if they are.
+        start: starts an episode that the harness does not simulate, `(scenario, seed)`; returns a `World`.
     """
 
     name: str
@@ -250,13 +251,13 @@ class Scenario:
 
     @property
     def prompt_words(self) -> dict[str, str]:
-        """What prompts may say of it: `words`, and the `speeds` that actions step through, from the top."""
+        """Texts for prompts: `words`, and the `speeds` that actions step through, the highest first."""
         speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
         return {**self.words, "speeds": speeds}
 
     @property
     def summary(self) -> str:
-        """What happens, in a line."""
+        """One line on what happens."""
         return self.description.strip().splitlines()[0].partition(": ")[2]
 
     def __hash__(self) -> int:

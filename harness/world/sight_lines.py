@@ -1,4 +1,4 @@
-"""What stands between the antennas of the ego and its helpers: geometry for channel models that need it."""
+"""Geometry of the radio links between the ego and its helpers: distances, and obstacles between antennas."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Site, Unit
 from harness.world.perception.rays import meetings
 from harness.world.state import HEIGHTS_M, VehicleState, WorldState
 
-LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at less run side by side, or merge
+LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at a smaller angle run side by side, or merge
 
 
 Place = tuple[float, float]
@@ -21,15 +21,15 @@ def site(
     units: Collection[Unit] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
-    """The links of some moments, (n, ...), those of roadside units among them.
+    """Return the links at some moments, (n, ...), with those of roadside units.
 
-    An antenna is at the centre of its vehicle. Of what stands between two, a building counts for more than a
-    vehicle.
+    An antenna is at the centre of its vehicle. If a building and a vehicle stand between two antennas, the
+    building counts.
 
     Args:
-        moments: the state, and the ids of the ego and its helpers, in this order.
+        moments: states, each with the ids of the ego and its helpers, in this order.
         units: roadside units.
-        zone_m: the centroid of the conflict zone, from which their places are counted.
+        zone_m: centroid of the conflict zone, the origin of the units' positions.
     """
     there = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in moments]
     among = _site([(state, ego, helpers) for state, (ego, *helpers) in there])
@@ -44,7 +44,7 @@ def site(
 
 
 def _site(moments: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
-    """The links from one end, a vehicle or a place, to some vehicles."""
+    """Return the links from one end, a vehicle or a place, to some vehicles."""
     n, most = len(moments), max((len(others) for _, _, others in moments), default=0)
     xy_m = np.full((n, 1 + most, 2), np.nan)
     sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
@@ -63,7 +63,7 @@ def _xy(end: VehicleState | Place) -> Place:
 
 
 def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tuple[int, float]:
-    """What stands between two ends, and the height of the tallest vehicle that does."""
+    """Return what stands between two ends, and the height of the tallest vehicle between them."""
     origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
     vehicles = [v for v in state.vehicles if v not in (a, b)]
     corners = [*(v.corners() for v in vehicles), *(building.corners() for building in state.buildings)]
@@ -78,7 +78,7 @@ def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tup
 
 
 def corner(a: VehicleState, b: VehicleState) -> Floats:
-    """How far two vehicles are from where the lines along their headings cross, (2,) m; NaN without."""
+    """Return the distances of two vehicles to the crossing of their headings' lines, (2,) m; NaN if none."""
     sine = np.sin(b.heading_rad - a.heading_rad)
     if abs(sine) < np.sin(LEAST_ANGLE_RAD):
         return np.full(2, np.nan)

@@ -1,9 +1,9 @@
-"""Vehicles on highway-env's roads, without its environments.
+"""Simulate vehicles on highway-env's roads, without its environments.
 
 Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits.
 
-What highway-env computes in every frame is computed here to the same last bit for less: its own NumPy
-functions in its own order, with Python's comparisons in place of `np.clip` and `np.linalg.norm`, whose calls
+The code repeats highway-env's computation of a frame faster and with the same last bit: the same NumPy
+functions in the same order, but Python's comparisons instead of `np.clip` and `np.linalg.norm`, whose calls
 cost more than all of its arithmetic. A test drives both side by side.
 """
 
@@ -24,16 +24,16 @@ from harness.world.road import Lane
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, VehicleState
 
-NEAR_M = 1e-6  # more than rounding can add to a distance: farther apart, highway-env finds no collision
-NOBODY_DRAWS = np.random.RandomState(0)  # highway-env wants one, and would seed it by the clock
-DECIMALS = 6  # of a state's metres, radians and m/s
-LAMPS_MPS2 = 1.0  # braking harder than this shows
-BRAKES_OFF_HZ = 20.0  # how fast who brakes by itself lets go of the brake in the end
-FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above it highway-env limits the acceleration
+NEAR_M = 1e-6  # more than the rounding of a distance; farther apart, highway-env finds no collision
+NOBODY_DRAWS = np.random.RandomState(0)  # never drawn from; highway-env would seed its own by the clock
+DECIMALS = 6  # decimals of a state's metres, radians and m/s
+LAMPS_MPS2 = 1.0  # brake lamps are on above this deceleration
+BRAKES_OFF_HZ = 20.0  # rate at which a vehicle that brakes by itself releases the brake at the end
+FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above this speed highway-env limits acceleration
 
 
 class _Road(Road):  # type: ignore[misc]
-    """Looks closer only at vehicles that are near enough to touch within the frame.
+    """highway-env's road, which checks only vehicles for collisions that may touch within the frame.
 
     Attributes:
         time_s: simulated time at the beginning of the frame.
@@ -42,7 +42,7 @@ class _Road(Road):  # type: ignore[misc]
     time_s = 0.0
 
     def step(self, dt: float) -> None:
-        """`Road.step`; no scenario has objects that are no vehicles."""
+        """Do what `Road.step` does; no scenario has objects other than vehicles."""
         for vehicle in self.vehicles:
             vehicle.step(dt)
         placed = [(v, *v.position.tolist(), v.diagonal / 2) for v in self.vehicles]
@@ -54,7 +54,7 @@ class _Road(Road):  # type: ignore[misc]
 
 
 def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> bool:
-    """Whether an axis of either vehicle keeps their outlines farther apart than both can move in `dt`."""
+    """Whether a separating axis keeps two outlines farther apart than both vehicles can move in `dt`."""
     (cos, sin), (other_cos, other_sin) = v.direction.tolist(), other.direction.tolist()
     dot, cross = abs(cos * other_cos + sin * other_sin), abs(cos * other_sin - sin * other_cos)
     moves = (abs(v.speed) + abs(other.speed)) * dt + NEAR_M
@@ -67,18 +67,18 @@ def _apart(v: Vehicle, other: Vehicle, dx_m: float, dy_m: float, dt: float) -> b
 
 
 class _OnRoute:
-    """A vehicle knows its lane from its route; highway-env's search over all lanes is not needed."""
+    """A vehicle that knows its lane from its route, without highway-env's search over all lanes."""
 
     spawn: Spawn
     braking = False
-    towards: tuple[float, Any] = (np.nan, None)  # a heading and its direction
+    towards: tuple[float, Any] = (np.nan, None)  # a heading and its direction, cached
 
     def on_state_update(self: Any) -> None:
         self.lane_index = self.target_lane_index
         self.lane = self.road.network.get_lane(self.lane_index)
 
     def act(self: Any, action: str | None = None) -> None:
-        """Steer and keep the target speed; a meta-action is highway-env's own affair."""
+        """Steer and keep the target speed; highway-env's own code handles a meta-action."""
         if action is not None:
             super().act(action)  # type: ignore[misc]
             return
@@ -95,18 +95,18 @@ class _OnRoute:
         self.braking = self.action["acceleration"] < -LAMPS_MPS2
 
     def follow_road(self: Any) -> None:
-        """Near the end of its lane it takes the next of its route, wherever on the route it began."""
+        """Take the next lane of the route near the end of the present one."""
         if self.road.network.get_lane(self.target_lane_index).after_end(self.position):
             rest = self.route[self.route.index(self.target_lane_index) + 1 :]
             if rest:
                 self.route, self.target_lane_index = rest, rest[0]
 
     def _steering(self: Any, lane: Any, along: float, lateral: float) -> float:
-        """`ControlledVehicle.steering_control`, where the vehicle's place in its lane is known."""
+        """Do what `ControlledVehicle.steering_control` does, for a known place in the lane."""
         speed = utils.not_zero(self.speed)
         ahead = lane.heading_at(along + self.speed * self.TAU_PURSUIT)
         turn = -self.KP_LATERAL * lateral / speed
-        if turn:  # the functions of 0 are 0
+        if turn:  # for 0 the functions return 0
             turn = _within(np.pi / 4, np.arcsin(_within(1.0, turn)))
         rate = self.KP_HEADING * utils.wrap_to_pi(ahead + turn - self.heading)
         slip = self.LENGTH / 2 / speed * rate
@@ -115,7 +115,7 @@ class _OnRoute:
         return float(_within(self.MAX_STEERING_ANGLE, slip))
 
     def step(self: Any, dt: float) -> None:
-        """`Vehicle.step`, which most vehicles take straight on and in the direction of the frame before."""
+        """Do what `Vehicle.step` does, faster for a vehicle that drives straight on, as most do."""
         if self.action["steering"] or self.impact is not None or self.crashed or abs(self.speed) > FAST_MPS:
             super().step(dt)  # type: ignore[misc]
             return
@@ -133,14 +133,14 @@ def _within(limit: float, value: float) -> float:
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane.
 
-    Where its layout says so it brakes by itself.
+    It brakes by itself if its layout says so.
     """
 
     braking_mps2 = 4.0
     standoff_m = 2.0
 
     def speed_control(self, target_speed: float) -> float:
-        """Acceleration in m/s²: brakes once the room left calls for its braking; never speeds up."""
+        """Return the acceleration in m/s²: it brakes once the remaining room requires it, never speeds up."""
         if self.spawn.brakes_at_s is not None and self.road.time_s >= self.spawn.brakes_at_s:
             above = max(self.speed - self.spawn.brakes_to_mps, 0.0)
             if above > 0:
@@ -155,7 +155,7 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
 
 
 class Van(Traffic):
-    """High enough to hide what is before it, or behind it."""
+    """High enough to hide vehicles before or behind it."""
 
     LENGTH, WIDTH = SIZES_M["van"]
 
@@ -170,20 +170,20 @@ KINDS = {"car": Traffic, "van": Van, "truck": Truck}
 
 
 class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
-    """Follows a target speed within physical limits (highway-env's own controller brakes without bound)."""
+    """Follows a target speed within physical limits (highway-env's own controller has no limit)."""
 
     limits_mps2 = (-8.0, 3.0)
-    ways: Mapping[Lane, str] = MappingProxyType({})  # routes of the lanes that it may change between
+    ways: Mapping[Lane, str] = MappingProxyType({})  # the lanes that it may change between, and their routes
 
     def act(self, action: str | None = None) -> None:
-        """Drive on, or take a meta-action; a change of lane is a change of route."""
+        """Drive on, or take a meta-action; changing lane changes the route."""
         super().act(action)
         route = self.ways.get(self.target_lane_index, self.spawn.route)
         if route != self.spawn.route:
             self.spawn, self.route = replace(self.spawn, route=route), [self.target_lane_index]
 
     def on_state_update(self) -> None:
-        """It is in the nearest of its lanes."""
+        """Set the lane to the nearest of its ways."""
         super().on_state_update()
         if self.ways:
             self.lane_index = min(self.ways, key=self._off_m)
@@ -193,13 +193,13 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
         return abs(float(self.road.network.get_lane(lane).local_coordinates(self.position)[1]))
 
     def speed_control(self, target_speed: float) -> float:
-        """Acceleration in m/s²."""
+        """Return the acceleration in m/s²."""
         least, most = self.limits_mps2
         return float(min(max(super().speed_control(target_speed), least), most))
 
 
 def populated(scenario: Scenario, layout: Layout) -> Any:
-    """highway-env's road with a layout's vehicles on it, the ego first."""
+    """Return highway-env's road with a layout's vehicles on it, the ego first."""
     road, static = new_road(scenario), scenario.road()
     for spawn in layout.spawns:
         path = static.paths[spawn.approach, spawn.route]
@@ -213,7 +213,7 @@ def populated(scenario: Scenario, layout: Layout) -> Any:
 
 
 def copied(road: Any) -> Any:
-    """A road with copies of its vehicles; of what they hold, that which is written to is copied too."""
+    """Return a road with copies of its vehicles; attributes that are written in place are copied, too."""
     new = copy(road)
     new.vehicles = [copy(v) for v in road.vehicles]
     for v in new.vehicles:
@@ -222,14 +222,14 @@ def copied(road: Any) -> Any:
 
 
 def new_road(scenario: Scenario) -> Any:
-    """highway-env's road, empty."""
+    """Return highway-env's road without vehicles."""
     return _Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
 
 
 def vehicle_on(
     road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float
 ) -> ControlledVehicle:
-    """A vehicle on the given section of its path."""
+    """Create a vehicle on a section of its path."""
     p = scenario.parameters
     route = list(scenario.road().paths[spawn.approach, spawn.route].lanes)
     arguments = {
@@ -246,14 +246,14 @@ def vehicle_on(
         vehicle.ways = {static.paths[key].lanes[0]: key[1] for key in static.ways}
     else:
         vehicle = KINDS[spawn.kind](None, position, **arguments)
-    vehicle.road = road  # only now: a vehicle that is made on a road first searches all of its lanes
+    vehicle.road = road  # only now: a vehicle that is created with a road searches all of its lanes
     vehicle.spawn = spawn
     vehicle.on_state_update()
     return vehicle
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """A vehicle in the midst of an episode, as if it began there."""
+    """Return a spawn for a vehicle in the middle of an episode, as if it began there."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
     plans = (begun.brakes_at_s, begun.brakes_mps2, begun.brakes_to_mps) if begun else ()
@@ -263,7 +263,7 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
 def state_of(
     v: ControlledVehicle, lamps: bool = False, origin_m: tuple[float, float] = (0.0, 0.0)
 ) -> VehicleState:
-    """A vehicle as the rest of the program knows it, to the micrometre: the last bits are the machine's."""
+    """Return a vehicle's state, rounded to the micrometre, since the last bits depend on the machine."""
     s = v.spawn
     x_m, y_m, heading_rad, speed_mps = (
         round(float(number), DECIMALS) + 0.0 for number in (*(v.position - origin_m), v.heading, v.speed)

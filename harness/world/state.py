@@ -1,4 +1,4 @@
-"""The nouns of a scene: vehicles, buildings, and the state of the whole world at one moment."""
+"""Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one moment."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from harness.core.arrays import Floats
 Kind = Literal["car", "van", "truck"]
 Part = Literal["ego", "helper", "other"]
 
-# Length and width; a van's are those of SUMO's delivery van.
+# Length and width; a van has those of SUMO's delivery van.
 SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
 HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 
 
 def indicator(route: str) -> str:
-    """What the turn indicator of a vehicle on a route shows."""
+    """Return what the turn indicator of a vehicle on a route shows."""
     return route if route in ("left", "right") else "off"
 
 
@@ -29,7 +29,7 @@ class VehicleState:
 
     Attributes:
         id: `v1`, `v2`, … by spawn order; the ego is `v1`.
-        kind: what it looks like; fixes its size.
+        kind: class of vehicle, which fixes its size.
         part: `ego`, `helper` (takes part in cooperation) or `other`.
         x_m: position of the centre, m to the east.
         y_m: position of the centre, m to the south.
@@ -38,7 +38,7 @@ class VehicleState:
         approach: where its path comes from.
         route: what its path does, such as `straight` or `left`.
         crashed: whether it has collided.
-        braking: whether its brake lamps show; never where the scenario has none.
+        braking: whether its brake lamps are on; always false if the scenario has none.
     """
 
     id: str
@@ -55,21 +55,24 @@ class VehicleState:
 
     @property
     def indicator(self) -> str:
-        """What its turn indicator shows."""
+        """What the turn indicator shows."""
         return indicator(self.route)
 
     @property
     def length_m(self) -> float:
-        """Bumper to bumper."""
+        """Length from bumper to bumper."""
         return SIZES_M[self.kind][0]
 
     @property
     def width_m(self) -> float:
-        """Side to side."""
+        """Width from side to side."""
         return SIZES_M[self.kind][1]
 
     def corners(self) -> NDArray[np.float64]:
-        """(4, 2) m, front left first, then clockwise as seen from above. Shared: not to be written to."""
+        """Return the corners, (4, 2) m: front left first, then clockwise as seen from above.
+
+        The array is shared and must not be written to.
+        """
         return _corners(self)
 
 
@@ -85,7 +88,7 @@ def rectangle(
     length_m: float | Floats,
     width_m: float | Floats,
 ) -> Floats:
-    """(..., 4, 2) m corners of rectangles (...): front left first, then clockwise as seen from above."""
+    """Return the corners of rectangles (...), (..., 4, 2) m: front left first, then clockwise from above."""
     cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
     along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
     right = np.multiply.outer(width_m, [-1.0, 1.0, 1.0, -1.0]) / 2
@@ -94,12 +97,12 @@ def rectangle(
 
 
 def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
-    """How far an axis of either keeps two rectangles apart (n,): no more than their gap, m.
+    """Return a lower bound of the gap between pairs of rectangles, (n,) m, by separating axes.
 
     Args:
-        poses: x, y and heading of the one, (n, 3).
+        poses: x, y and heading of the first of each pair, (n, 3).
         sizes_m: its length and width, (n, 2).
-        others: x, y and heading of the other, (n, 3).
+        others: x, y and heading of the second, (n, 3).
         their_sizes_m: its length and width, (n, 2).
     """
     (dx, dy), apart = (others - poses)[:, :2].T, np.full(len(poses), -np.inf)
@@ -117,7 +120,7 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
 
 @dataclass(frozen=True)
 class Building:
-    """An axis-parallel box that blocks sight; its walls in metres."""
+    """An axis-parallel box that blocks sight, by the positions of its walls in metres."""
 
     id: str
     west_m: float
@@ -126,28 +129,28 @@ class Building:
     south_m: float
 
     def corners(self) -> NDArray[np.float64]:
-        """(4, 2) m, north-west first, then clockwise as seen from above."""
+        """Return the corners, (4, 2) m: north-west first, then clockwise as seen from above."""
         w, n, e, s = self.west_m, self.north_m, self.east_m, self.south_m
         return np.array([[w, n], [e, n], [e, s], [w, s]])
 
 
 @dataclass(frozen=True)
 class Beacon:
-    """What a vehicle said of itself, errors included: `harness.world.beacons`.
+    """A vehicle's message about itself, with its errors: see `harness.world.beacons`.
 
     Attributes:
         sender: id of the vehicle.
-        time_s: when it was sent, since the start of the episode; negative before.
+        time_s: when it was sent, since the start of the episode; negative before the start.
         arrives_s: when receivers have it.
         x_m: position of the centre, m to the east.
         y_m: position of the centre, m to the south.
         heading_rad: from +x towards +y.
         speed_mps: speed along the heading.
-        target_speed_mps: what the ego's speed controller aims at; None of others.
-        heard_by: ids of the receivers that it gets through to.
-        interval_s: where they are sent as the vehicle moves, how long it waits now if it does not move; else
-            None.
-        unmoved: how many were sent on end because of that.
+        target_speed_mps: target of the ego's speed controller; None for other senders.
+        heard_by: ids of the receivers that receive it.
+        interval_s: under the rule `cam`, the interval until the next one if the vehicle does not move enough
+            to send earlier; else None.
+        unmoved: number of consecutive beacons that were sent because that interval was over.
     """
 
     sender: str
@@ -165,18 +168,18 @@ class Beacon:
 
 @dataclass(frozen=True)
 class WorldState:
-    """Everything that is there, seen or not.
+    """The state of everything, seen or not.
 
     Attributes:
         scenario: name of the scenario.
         episode_seed: seed of the episode's layout.
         step: index of the decision about to be taken; equals the number of actions taken so far.
         time_s: simulated time since the start of the episode.
-        target_speed_mps: what the ego's speed controller aims at.
-        vehicles: in spawn order, the ego first.
-        buildings: what blocks sight besides vehicles.
-        beacons: the last that each receiver has, and those under way, by sender and time; none under perfect
-            knowledge.
+        target_speed_mps: target of the ego's speed controller.
+        vehicles: vehicles in spawn order, the ego first.
+        buildings: obstacles to sight besides vehicles.
+        beacons: the last one that each receiver has, and those under way, by sender and time; empty under
+            perfect knowledge.
     """
 
     scenario: str
@@ -190,23 +193,23 @@ class WorldState:
 
     @property
     def ego(self) -> VehicleState:
-        """The vehicle whose decision it is."""
+        """The vehicle that decides."""
         return self.vehicles[0]
 
     @property
     def helpers(self) -> tuple[VehicleState, ...]:
-        """Vehicles that may be asked, in spawn order."""
+        """The vehicles that may be asked, in spawn order."""
         return tuple(v for v in self.vehicles if v.part == "helper")
 
     def vehicle(self, vehicle_id: str) -> VehicleState:
-        """The vehicle of that id. Raises KeyError."""
+        """Return the vehicle with an id. Raises KeyError if there is none."""
         for v in self.vehicles:
             if v.id == vehicle_id:
                 return v
         raise KeyError(vehicle_id)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready mapping; of `braking` only what is true, and of beacons what their rule needs."""
+        """Return a JSON-ready mapping, without `braking` if it is false and without unused beacon fields."""
         vehicles, buildings, beacons = (
             tuple(dict(vars(thing)) for thing in things)
             for things in (self.vehicles, self.buildings, self.beacons)
@@ -221,7 +224,7 @@ class WorldState:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "WorldState":
-        """Inverse of `to_dict`."""
+        """Read a state from a mapping of `to_dict`."""
         fields = dict(data)
         fields["vehicles"] = tuple(VehicleState(**v) for v in data["vehicles"])
         fields["buildings"] = tuple(Building(**b) for b in data["buildings"])

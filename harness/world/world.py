@@ -1,6 +1,6 @@
-"""The simulated world: one episode, from its start to its outcome.
+"""One simulated episode, from its start to its outcome.
 
-Frames are stepped here rather than by an environment's `step`, so that an episode ends in the frame in which
+Frames are stepped here and not by an environment's `step`, so that an episode ends in the very frame in which
 it is decided.
 """
 
@@ -22,7 +22,7 @@ from harness.world.state import Beacon, VehicleState, WorldState, rectangle, sep
 
 Snapshot = Mapping[str, Any]
 Target = tuple[str, int]  # route, and index of the scenario's target speeds
-TOUCHING_M = 1.0  # farther apart than that two wrecks did not meet in this frame
+TOUCHING_M = 1.0  # two wrecks farther apart than this did not meet in this frame
 HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 
@@ -31,16 +31,16 @@ class World:
     """One episode in the simulator.
 
     Attributes:
-        scenario: whose episode it is.
+        scenario: the episode's scenario.
         seed: seed of the episode's layout.
-        layout: how it began.
+        layout: its start.
         road: highway-env's road with its vehicles, the ego first.
-        step: decisions taken so far.
-        frame: frames simulated so far.
+        step: number of decisions taken so far.
+        frame: number of frames simulated so far.
         outcome: the outcome so far; its `ended` says whether the episode is decided.
         hard_brakings: how often the ego began to brake harder than HARD_BRAKING_MPS2.
-        braking_hard: whether it did so in the last frame.
-        beacons: those that matter from now on (`WorldState.beacons`).
+        braking_hard: whether it braked so hard in the last frame.
+        beacons: the beacons that still matter (`WorldState.beacons`).
     """
 
     scenario: Scenario
@@ -56,7 +56,7 @@ class World:
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
-        """The start of an episode."""
+        """Start an episode."""
         if scenario.start is not None:
             begun: World = scenario.start(scenario, seed)
             return begun
@@ -83,25 +83,25 @@ class World:
         return self.frame / self.scenario.parameters.simulation_hz
 
     def branch(self) -> "World":
-        """A copy that goes its own way."""
+        """Return an independent copy."""
         return replace(self, road=copied(self.road))
 
     def snapshot(self) -> Snapshot:
-        """What `thaw` needs besides `state()` to go on exactly as this world would."""
+        """Return what `thaw` needs besides `state()` to continue exactly as this world would."""
         vehicles = self.road.vehicles
         sections = [self._section(v) for v in vehicles]
         return {"frame": self.frame, "sections": sections, "speed_index": int(vehicles[0].speed_index)}
 
     def _section(self, v: Any) -> int:
-        """The section of its path that a vehicle is in; its route is what is left of its path's lanes."""
+        """Return the section of its path that a vehicle is in; its route has only the remaining lanes."""
         road, left = self.scenario.road(), v.route.index(v.target_lane_index)
-        if road.form == 1:  # counts from where the route now begins, and is set right in the next frame
+        if road.form == 1:  # counted from where the route now begins; the next frame corrects it
             return int(left)
         return len(road.paths[v.spawn.approach, v.spawn.route].lanes) - len(v.route) + int(left)
 
     @classmethod
     def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot) -> "World":
-        """The world that `state` and `snapshot` were taken from, before its episode was decided."""
+        """Restore the world that `state` and `snapshot` were taken from, if its episode was undecided."""
         if scenario.start is not None:
             world = cls.start(scenario, state.episode_seed)
             for frame, action in snapshot["taken"]:
@@ -121,7 +121,7 @@ class World:
         ego.speed_index = snapshot["speed_index"]
         ego.target_speed = ego.index_to_speed(ego.speed_index)
         if snapshot["frame"]:
-            # What touches is pushed apart in the next frame: highway-env's last act in every frame.
+            # highway-env ends every frame with collisions, which push touching vehicles apart in the next.
             for n, vehicle in enumerate(vehicles):
                 for other in vehicles[n + 1 :]:
                     vehicle.handle_collisions(other, 1 / scenario.parameters.simulation_hz)
@@ -131,7 +131,7 @@ class World:
         )
 
     def state(self) -> WorldState:
-        """What is where, now."""
+        """Return the present state."""
         vehicles = self.vehicles
         return WorldState(
             self.scenario.name, self.seed, self.step, self.time_s, float(vehicles[0].target_speed),
@@ -143,9 +143,9 @@ class World:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
 
     def act(self, action: str) -> None:
-        """Decide for an action by name, which acts a lag later, and simulate until the next decision is due.
+        """Take an action by name after the scenario's lag, and simulate until the next decision is due.
 
-        After the scenario's last decision the action is held until the episode is decided.
+        After the scenario's last decision, the action is held until the episode is decided.
         """
         p = self.scenario.parameters
         self.advance(p.due_frame(self.step) + p.lag_frames)
@@ -153,23 +153,23 @@ class World:
         self.advance(p.due_frame(self.step))
 
     def decide(self, action: str) -> None:
-        """Take an action if the episode is not decided yet, and count it: the next decision is to come."""
+        """Take an action unless the episode is decided, and count the decision."""
         if not self.outcome.ended:
             self.take(action)
         self.step += 1
 
     def take(self, action: str) -> None:
-        """Set the ego's target by a meta-action, now. Nothing moves until the world advances."""
+        """Set the ego's target by a meta-action. Nothing moves until the world advances."""
         self.vehicles[0].act(action)
 
     @property
     def target(self) -> Target:
-        """What the ego aims at."""
+        """The ego's route and target speed level."""
         ego = self.vehicles[0]
         return ego.spawn.route, int(ego.speed_index)
 
     def target_after(self, action: str) -> Target:
-        """What the ego would aim at if it took an action now."""
+        """Return the target that the ego would have if it took an action now."""
         ego = self.vehicles[0]
         kept = dict(vars(ego))
         self.take(action)
@@ -178,7 +178,7 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until so many frames have passed or the episode is decided."""
+        """Simulate until frame `until_frame`, or until the episode is decided."""
         frames, speed_mps = [], float(self.vehicles[0].speed)
         while self.frame < until_frame and not self.outcome.ended:
             self._step()
@@ -190,12 +190,12 @@ class World:
             self.passed(poses, speed_mps, gap_m)
 
     def passed(self, poses: Floats, speed_mps: float, gap_m: float) -> None:
-        """Take down what the last frames showed.
+        """Record the last frames: beacons, the least gap and hard braking.
 
         Args:
-            poses: x, y, heading and speed of each vehicle in each of them, from the origin of the scenario's
+            poses: x, y, heading and speed of each vehicle in each frame, from the origin of the scenario's
                 road, (F, V, 4).
-            speed_mps: of the ego before them.
+            speed_mps: the ego's speed before these frames.
             gap_m: least gap between the ego and others so far.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
@@ -207,17 +207,17 @@ class World:
         self.braking_hard = hard[-1]
 
     def _poses(self) -> list[tuple[float, ...]]:
-        """x, y, heading and speed of each vehicle, in highway-env's own frame."""
+        """Return x, y, heading and speed of each vehicle, in highway-env's own frame."""
         return [(*v.position.tolist(), float(v.heading), float(v.speed)) for v in self.vehicles]
 
     def _in_road_frame(self, poses: Sequence[Any]) -> Floats:
-        """Poses (..., V, 4) from the origin of the scenario's road."""
+        """Convert poses (..., V, 4) to the frame of the scenario's road."""
         found = np.array(poses)
         found[..., :2] -= self.scenario.road().origin_m
         return found
 
     def _broadcast(self, poses: Floats, first_frame: int) -> None:
-        """What the ego and the helpers say of themselves in some frames, (F, V, 4)."""
+        """Add the beacons of the ego and the helpers in some frames, whose poses are (F, V, 4)."""
         p, radios = (
             self.scenario.parameters,
             [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"],
@@ -235,7 +235,7 @@ class World:
         self.road.step(1 / self.scenario.parameters.simulation_hz)
 
     def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
-        """Whom the ego hit, and how; of an object on the road nothing is known."""
+        """Return whom the ego hit, and how; empty if it hit an object on the road."""
         mine = self._state_of(ego)
         hit = [(float(outline(mine).distance(outline(v))), v) for v in map(self._state_of, wrecks)]
         apart_m, partner = min(hit, key=lambda pair: pair[0], default=(math.inf, mine))
@@ -257,10 +257,10 @@ class World:
         return bool(self.scenario.cleared(np.array(xy_m), np.array(approaches), self.scenario.parameters))
 
     def judge(self, standing: Set[str]) -> None:
-        """Look whether the frame that has just passed decided the episode.
+        """Decide the episode if the last frame has decided it.
 
         Args:
-            standing: ids of the vehicles that had crashed before it.
+            standing: ids of the vehicles that had crashed before that frame.
         """
         p = self.scenario.parameters
         ego, others = self.vehicles[0], self.vehicles[1:]
@@ -280,12 +280,12 @@ class World:
 
 
 def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
-    """The smaller of `least_m` and the least gap between an ego's outline and another's, in each world (W,).
+    """Return the least gap between the ego's outline and another's in each world, at most `least_m`, (W,).
 
     Args:
-        poses: (W, frames, vehicles, 3 or more), x, y and heading; the ego first; NaN where nobody is.
-        sizes_m: (W, vehicles, 2), length and width.
-        least_m: (W,), the least gap before these frames.
+        poses: x, y and heading, (W, frames, vehicles, 3 or more); the ego first; NaN without a vehicle.
+        sizes_m: length and width, (W, vehicles, 2).
+        least_m: the least gap before these frames, (W,).
     """
     centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
     # Two centres are at least both half widths apart from touching, and at most both half diagonals.
@@ -306,7 +306,7 @@ def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
         )
         np.minimum.at(gaps_m, worlds[pairs], shapely.distance(*outlines))
 
-    # The likeliest pair of each world first: few others can be nearer than that.
+    # The pair with the smallest bound in each world is measured first; few others can then be nearer.
     likely = np.lexsort((at_least_m, worlds))
     measure(likely[np.diff(worlds[likely], prepend=-1) > 0])
     measure(np.flatnonzero(at_least_m < gaps_m[worlds]))

@@ -1,4 +1,4 @@
-"""Answers of a GGUF file through llama.cpp, in a process of its own."""
+"""The backend of a GGUF file: llama.cpp in a child process."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ def open(
     """Find and load a card's weights.
 
     Raises:
-        UserError: the file is missing, an option cannot be, or llama.cpp refuses the file.
+        UserError: the file is missing, an option is wrong, or llama.cpp refuses the file.
     """
     if dtype not in (None, "auto"):
         raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
@@ -40,13 +40,16 @@ class LlamaBackend(Child):
         self.chat = _RemoteChat(card.name, self)
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Natural log-probabilities of the first `vocabulary` tokens after each prompt, (n, vocabulary)."""
-        found: Floats = self.call("next_log_probs", requests, vocabulary)
-        return found
+        """Return the natural log-probabilities of the first `vocabulary` tokens after each prompt.
+
+        Shape (n, vocabulary).
+        """
+        log_p: Floats = self.call("next_log_probs", requests, vocabulary)
+        return log_p
 
 
 def _of_child(attribute: str) -> Any:
-    """A method that is called in the child."""
+    """Return a method that calls the chat's method in the child."""
 
     def method(chat: "_RemoteChat", *arguments: Any, **options: Any) -> Any:
         return chat.child.call(f"chat.{attribute}", *arguments, **options)
@@ -55,7 +58,7 @@ def _of_child(attribute: str) -> Any:
 
 
 class _RemoteChat(Chat):
-    """A chat template and tokenizer in a child."""
+    """A chat template and tokenizer in the child process."""
 
     def __init__(self, name: str, child: Child) -> None:
         self.name = name

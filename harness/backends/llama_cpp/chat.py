@@ -1,4 +1,4 @@
-"""The chat template of a GGUF file, rendered as transformers renders it, and llama.cpp's own tokenizer."""
+"""The chat template of a GGUF file, rendered as transformers does, with llama.cpp's own tokenizer."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from harness.core.errors import UserError, printable
 
 
 class Vocabulary(Protocol):
-    """What a GGUF file says of text; `harness.backends.llama_cpp.model.LlamaModel` is one."""
+    """The tokenizer of a GGUF file; `harness.backends.llama_cpp.model.LlamaModel` is one."""
 
     template: str
     specials: dict[str, str]
@@ -66,23 +66,23 @@ class GgufChat(Chat):
 
 
 class _Generation(Extension):
-    """`{% generation %}`, with which a template marks what a model said, for training. Its text stays."""
+    """The tag `{% generation %}`, which marks a model's turns for training; its content is rendered."""
 
     tags = {"generation"}  # noqa: RUF012 jinja2 declares it so
 
     def parse(self, parser: Parser) -> list[nodes.Node]:
-        """The block's own content."""
+        """Return the content of the block."""
         next(parser.stream)
         return parser.parse_statements(("name:endgeneration",), drop_needle=True)
 
 
 def _environment() -> ImmutableSandboxedEnvironment:
-    """Jinja with the names that templates on the hub count on."""
+    """Build the Jinja environment with the names that templates on the hub expect."""
 
     def raise_exception(message: str) -> None:
         raise TemplateError(message)
 
-    def tojson(value: Any, **options: Any) -> str:  # Jinja's own escapes for HTML
+    def tojson(value: Any, **options: Any) -> str:  # Jinja's own filter escapes for HTML
         return json.dumps(value, **{"ensure_ascii": False, **options})
 
     built = ImmutableSandboxedEnvironment(

@@ -1,6 +1,6 @@
-"""A backend in a process of its own: an engine that dies does not take the run with it.
+"""Run a backend in a child process, so that an engine that crashes does not end the run.
 
-The process is spawned, so that it has only what its opener loads. Messages are pickled through a pipe.
+The process is spawned, so it loads only what its opener imports. Messages are pickled through a pipe.
 """
 
 import os
@@ -21,33 +21,34 @@ from harness.backends.base import Completion, Request
 from harness.core.errors import UserError, printable
 from harness.core.parallel import end_with_parent
 
-LOADS = 3  # deaths in a row, while it loads, before we give up
-LOOK_S = 10.0  # between two looks at whether it is stopped
+LOADS = 3  # attempts to load the backend, each ended by the death of its process
+LOOK_S = 10.0  # time between two checks whether the process is stopped
 
 
 class _Died(Exception):
-    """The process is gone; says what ended it."""
+    """The process has ended; the message says how."""
 
 
 class Child:
     """The backend that an opener returns, opened and asked in a child process.
 
-    Seconds are measured by the backend, where it is. After a death what was under way is asked again
-    together, as company may move an answer by rounding. If that kills the engine too, it is asked one at a
-    time, and the request that kills it then is a completion with an error. One that stays stopped is killed.
+    The backend measures seconds inside the child. After a death, the same requests are asked again together,
+    since a different batch may move an answer by rounding. If that kills the engine, too, they are asked one
+    at a time, and a request that kills it again becomes a completion with an error. A process that stays
+    stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
         """Open the backend.
 
         Args:
-            name: the model's, for messages.
+            name: name of the model, for messages.
             opener: `module:function`, called in the child with `arguments` and `options`, which are pickled.
-            arguments: of the opener.
-            options: of the opener.
+            arguments: positional arguments of the opener.
+            options: keyword arguments of the opener.
 
         Raises:
-            UserError: the opener raised it, or its process died time after time.
+            UserError: the opener raised it, or its process died `LOADS` times.
         """
         self._name = name
         self._opener = opener, arguments, options
@@ -62,18 +63,18 @@ class Child:
         return [self._alone(request) for request in requests]
 
     def identity(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.call("identity")
-        return found
+        identity: dict[str, Any] = self.call("identity")
+        return identity
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        found: list[str] = self.call("rendered", requests)
-        return found
+        prompts: list[str] = self.call("rendered", requests)
+        return prompts
 
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
-        """An attribute of the backend, by its dotted name; what it returns, where it is a method.
+        """Return an attribute of the backend by its dotted name; call it if it is a method.
 
         Raises:
-            UserError: the backend raised it, or dies of the question.
+            UserError: the backend raised it, or died of the call.
         """
         for _ in range(2):
             try:
@@ -83,7 +84,7 @@ class Child:
         raise UserError(f"model {printable(self._name)!r}: {last} of {attribute}; see `harness model check`")
 
     def close(self) -> None:
-        """End the process, if there is one."""
+        """Kill the process, if there is one."""
         if self._running:
             process, pipe = self._running
             self._running = None
@@ -107,7 +108,7 @@ class Child:
             process = context.Process(target=_serve, args=(theirs, *self._opener), daemon=True)
             with _uninterrupted():
                 process.start()
-            theirs.close()  # else its death would not close the pipe
+            theirs.close()  # otherwise the child's death would not close the pipe
             Thread(target=_watch, args=(process.pid,), daemon=True).start()
             self._running = process, ours
             try:
@@ -127,7 +128,7 @@ class Child:
         if not self._running:
             self._start()
         assert self._running
-        with suppress(BrokenPipeError, ConnectionResetError):  # it died idle: receiving finds out
+        with suppress(BrokenPipeError, ConnectionResetError):  # it died while idle: `_receive` reports that
             self._running[1].send((attribute, arguments, options))
         return self._receive()
 
@@ -141,7 +142,7 @@ class Child:
             code = process.exitcode or 0
             self.close()
             raise _Died(f"engine died: {f'signal {-code}' if code < 0 else f'exit code {code}'}") from None
-        except BaseException:  # Ctrl-C: its answer must not be taken for that of the next question
+        except BaseException:  # Ctrl-C: the pending answer must not be taken for the next call's
             self.close()
             raise
         if error:
@@ -150,9 +151,9 @@ class Child:
 
 
 def _watch(pid: int) -> None:
-    """End a process that is found stopped twice in a row: who waits for its answer would wait for ever."""
+    """Kill a process that is found stopped twice in a row; otherwise its caller would wait for ever."""
     before = False
-    with suppress(ChildProcessError, AttributeError):  # it is gone; or Windows, which stops none
+    with suppress(ChildProcessError, AttributeError):  # the process is gone, or this is Windows
         while True:
             time.sleep(LOOK_S)
             stopped = os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
@@ -177,27 +178,27 @@ def _open(opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> A
 
 
 def _get(backend: Any, attribute: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
-    found = attrgetter(attribute)(backend)
-    return found(*arguments, **options) if callable(found) else found
+    value = attrgetter(attribute)(backend)
+    return value(*arguments, **options) if callable(value) else value
 
 
 def _attempt(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
-    """What some work gives, or what it raises."""
+    """Return the result of some work, or the exception that it raises."""
     try:
         return work(*arguments), None
     except UserError as error:
         return None, error
-    except Exception:  # a bug, which crashes the parent with the child's traceback
+    except Exception:  # a bug: the parent crashes with the child's traceback
         return None, RuntimeError(f"in the engine's process:\n{traceback.format_exc()}")
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """What starts meanwhile never hears Ctrl-C: the parent does, and ends it."""
+    """Block Ctrl-C in processes that are started inside; the parent receives it and ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    resource_tracker.ensure_running()  # the first start would start it, which unblocks SIGINT
+    resource_tracker.ensure_running()  # started by the first process otherwise, which would unblock SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

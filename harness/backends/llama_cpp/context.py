@@ -1,4 +1,4 @@
-"""Sequences of tokens in llama.cpp's memory, which grows with them."""
+"""Token sequences in llama.cpp's key-value memory, which grows as needed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,24 +14,25 @@ from harness.backends.llama_cpp.projector import Projector, Run, text_run
 Ints = NDArray[np.int32]
 Logits = NDArray[np.float32]
 
-_BATCH = 512  # most tokens of one call; more go in several
-_PAGE = 256  # llama.cpp rounds its memory up to so many tokens
-_FULL = 1  # llama_decode: no room left
+_BATCH = 512  # most tokens of one call; more are split over several
+_PAGE = 256  # llama.cpp rounds its memory up to a multiple of this many tokens
+_FULL = 1  # llama_decode's code for no room left
 _FIELDS = c.llama_batch._fields_
 
 
 class LlamaContext:
     """Sequences by number, 0 to n-1, each a list of tokens whose keys and values are computed.
 
-    Negative tokens are a picture's. A sequence may be cut before or behind a picture, not within.
+    Negative tokens are a picture's. A sequence may be cut before or after a picture, but not inside.
 
-    Each has as much room as the next. In a memory that all share, which llama.cpp can have too, each would
-    attend to all the others' tokens, if only to mask them. The memory is made when it is first needed. When a
-    sequence has filled its room it is made anew at twice the size, and filled again from the tokens.
+    All sequences have equal room. (llama.cpp can also share one memory, but then each sequence would attend
+    to all the others' tokens, if only to mask them.) The memory is allocated when it is first needed. When a
+    sequence has filled its room, the memory is replaced by one of twice the size and filled again from the
+    tokens.
 
     Attributes:
-        tokens: of each sequence that is there.
-        cache_type: number format of keys and values, `F32` for F32 weights and else `F16`.
+        tokens: tokens of each existing sequence.
+        cache_type: number format of keys and values: `F32` for F32 weights, or else `F16`.
     """
 
     def __init__(self, model: LlamaModel, sequences: int, projector: Projector | None = None) -> None:
@@ -42,34 +43,34 @@ class LlamaContext:
         self._room = 0
         self.cache_type = "F32" if model.dtype == "F32" else "F16"
         self.tokens: dict[int, list[int]] = {}
-        self._ends: dict[int, list[int]] = {}  # of each token, the position behind it
+        self._ends: dict[int, list[int]] = {}  # the position after each token
 
     def fork(self, source: int, copy: int, length: int) -> None:
-        """Let a new sequence begin with the first `length` tokens of another, as they were computed."""
-        if length:  # between rooms llama.cpp copies a whole sequence only
+        """Start a new sequence with the computed first `length` tokens of another."""
+        if length:  # llama.cpp can only copy a whole sequence, so the copy is cut afterwards
             c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
             c.llama_memory_seq_rm(self._memory(), copy, self._ends[source][length - 1], -1)
-        for each in (self.tokens, self._ends):
-            each[copy] = each[source][:length] if length else []
+        for lists in (self.tokens, self._ends):
+            lists[copy] = lists[source][:length] if length else []
 
     def drop(self, sequence: int) -> None:
-        """Forget a sequence, if it is there."""
+        """Remove a sequence, if it exists."""
         if self.tokens.pop(sequence, None) is not None and self._context:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
     def reserve(self, room: int) -> None:
-        """Make the memory, for so many tokens of each sequence, if there is none yet."""
+        """Allocate memory for `room` tokens of each sequence, if there is none yet."""
         if not self._context:
             self._make(room)
 
     def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
-        """Append a chunk, which is not empty, to each of some sequences.
+        """Append a chunk, which must not be empty, to each of some sequences.
 
         Returns:
             Logits after the last token of each, (len(chunks), vocabulary).
 
         Raises:
-            RuntimeError: llama.cpp fails; all sequences are gone then.
+            RuntimeError: llama.cpp fails; all sequences are lost then.
         """
         try:
             logits = self._decode(chunks)
@@ -86,7 +87,7 @@ class LlamaContext:
         return logits
 
     def free(self) -> None:
-        """Give all memory back; every sequence is gone."""
+        """Free all memory; all sequences are lost."""
         if self._context:
             c.llama_free(self._context)
         self._context, self.tokens, self._ends = None, {}, {}
@@ -96,7 +97,7 @@ class LlamaContext:
         return memory
 
     def _make(self, room: int) -> None:
-        if self._context:  # before the new one is there: both may not fit
+        if self._context:  # freed before the new one is allocated, since both may not fit
             c.llama_free(self._context)
             self._context = None
         params = c.llama_context_default_params()
@@ -105,9 +106,9 @@ class LlamaContext:
         params.n_batch = params.n_ubatch = _BATCH
         params.n_seq_max = params.n_outputs_max = self._sequences
         params.kv_unified = False
-        params.swa_full = True  # else a beginning is forgotten as its window passes
+        params.swa_full = True  # otherwise a beginning is lost once the sliding window has passed it
         if self.cache_type == "F32":
-            # As exact as the weights: llama.cpp's own choice, and its fused attention, round to F16.
+            # As exact as the weights; llama.cpp's default and its fused attention round to F16.
             params.type_k = params.type_v = c.GGML_TYPE_F32
             params.flash_attn_type = c.LLAMA_FLASH_ATTN_TYPE_DISABLED
         params.n_threads = params.n_threads_batch = threads()
@@ -119,28 +120,28 @@ class LlamaContext:
             raise RuntimeError(f"no memory for {self._sequences} x {self._room} tokens: {last_error()}")
 
     def _fill(self) -> None:
-        """Compute all sequences again. In this order each begins like the one before as far as like any."""
-        held = sorted(self.tokens.items(), key=lambda item: item[1])
-        before, self.tokens = held[0][0], {}
-        for sequence, tokens in held:
+        """Compute all sequences again, sorted, so that each shares its longest beginning with the last."""
+        sequences = sorted(self.tokens.items(), key=lambda item: item[1])
+        before, self.tokens = sequences[0][0], {}
+        for sequence, tokens in sequences:
             shared = [] if self._model.whole_state else self.tokens.get(before, [])
             self.fork(before, sequence, common_length([shared, tokens]))
             try:
                 if rest := tokens[len(self.tokens[sequence]) :]:
                     self._decode({sequence: rest})
-            except LookupError:  # a beginning with a picture that nobody has any more
+            except LookupError:  # a beginning with a picture that no longer exists
                 self.drop(sequence)
             else:
                 before = sequence
 
     def _decode(self, chunks: Mapping[int, Sequence[int]]) -> Logits | None:
-        """Append chunks; logits after each. None, with nothing appended, if there is no room."""
+        """Append chunks and return the logits after each; without room, append nothing and return None."""
         queues = {s: self._runs(chunk) for s, chunk in chunks.items()}
         ends = {s: self._ends[s][-1:] or [0] for s in chunks}
         logits = np.empty((len(chunks), self._model.vocabulary), dtype=np.float32)
         while fronts := {s: queue[0] for s, queue in queues.items() if queue}:
             texts = {s: run for s, run in fronts.items() if run.inputs.ndim == 1}
-            now = texts or fronts  # llama.cpp takes texts together, or pictures
+            now = texts or fronts  # one call of llama.cpp takes either texts or pictures
             rows = [row if len(queues[s]) == 1 else None for row, s in enumerate(chunks) if s in now]
             if not self._read(now, [ends[s][-1] for s in now], logits, rows):
                 return None
@@ -153,7 +154,7 @@ class LlamaContext:
         return logits
 
     def _runs(self, chunk: Sequence[int]) -> list[Run]:
-        """A chunk as texts and pictures in turn."""
+        """Split a chunk into texts and pictures."""
         if self._projector is None or min(chunk) >= 0:
             return [text_run(chunk)]
         runs, start = [], 0
@@ -169,13 +170,13 @@ class LlamaContext:
     def _read(
         self, runs: Mapping[int, Run], starts: Sequence[int], logits: Logits, rows: Sequence[int | None]
     ) -> bool:
-        """Read a run of each of some sequences, all texts or all pictures; whether there was room.
+        """Read a run of each of some sequences, all texts or all pictures; return whether there was room.
 
         Args:
-            runs: by sequence.
-            starts: position of the first token of each.
-            logits: where those behind a run go.
-            rows: into which row; None if those of a run are not wanted.
+            runs: runs by sequence.
+            starts: position of the first token of each run.
+            logits: array that receives the logits after a run.
+            rows: its row for each run; None if the logits are not needed.
         """
         inputs = np.concatenate([run.inputs for run in runs.values()])
         places = [run.at(start) for run, start in zip(runs.values(), starts, strict=True)]
@@ -194,14 +195,14 @@ class LlamaContext:
                 raise RuntimeError(f"llama_decode returned {code}: {last_error()}")
             for row, i in zip(rows, last - start, strict=True):
                 if row is not None and 0 <= i < _BATCH:
-                    found = c.llama_get_logits_ith(self._context, int(i))
-                    logits[row] = np.ctypeslib.as_array(found, (self._model.vocabulary,))
+                    pointer = c.llama_get_logits_ith(self._context, int(i))
+                    logits[row] = np.ctypeslib.as_array(pointer, (self._model.vocabulary,))
         return True
 
     def _call(self, inputs: NDArray[Any], place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
-        """llama_decode on arrays of one length, without a copy."""
+        """Call llama_decode on arrays of one length, without a copy."""
         one = np.ones_like(owner)
-        # One address a token: it belongs to one sequence.
+        # One address for each token, since it belongs to one sequence.
         owners = owner.ctypes.data + owner.itemsize * np.arange(len(owner), dtype=np.uintp)
         arrays: dict[str, NDArray[Any]] = {
             "token" if inputs.ndim == 1 else "embd": inputs,

@@ -1,4 +1,4 @@
-"""llama.cpp as an engine: GGUF files, mostly on a CPU."""
+"""The llama.cpp engine: GGUF files, mostly on a CPU."""
 
 import os
 from collections.abc import Sequence
@@ -22,18 +22,18 @@ from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
 from harness.core.image import Image
 
-BEGINNINGS = 3  # of prompts, kept between calls: one a role, and one of a batch with both
-_ANSWER = 256  # tokens of an answer that memory is made for at once
-_PICTURES = ("<|image_pad|>", "<image>")  # what chat templates write for a picture
+BEGINNINGS = 3  # beginnings of prompts kept between calls: one for each role, and one of a batch with both
+_ANSWER = 256  # tokens of an answer for which memory is allocated in advance
+_PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for a picture
 
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
-    """Load a GGUF file in this process, which llama.cpp may end.
+    """Load a GGUF file in this process, which llama.cpp may abort.
 
     Raises:
-        UserError: the file, its projector, the device or the batch size is none for llama.cpp.
+        UserError: llama.cpp refuses the file, its projector, the device or the batch size.
     """
-    os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # which starts a debugger where there is one
+    os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # a backtrace would start a debugger if there is one
     most = most_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
@@ -47,7 +47,7 @@ def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> La
 class LlamaEngine:
     """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts.
 
-    Without a projector it takes no pictures.
+    Without a projector, it takes no pictures.
 
     Attributes:
         chat: its tokenizer and chat template.
@@ -68,19 +68,19 @@ class LlamaEngine:
         self._projector = projector
         self._context = LlamaContext(model, batch_size + BEGINNINGS, projector)
         self._free = list(range(batch_size))
-        # Least lately used first.
+        # The least recently used comes first.
         self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
 
     def look(self, image: Image) -> list[int]:
-        """What stands for a picture in a prompt."""
+        """Return the tokens that stand for a picture in a prompt."""
         if self._projector is None:
             raise ValueError(f"model {self._card.name!r} takes no pictures")
         return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> "LlamaSession":
-        """Read some prompts, none of them empty; what they begin with in common is computed once.
+        """Read some prompts, none of them empty; their common beginning is computed once.
 
-        A beginning is kept for later calls, unless half of it is part of one that is kept already.
+        The beginning is kept for later calls, unless half of it is part of one that is kept already.
         """
         if len(prompts) > len(self._free):
             raise ValueError(f"{len(prompts)} prompts for {len(self._free)} free places")
@@ -94,13 +94,15 @@ class LlamaEngine:
 
     def _read(self, prompts: dict[int, list[int]]) -> Logits:
         first, *rest = prompts
-        # The last token of each is left for its logits.
+        # The last token of each prompt is always read, for its logits.
         common = 0 if self._model.whole_state else common_length([p[:-1] for p in prompts.values()])
         shared = prompts[first][:common]
         self._context.reserve(max(map(len, prompts.values())) + _ANSWER)
         kept = {b: common_length([self._context.tokens.get(b, []), shared]) for b in self._beginnings}
         new = 2 * max(kept.values()) < common
-        if not rest:  # a prompt that is asked again is read again: else its time would be no answer's time
+        if (
+            not rest
+        ):  # a repeated prompt is read again, since its time would otherwise not be an answer's time
             if self._projector and max(kept.values()) == common:
                 self._projector.forget(shared)
             kept = {b: n if n < common else 0 for b, n in kept.items()}
@@ -126,17 +128,17 @@ class LlamaEngine:
         self._beginnings.append(beginning)
 
     def extend(self, chunks: dict[int, Sequence[int]]) -> Logits:
-        """Append tokens to sequences by place; logits after each, (len(chunks), vocabulary)."""
+        """Append tokens to sequences by place; return the logits after each, (len(chunks), vocabulary)."""
         return self._context.extend(chunks)
 
     def release(self, places: Sequence[int]) -> None:
-        """Forget the sequences at some places, which are free then."""
+        """Drop the sequences at some places, which are free afterwards."""
         for place in places:
             self._context.drop(place)
         self._free += places
 
     def identity(self) -> dict[str, Any]:
-        """What decides the answers: the build of llama.cpp, and the file by its hub commit or its content."""
+        """Return what decides the answers: llama.cpp's build, and the file by hub commit or by content."""
         commit = hub_commit(self._file.parent)
         return {
             "engine": "llama-cpp",
@@ -167,7 +169,7 @@ class LlamaEngine:
 
 
 class LlamaSession:
-    """Sequences that go forward together; `harness.backends.engine.Session` says what each method does."""
+    """Sequences that advance together; `harness.backends.engine.Session` documents the methods."""
 
     def __init__(self, engine: LlamaEngine, places: list[int], logits: Logits) -> None:
         self._engine = engine
@@ -177,11 +179,11 @@ class LlamaSession:
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
         check_logits(self._logits.max(axis=1).tolist())
         best = []
-        for row, listed in zip(self._logits, among, strict=True):
-            if listed is None:
+        for row, allowed in zip(self._logits, among, strict=True):
+            if allowed is None:
                 best.append(int(row.argmax()))
             else:
-                tokens = np.unique(listed)
+                tokens = np.unique(allowed)
                 best.append(int(tokens[row[tokens].argmax()]))
         return best
 
@@ -190,8 +192,8 @@ class LlamaSession:
         check_logits(largest.ravel().tolist())
         logits = self._logits - largest
         total = np.log(np.exp(logits).sum(axis=1, keepdims=True))
-        found: Floats = (logits if tokens is None else logits[:, list(tokens)]) - total
-        return found
+        log_p: Floats = (logits if tokens is None else logits[:, list(tokens)]) - total
+        return log_p
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]

@@ -1,6 +1,7 @@
-"""A GGUF file loaded by llama.cpp: its weights, its vocabulary and what it says of itself.
+"""Load a GGUF file with llama.cpp: its weights, its vocabulary and its metadata.
 
-Everything here runs in the child process (`harness.backends.llama_cpp.child`): llama.cpp can end its process.
+All of this runs in the child process (`harness.backends.llama_cpp.child`), because llama.cpp may abort its
+process.
 """
 
 import ctypes
@@ -15,22 +16,22 @@ import numpy as np
 
 from harness.core.errors import UserError, printable
 
-_ERROR = 4  # of ggml's log levels
+_ERROR = 4  # ggml's log level of errors
 _errors: list[str] = []
 
 
 @c.llama_log_callback  # type: ignore[untyped-decorator]
 def keep_errors(level: int, text: bytes, _: Any) -> None:
-    """Keep what went wrong for the user's one line; the rest is chatter."""
+    """Keep errors for the user's one line, and drop all other log messages."""
     if level == _ERROR:
         _errors.append(text.decode(errors="replace").strip())
 
 
 def last_error() -> str:
-    """The first thing that llama.cpp complained of since the last call, made safe to show."""
-    said = printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
+    """Return the first error that llama.cpp has logged since the last call, made safe to show."""
+    reason = printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
     _errors.clear()
-    return said
+    return reason
 
 
 class LlamaModel:
@@ -38,14 +39,15 @@ class LlamaModel:
 
     Attributes:
         pointer: llama.cpp's model.
-        vocabulary: number of tokens, rows without a token included.
-        trained_tokens: context it was trained for.
+        vocabulary: number of tokens, with rows that have no token.
+        trained_tokens: length of the context that it was trained for.
         dtype: number format of the weights, as llama.cpp names it.
         stops: token ids that end an answer, sorted.
-        template: its chat template.
-        specials: texts of its special tokens by their name in a chat template, such as `bos_token`.
-        bos: id of its BOS token, None if it has none.
-        whole_state: a sequence's state cannot be cut (recurrent layers), so no beginning can be shared.
+        template: chat template.
+        specials: texts of special tokens by their name in a chat template, such as `bos_token`.
+        bos: id of the BOS token; None if there is none.
+        whole_state: whether a sequence's state cannot be cut (recurrent layers), so no beginning can be
+            shared.
         device: `cpu` or `gpu`.
     """
 
@@ -89,22 +91,22 @@ class LlamaModel:
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
 
     def encode(self, text: str) -> list[int]:
-        """Token ids of a text; special tokens written in it are taken for what they are, none is added."""
+        """Return the token ids of a text. Special tokens written in it are recognised; none is added."""
         data = text.encode(errors="replace")
-        ids = np.empty(len(data) + 1, dtype=np.int32)  # a token is a byte at least
+        ids = np.empty(len(data) + 1, dtype=np.int32)  # a token has at least one byte
         pointer = ids.ctypes.data_as(ctypes.POINTER(c.llama_token))
         count = c.llama_tokenize(self._vocab, data, len(data), pointer, len(ids), False, True)
         if count < 0:
             raise ValueError(f"llama.cpp cannot tokenise {len(data)} bytes ({count})")
-        found: list[int] = ids[:count].tolist()
-        return found
+        tokens: list[int] = ids[:count].tolist()
+        return tokens
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Text of token ids, control tokens left out. Bytes that are no text become U+FFFD."""
+        """Return the text of token ids without control tokens. Invalid bytes become U+FFFD."""
         return b"".join(self._piece(token) for token in ids).decode(errors="replace")
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """The text of each token on its own, control tokens as they are written."""
+        """Return the text of each single token, with control tokens."""
         return [self._piece(token, control=True).decode(errors="replace") for token in ids]
 
     def _piece(self, token: int, control: bool = False) -> bytes:
@@ -117,26 +119,26 @@ class LlamaModel:
             size = -length
 
     def _described(self) -> str:
-        """Such as `qwen3 4B Q4_K - Medium`."""
+        """Return llama.cpp's description, such as `qwen3 4B Q4_K - Medium`."""
         buffer = ctypes.create_string_buffer(128)
         c.llama_model_desc(self.pointer, buffer, len(buffer))
         return buffer.value.decode(errors="replace")
 
 
 def most_sequences() -> int:
-    """How many sequences llama.cpp keeps apart."""
+    """Return the most sequences that llama.cpp can hold."""
     most: int = c.llama_max_parallel_sequences()
     return most
 
 
 def build() -> dict[str, str]:
-    """What of llama.cpp itself moves an answer's last digits."""
+    """Return the version and CPU features of llama.cpp, which move an answer's last digits."""
     features: bytes = c.llama_print_system_info()
     return {"llama_cpp_python": version("llama-cpp-python"), "system": features.decode().strip(" |")}
 
 
 def threads() -> int:
-    """Threads of a computation: OMP_NUM_THREADS, as for any other engine, else one a core."""
+    """Return the number of threads: OMP_NUM_THREADS, as for any other engine, or else one a core."""
     asked = os.environ.get("OMP_NUM_THREADS", "")
     if asked.isdigit() and int(asked):
         return int(asked)

@@ -1,4 +1,4 @@
-"""The projector of a model that takes pictures: a second GGUF file, which llama.cpp's mtmd reads."""
+"""The projector of a model with vision: a second GGUF file, with which llama.cpp's mtmd encodes pictures."""
 
 import ctypes
 from collections import OrderedDict
@@ -21,16 +21,16 @@ from harness.core.errors import UserError, printable
 from harness.core.image import Image
 
 KEPT = 64  # pictures whose embeddings are kept: those of a chunk of requests, for a repair turn
-MOST_TOKENS = 1 << 16  # of a picture whose processor has no limit
+MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
-    """Tokens that llama.cpp takes in one go.
+    """Tokens that llama.cpp reads together.
 
     Attributes:
         inputs: token ids, (n,) int32, or embeddings, (n, width) float32.
-        places: their positions from the first one's, (1, n) int32; with M-RoPE a picture's are (4, n).
-        span: positions that they take; a picture may take fewer than it has tokens.
+        places: positions relative to the first token, (1, n) int32; with M-RoPE a picture's are (4, n).
+        span: number of positions that they take; a picture may take fewer than it has tokens.
     """
 
     inputs: NDArray[Any]
@@ -38,39 +38,39 @@ class Run(NamedTuple):
     span: int
 
     def at(self, start: int) -> NDArray[np.int32]:
-        """Positions of its tokens; the fourth row is no position, and 0."""
+        """Return the tokens' positions from `start`; the fourth row is not a position and stays 0."""
         shifted = self.places + np.int32(start)
         shifted[3:] = 0
         return shifted
 
     def ends(self, start: int) -> Sequence[int]:
-        """Position behind each token, of a picture behind all of it."""
+        """Return the position after each token; for a picture, the position after the whole picture."""
         n = len(self.inputs)
         return range(start + 1, start + n + 1) if self.inputs.ndim == 1 else [start + self.span] * n
 
 
 def text_run(ids: Sequence[int]) -> Run:
-    """Tokens of a text."""
+    """Return the run of a text."""
     return Run(np.array(ids, dtype=np.int32), np.arange(len(ids), dtype=np.int32)[None], len(ids))
 
 
 class Projector:
     """A loaded projector.
 
-    Pictures are encoded when their tokens are first read, so that this is part of an answer's time.
+    Pictures are encoded when their tokens are first read, so that encoding is part of an answer's time.
     """
 
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
-        """Load it.
+        """Load a projector.
 
         Raises:
-            UserError: llama-cpp-python has no mtmd, the file is no projector or another model's, or a picture
-                does not become as many tokens as the card says.
+            UserError: llama-cpp-python has no mtmd, the file is not a projector of this model, or a picture
+                does not have as many tokens as the card says.
         """
         shown = f"model {name!r} with projector {printable(file)}"
         try:
             m = import_module("llama_cpp.mtmd_cpp")
-        except (ImportError, OSError):  # OSError: its library is not there
+        except (ImportError, OSError):  # OSError: its library is missing
             raise UserError(
                 f"model {name!r}: llama-cpp-python was built here without what reads pictures; run "
                 "`pip install --force-reinstall --no-cache-dir --no-deps llama-cpp-python`"
@@ -81,7 +81,7 @@ class Projector:
         params = m.mtmd_context_params_default()
         params.use_gpu = model.device == "gpu"
         params.n_threads = threads()
-        params.flash_attn_type = c.LLAMA_FLASH_ATTN_TYPE_DISABLED  # which rounds to F16
+        params.flash_attn_type = c.LLAMA_FLASH_ATTN_TYPE_DISABLED  # it rounds to F16
         params.print_timings = params.warmup = False
         if vision.scaled_to_px is None:
             square = (vision.patch_px * vision.merge) ** 2
@@ -99,26 +99,26 @@ class Projector:
         self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
         self._layouts: dict[tuple[int, ...], list[Sequence[int] | int]] = {}
         self._encoded: OrderedDict[int, dict[int, Run]] = OrderedDict()
-        found = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
-        if found != vision.tokens:
+        count = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
+        if count != vision.tokens:
             raise UserError(
-                f"{shown} makes {found} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
+                f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
                 f"card's [vision] {vision.tokens}; fix the card, or give the model's own projector"
             )
 
     def tokens(self, image: Image) -> list[int]:
-        """What stands for a picture in a prompt; the picture must be there until it is read."""
+        """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
         layout = self._layout(image.pixels.shape[:2])
         numbers = picture_tokens(image, sum(part for part in layout if isinstance(part, int)))
         self._images[picture_of(numbers[0])[0]] = image
-        left = iter(numbers)
-        return [t for part in layout for t in (islice(left, part) if isinstance(part, int) else part)]
+        remaining = iter(numbers)
+        return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
 
     def run(self, token: int) -> Run:
-        """The part of a picture that begins with a token.
+        """Return the part of a picture that begins with a token.
 
         Raises:
-            LookupError: none does, or its picture is gone.
+            LookupError: no part does, or its picture no longer exists.
         """
         key, place = picture_of(token)
         if key not in self._encoded:
@@ -131,29 +131,29 @@ class Projector:
         return self._encoded[key][place]
 
     def forget(self, tokens: Sequence[int]) -> None:
-        """Encode the pictures among some tokens again when they are read again."""
+        """Drop the encodings of the pictures among some tokens, so that they are encoded again."""
         for key in {picture_of(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(key, None)
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
-        """Token ids of a marker, or how many tokens a picture's part has, in order.
+        """Return the token ids of each marker and the token count of each picture part, in order.
 
-        What the chat template writes around a picture itself is left out.
+        Markers that the chat template writes itself are left out.
         """
         if shape not in self._layouts:
             with self._chunks(shape, None) as chunks:
-                found = [
+                parts = [
                     self._marker(chunk) or self._m.mtmd_input_chunk_get_n_tokens(chunk) for chunk in chunks
                 ]
             self._layouts[shape] = [
                 part
-                for part in found
+                for part in parts
                 if isinstance(part, int) or "".join(self._model.pieces(part)) not in self._model.template
             ]
         return self._layouts[shape]
 
     def _marker(self, chunk: int) -> list[int]:
-        """Token ids of a text chunk; none of a picture's."""
+        """Return the token ids of a text chunk; empty for a picture's."""
         if self._m.mtmd_input_chunk_get_type(chunk) != self._m.MTMD_INPUT_CHUNK_TYPE_TEXT:
             return []
         count = ctypes.c_size_t()
@@ -161,7 +161,7 @@ class Projector:
         return [int(ids[i]) for i in range(count.value)]
 
     def _encode(self, image: Image) -> dict[int, Run]:
-        """The parts of a picture, by the place of their first token."""
+        """Encode a picture; return its parts by the place of their first token."""
         pixels = np.ascontiguousarray(image.pixels)
         runs: dict[int, Run] = {}
         place = 0
@@ -187,7 +187,7 @@ class Projector:
 
     @contextmanager
     def _chunks(self, shape: tuple[int, ...], pixels: Any) -> Iterator[list[int]]:
-        """What mtmd makes of a picture of (height, width) pixels, alone; without pixels only their number."""
+        """Split a picture of (height, width) pixels with mtmd; without pixels, chunks have sizes only."""
         marker = self._m.mtmd_default_marker()
         text = self._m.mtmd_input_text(marker, len(marker), False, True)
         bitmap = ctypes.c_void_p(self._m.mtmd_bitmap_init(shape[1], shape[0], pixels))

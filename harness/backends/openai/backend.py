@@ -1,4 +1,4 @@
-"""Answers of a model behind any server that speaks OpenAI's chat completions."""
+"""The backend of a model behind any server that speaks OpenAI's chat completions."""
 
 import asyncio
 import time
@@ -20,14 +20,14 @@ from harness.backends.servers import Server
 from harness.core.files import canonical_json
 
 T = TypeVar("T")
-_CLOSED_S = 5.0  # in which connections are closed
+_CLOSED_S = 5.0  # longest wait for connections to close
 
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
-    """Reach a card's servers.
+    """Connect to a card's servers.
 
     Raises:
-        UserError: nobody listens there, one refuses the key, the key is none, or models differ.
+        UserError: no server answers, one refuses the key, the key is malformed, or models differ.
     """
     if card.server is None:
         raise ValueError(f"card {card.name} has no server")
@@ -37,11 +37,11 @@ def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
 class OpenAIBackend:
     """A model behind one or several servers.
 
-    Requests are asked at the same time, each by itself, so that `complete` may be called while another call
-    is at work. Connections stay open between calls.
+    Requests are sent concurrently, each by itself, so `complete` may be called during another call.
+    Connections stay open between calls.
 
     Attributes:
-        window: requests that it has under way at most.
+        window: most requests that are sent at once.
     """
 
     def __init__(self, card: Card, server: Server, batch_size: int) -> None:
@@ -49,7 +49,7 @@ class OpenAIBackend:
         self._server = server
         self._batch_size = batch_size
         self.window = batch_size * len(server.urls)
-        self._streams = True  # until it refuses to
+        self._streams = True  # until a server refuses to stream
         client = Client(server)
         self._farm = Farm(client, server, card.name, card.weights or "", batch_size)
         self._loop = _Loop(client)
@@ -57,12 +57,12 @@ class OpenAIBackend:
         self._loop.run(self._farm.open())
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """One completion per request, in the same order.
+        """Return one completion per request, in the same order.
 
-        Where a server has one request alone, `seconds` is the time from asking to the last byte, failed
-        attempts and the waits between them included; an answer that never came has spent its time, too. The
-        first takes a connection, which the others go on with. One that is asked to be timed is streamed. No
-        other is: some servers count no tokens in a stream, or part thoughts otherwise.
+        If a server has one request alone, `seconds` is the time from sending it to the last byte, with failed
+        attempts and the waits between them; an answer that never came has its time, too. The first request
+        opens a connection, which later ones reuse. Only `timed` requests are streamed: in a stream some
+        servers count no tokens, or separate thoughts differently.
 
         Raises:
             UserError: no server is left, or one has come back with another model.
@@ -70,13 +70,13 @@ class OpenAIBackend:
         return self._loop.run(self._all(requests))
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """What the server is sent for each request, its picture by digest; it renders the messages itself."""
+        """Return the JSON that the server is sent for each request, with its picture as a digest."""
         return [canonical_json(body(self._card, self._server, r, digest_url)) for r in requests]
 
     def identity(self) -> dict[str, Any]:
-        """The model, by what its servers say of it. Weights that are changed unsaid are not seen.
+        """Return the model's identity as its servers state it; weights changed without notice go undetected.
 
-        Where any of several may answer, it does not matter which they are.
+        If any of several servers may answer, their URLs are not part of it.
         """
         model = self._farm.model
         version = {} if model.version is None else {"version": model.version}
@@ -92,52 +92,55 @@ class OpenAIBackend:
 
     async def _all(self, requests: Sequence[Request]) -> list[Completion]:
         together = min(self._batch_size, len(requests))
-        if together == 1 and any(request.timed for request in requests):  # the next knows how the last went
+        # One at a time: if a server refuses to stream, the next request must know.
+        if together == 1 and any(request.timed for request in requests):
             return [await self._answer(request, together) for request in requests]
         return await asyncio.gather(*(self._answer(request, together) for request in requests))
 
     async def _answer(self, request: Request, together: int) -> Completion:
-        reply = await self._asked(request, together == 1 and request.timed)
+        reply = await self._reply(request, together == 1 and request.timed)
         end_s = time.perf_counter()
-        if together == 1 and not reply.alone:  # another call's were there
+        if together == 1 and not reply.alone:  # requests of another call ran at the same time
             together = self._batch_size
         seconds = end_s - reply.begun_s if together == 1 else None
-        said = Said(error=reply.fault) if reply.fault else read(reply.payload, request)
-        first_at_s, tokens = reply.first_at_s, said.completion_tokens
+        answer = Said(error=reply.fault) if reply.fault else read(reply.payload, request)
+        first_at_s, tokens = reply.first_at_s, answer.completion_tokens
         if request.answer == "readout":
             first_at_s, tokens = end_s, 1
-        first_s = None if seconds is None or first_at_s is None or said.error else first_at_s - reply.begun_s
+        first_s = None
+        if seconds is not None and first_at_s is not None and not answer.error:
+            first_s = first_at_s - reply.begun_s
         return Completion(
             request_id=request.id,
-            text=said.text,
-            prompt_tokens=said.prompt_tokens,
-            completion_tokens=said.completion_tokens,
-            finish_reason=said.finish_reason,
+            text=answer.text,
+            prompt_tokens=answer.prompt_tokens,
+            completion_tokens=answer.completion_tokens,
+            finish_reason=answer.finish_reason,
             seconds=seconds,
             batch_size=together,
-            error=said.error,
-            label_mass=said.label_mass,
+            error=answer.error,
+            label_mass=answer.label_mass,
             retries=reply.retries,
             first_token_s=first_s,
             token_s=None if seconds is None else per_token_s(seconds, first_s, tokens),
         )
 
-    async def _asked(self, request: Request, streamed: bool) -> Reply:
-        """The server's reply; a server that will not stream is asked again, and never to stream again."""
-        asked = partial(body, self._card, self._server, request)
+    async def _reply(self, request: Request, streamed: bool) -> Reply:
+        """Ask for a reply. If the server refuses to stream, ask again without, and stream no more."""
+        json_body = partial(body, self._card, self._server, request)
         decision = request.id.partition("/")[0]
         if not streamed or not self._streams or request.answer == "readout":
-            return await self._farm.post(decision, asked)
-        reply = await self._farm.post(decision, lambda: {**asked(), **ASKED})
+            return await self._farm.post(decision, json_body)
+        reply = await self._farm.post(decision, lambda: {**json_body(), **ASKED})
         if reply.status in (None, 200) or "stream" not in (reply.fault or "").lower():
             return reply
         self._streams = False
-        plain = await self._farm.post(decision, asked)
+        plain = await self._farm.post(decision, json_body)
         return replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
 
 
 class _Loop:
-    """An event loop in a thread of its own, with a client's connections, until it is ended."""
+    """An event loop in a thread of its own, with the connections of a client."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -147,7 +150,7 @@ class _Loop:
         self.run(client.__aenter__())
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """The result of some work in the loop, which is cancelled where this is interrupted."""
+        """Run a coroutine in the loop and return its result; an interrupt cancels it."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
@@ -156,7 +159,7 @@ class _Loop:
             raise
 
     def end(self) -> None:
-        """Close the connections; what still waits is cancelled."""
+        """Close the connections and cancel all coroutines that still wait."""
         with suppress(RuntimeError):  # ended already
             self._loop.call_soon_threadsafe(self._loop.stop)
         if current_thread() is not self._thread:

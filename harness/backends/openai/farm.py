@@ -1,8 +1,8 @@
-"""One model behind one or several servers: which of them is asked, and what becomes of one that breaks down.
+"""One model behind one or several servers: distribute requests, retry, and set broken servers aside.
 
-Requests with the same key go to the same server, which has the beginning of their prompts in its cache: each
-key ranks the servers by a hash (rendezvous hashing), so that one more or less moves few keys. A server with
-nothing left of its own takes from the end of the longest queue, so that none is idle.
+Requests with the same key go to the same server, whose cache holds the beginning of their prompts: each key
+ranks the servers by a hash (rendezvous hashing), so that adding or removing one moves few keys. A server
+whose queue is empty takes requests from the end of the longest queue, so that none is idle.
 """
 
 import asyncio
@@ -21,11 +21,11 @@ from harness.backends.openai.http import Client, Reply
 from harness.backends.servers import Kind, Server
 from harness.core.errors import UserError, printable
 
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # before the first retry, doubled with each; at most
-BROKEN = 3  # failures with no answer between them, after which a server is set aside
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # wait before the first retry, doubled with each; and its limit
+BROKEN = 3  # failures in a row after which a server is set aside
 _PATH = "/chat/completions"
-_LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates: a server says when it was started
-# Where kinds of servers say which version they are, beside `/v1`, and under which key.
+_LISTED = ("id", "owned_by", "root", "max_model_len")  # no dates, which tell only when a server was started
+# Path of each kind of server's version, beside `/v1`, and its key.
 _VERSION: Mapping[Kind, tuple[str, str]] = {
     "vllm": ("/version", "version"),
     "llama-server": ("/props", "build_info"),
@@ -34,11 +34,11 @@ _VERSION: Mapping[Kind, tuple[str, str]] = {
 
 
 class Model(NamedTuple):
-    """What a server says of the model that it has.
+    """A server's statement about its model.
 
     Attributes:
-        listed: its entry in the server's list; None where there is no list, or the model is not on it.
-        version: the server's own; None where it does not say.
+        listed: the model's entry in the server's list; None without a list, or if the model is not on it.
+        version: version of the server; None if it does not tell.
     """
 
     listed: dict[str, Any] | None = None
@@ -47,22 +47,22 @@ class Model(NamedTuple):
 
 @dataclass(eq=False)
 class _Place:
-    """One of the servers.
+    """The state of one server.
 
     Attributes:
-        url: its base URL.
+        url: base URL.
         queue: requests that wait for it.
-        busy: how many it has.
-        begun: how many it was given so far.
-        failures: attempts that failed since it last answered.
-        pauses: how often it was waited for since it last answered.
-        lost: how often it was looked for in vain since it was last there.
-        fault: how it failed last.
-        aside: whether it is asked nothing until it is there again.
+        busy: number of requests that it works on.
+        begun: number of requests that it has been sent so far.
+        failures: failed attempts since it last answered.
+        pauses: waits for it since it last answered.
+        lost: vain attempts to reach it since it was set aside.
+        fault: its last failure.
+        aside: whether it is set aside: it gets no requests until it answers again.
     """
 
     url: str
-    queue: "deque[_Owed]" = field(default_factory=deque)
+    queue: "deque[_Pending]" = field(default_factory=deque)
     busy: int = 0
     begun: int = 0
     failures: int = 0
@@ -73,8 +73,8 @@ class _Place:
 
 
 @dataclass(eq=False)
-class _Owed:
-    """A request, made once it is asked; where its reply is awaited; how often it failed at which server."""
+class _Pending:
+    """A pending request: its body, built when it is sent, the future of its reply, and failures by server."""
 
     key: str
     body: Callable[[], Mapping[str, Any]]
@@ -84,31 +84,31 @@ class _Owed:
 
 
 def pause_s(times: int) -> float:
-    """Seconds to wait after so many waits in a row."""
+    """Return the seconds to wait after `times` waits in a row."""
     return float(min(FIRST_WAIT_S * 2 ** min(times, 32), LONGEST_WAIT_S))
 
 
 class Farm:
-    """The servers of a model. All of it runs in one event loop, inside `async with` of the client.
+    """The servers of a model. It runs in one event loop, inside `async with` of the client.
 
     Attributes:
-        model: what all servers say of the model.
+        model: the statement about the model in which all servers agree.
     """
 
     def __init__(self, client: Client, server: Server, name: str, weights: str, at_once: int) -> None:
-        """A farm that is not open yet.
+        """Prepare a farm, which `open` connects.
 
         Args:
-            client: asks a server once.
-            server: where the servers are, and how often a request is tried again.
-            name: the card's, for messages.
-            weights: what servers know the model by.
-            at_once: most requests that one server has at once.
+            client: sends single requests.
+            server: the servers' URLs and the number of retries.
+            name: name of the card, for messages.
+            weights: the servers' name of the model.
+            at_once: most requests that one server gets at once.
         """
         self._client, self._server, self._name, self._weights = client, server, printable(name), weights
         self._at_once = at_once
         self._places = [_Place(url) for url in server.urls]
-        self._owed: set[_Owed] = set()
+        self._pending: set[_Pending] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._woken = False
         self._refused: Exception | None = None
@@ -117,133 +117,134 @@ class Farm:
         self.model = Model()
 
     async def open(self) -> None:
-        """Look at every server. One that does not answer is waited for, if another does.
+        """Ask every server for its model. One that does not answer is set aside if another does.
 
         Raises:
             UserError: none answers, one refuses the key, or two have different models.
         """
-        looked = await asyncio.gather(*(self._look(place) for place in self._places))
-        there = {place: model for place, model in zip(self._places, looked, strict=True) if model}
-        if not there:
+        models = await asyncio.gather(*(self._look(place) for place in self._places))
+        answering = {place: model for place, model in zip(self._places, models, strict=True) if model}
+        if not answering:
             raise UserError(
                 f"nobody answers at {self._faults()}; start the server, or fix base_url in the model's card"
             )
-        self._first, self.model = next(iter(there.items()))
-        for place, model in there.items():
+        self._first, self.model = next(iter(answering.items()))
+        for place, model in answering.items():
             self._agree(place, model)
         for place in self._places:
-            if place not in there:
+            if place not in answering:
                 self._set_aside(place)
 
-    async def post(self, key: str, body: Callable[[], Mapping[str, Any]]) -> Reply:
-        """What a server answers, once there is an answer, or the retries are used up.
+    async def post(self, key: str, build: Callable[[], Mapping[str, Any]]) -> Reply:
+        """Send a request; return the reply once there is an answer, or the retries are used up.
 
-        A server that is busy (429), breaks down (5xx), is not reached or takes too long may be asked again:
-        another one at once, the same after the time that it asks for or one that doubles.
+        If a server is busy (429), breaks down (5xx), is not reached or takes too long, the request is tried
+        again: at once at another server, or at the same one after the wait that it asks for, or else a
+        doubling one.
 
         Raises:
             UserError: no server is left, or one has come back with another model.
         """
         if self._refused:
             raise self._refused
-        owed = _Owed(key, body, asyncio.get_running_loop().create_future())
-        self._owed.add(owed)
+        pending = _Pending(key, build, asyncio.get_running_loop().create_future())
+        self._pending.add(pending)
         try:
-            self._queue(owed)
-            return await owed.reply
+            self._queue(pending)
+            return await pending.reply
         finally:
-            self._owed.discard(owed)
+            self._pending.discard(pending)
 
     # -- who is asked ---------------------------------------------------------------------------------------
 
     def _rank(self, key: str) -> list[_Place]:
-        """The servers, that of a key first."""
+        """Return the servers in the order of a key."""
         if len(self._places) == 1:
             return self._places
         weights = {p: blake2b(f"{p.url} {key}".encode(), digest_size=8).digest() for p in self._places}
         return sorted(self._places, key=weights.__getitem__)
 
-    def _queue(self, owed: _Owed) -> None:
-        """Wait for the server of the key, or for the next that is there and has failed less often."""
-        place = min(self._ranked(owed.key), key=lambda place: (place.aside, owed.failed[place]))
-        (place.queue.appendleft if owed.failed else place.queue.append)(owed)  # who has waited goes first
+    def _queue(self, pending: _Pending) -> None:
+        """Queue a request at its key's server, or at the next that is up and has failed it less often."""
+        place = min(self._ranked(pending.key), key=lambda place: (place.aside, pending.failed[place]))
+        (place.queue.appendleft if pending.failed else place.queue.append)(pending)  # a retry goes first
         self._wake()
 
     def _wake(self) -> None:
-        """Hand out what waits once all that is ready has queued."""
+        """Schedule `_hand_out`, once, after all ready coroutines have queued their requests."""
         if not self._woken:
             self._woken = True
             asyncio.get_running_loop().call_soon(self._hand_out)
 
     def _hand_out(self) -> None:
         self._woken = False
-        there = [place for place in self._places if not place.aside]
-        for take in (self._own, self._take):  # each its own first
-            for place in there:
-                while place.busy < self._at_once and (owed := take(place)):
+        available = [place for place in self._places if not place.aside]
+        for take in (self._own, self._take):  # first each server's own queue
+            for place in available:
+                while place.busy < self._at_once and (pending := take(place)):
                     place.busy += 1
-                    self._run(self._work(place, owed))
+                    self._run(self._work(place, pending))
 
-    def _own(self, place: _Place) -> _Owed | None:
-        """The next request that waits for a server."""
+    def _own(self, place: _Place) -> _Pending | None:
+        """Take the next request from a server's own queue."""
         while place.queue:
-            if not (owed := place.queue.popleft()).reply.done():  # whoever asked may be gone
-                return owed
+            if not (pending := place.queue.popleft()).reply.done():  # its caller may have been cancelled
+                return pending
         return None
 
-    def _take(self, place: _Place) -> _Owed | None:
-        """The same, or where there is none, one from the end of the longest queue."""
+    def _take(self, place: _Place) -> _Pending | None:
+        """Take the next request from a server's own queue, or else one from the end of the longest queue."""
         if place.aside:
             return None
-        if owed := self._own(place):
-            return owed
+        if pending := self._own(place):
+            return pending
         queue = max((other.queue for other in self._places), key=len)
         return queue.pop() if queue and not queue[-1].failed[place] else None
 
-    async def _work(self, place: _Place, owed: _Owed | None) -> None:
-        """Ask a server for one request after the other."""
-        while owed:
+    async def _work(self, place: _Place, pending: _Pending | None) -> None:
+        """Send a server one request after another until none is left for it."""
+        while pending:
             try:
-                await self._ask(place, owed)
-            except Exception as error:  # a bug, of which whoever asked has to hear
-                if not owed.reply.done():
-                    owed.reply.set_exception(error)
-            owed = self._take(place)
+                await self._ask(place, pending)
+            except Exception as error:  # a bug, which the caller must see
+                if not pending.reply.done():
+                    pending.reply.set_exception(error)
+            pending = self._take(place)
         place.busy -= 1
 
     def _run(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)  # a loop keeps no task alive
+        self._tasks.add(task)  # the event loop holds only weak references to tasks
         task.add_done_callback(self._tasks.discard)
 
-    async def _ask(self, place: _Place, owed: _Owed) -> None:
-        """Ask a server for a request until it answers, another one may, or there is no attempt left."""
+    async def _ask(self, place: _Place, pending: _Pending) -> None:
+        """Send a request until it is answered, another server may answer it, or no attempt is left."""
         while True:
             place.begun += 1
             nth, first = place.begun, place.busy == 1
-            owed.begun_s = perf_counter() if owed.begun_s is None else owed.begun_s
-            reply = await self._client.post(place.url, _PATH, json.dumps(owed.body()).encode())
+            pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
+            reply = await self._client.post(place.url, _PATH, json.dumps(pending.body()).encode())
             alone = first and place.begun == nth
-            reply = replace(reply, retries=owed.failed[place], begun_s=owed.begun_s, alone=alone)
+            reply = replace(reply, retries=pending.failed[place], begun_s=pending.begun_s, alone=alone)
             if not reply.again:
                 place.failures = place.pauses = 0
                 break
-            owed.failed[place] += 1
+            pending.failed[place] += 1
             if reply.status != 429:
                 self._failed(place, reply)
-            if any(not owed.failed[other] for other in self._places if not other.aside):
-                self._queue(owed)
+            if any(not pending.failed[other] for other in self._places if not other.aside):
+                self._queue(pending)
                 return
-            attempts = owed.failed.total()
+            attempts = pending.failed.total()
             if attempts > self._server.retries:
                 break
             wait_s = pause_s(attempts - 1) if reply.after_s is None else reply.after_s
             await asyncio.sleep(min(wait_s, LONGEST_WAIT_S))
             if place.aside:
-                self._queue(owed)
+                self._queue(pending)
                 return
-        if not owed.reply.done():
-            owed.reply.set_result(reply)
+        if not pending.reply.done():
+            pending.reply.set_result(reply)
 
     # -- who breaks down ------------------------------------------------------------------------------------
 
@@ -254,7 +255,7 @@ class Farm:
             self._set_aside(place)
 
     def _set_aside(self, place: _Place) -> None:
-        """Ask a server nothing until it is there again; what waits for it goes elsewhere."""
+        """Send a server no more requests until it answers again, and move its queue to other servers."""
         place.aside = True
         if len(self._places) > 1:
             self._say(f"server {printable(place.url)} is set aside ({place.fault})")
@@ -262,14 +263,14 @@ class Farm:
         self._queue_again(place)
 
     def _queue_again(self, *places: _Place) -> None:
-        waiting = [owed for place in places for owed in place.queue]
+        waiting = [pending for place in places for pending in place.queue]
         for place in places:
             place.queue.clear()
-        for owed in waiting:
-            self._queue(owed)
+        for pending in waiting:
+            self._queue(pending)
 
     async def _await(self, place: _Place) -> None:
-        """Look for a server that was set aside after longer and longer pauses, until it is there again."""
+        """Ask a server that was set aside for its model, after longer and longer pauses, until it answers."""
         try:
             while True:
                 await asyncio.sleep(pause_s(place.pauses))
@@ -286,7 +287,7 @@ class Farm:
                         )
                     )
             self._agree(place, model)
-        except Exception as error:  # a bug ends the run as well; nobody else awaits this
+        except Exception as error:  # a bug ends the run, too; nothing else awaits this task
             self._refused = error
             self._end(error)
             return
@@ -297,9 +298,9 @@ class Farm:
         self._wake()
 
     def _end(self, error: Exception) -> None:
-        for owed in list(self._owed):
-            if not owed.reply.done():
-                owed.reply.set_exception(error)
+        for pending in list(self._pending):
+            if not pending.reply.done():
+                pending.reply.set_exception(error)
 
     def _faults(self) -> str:
         return "; ".join(f"{printable(place.url)} ({place.fault})" for place in self._places)
@@ -310,7 +311,7 @@ class Farm:
     # -- what they have -------------------------------------------------------------------------------------
 
     async def _look(self, place: _Place) -> Model | None:
-        """What a server says of the model; None where nobody is there.
+        """Ask a server for its statement about the model; None if it does not answer.
 
         Raises:
             UserError: it refuses the key.
@@ -327,7 +328,7 @@ class Farm:
         data = reply.payload.get("data") if isinstance(reply.payload, dict) else None
         models = [entry for entry in data if isinstance(entry, dict)] if isinstance(data, list) else []
         named = [entry for entry in models if entry.get("id") == self._weights]
-        # A server with one model answers to any name.
+        # A server with one model accepts any name.
         for entry in named or (models if len(models) == 1 else []):
             listed = {k: v if type(v) is int else printable(v) for k in _LISTED if (v := entry.get(k))}
             return Model(listed, await self._version(place))
@@ -342,7 +343,7 @@ class Farm:
         return None
 
     def _agree(self, place: _Place, model: Model) -> None:
-        """Raise UserError unless a server has what the first one had."""
+        """Raise UserError unless a server has the same model as the first one."""
         url, weights = printable(place.url), printable(self._weights)
         if self._server.any_may_answer and model.listed is None:
             raise UserError(
@@ -358,5 +359,5 @@ class Farm:
 
 
 def _shown(model: Model) -> str:
-    said = {**(model.listed or {}), "version": model.version}
-    return " ".join(f"{key}={printable(value, 80)}" for key, value in said.items() if value is not None)
+    facts = {**(model.listed or {}), "version": model.version}
+    return " ".join(f"{key}={printable(value, 80)}" for key, value in facts.items() if value is not None)

@@ -1,6 +1,6 @@
-"""Asking a server for JSON once: deadlines, bounds, and a key that gets out nowhere.
+"""One HTTP request to a server, with deadlines, limits, and a key that never appears in output.
 
-Nothing that a server does raises: what it answers, and how it fails, is data.
+Nothing that a server does raises an exception: answers and failures are both data.
 """
 
 import asyncio
@@ -21,30 +21,30 @@ from harness.backends.openai.stream import Stream
 from harness.backends.servers import Server
 from harness.core.errors import UserError, printable
 
-CONNECT_S = 10.0  # a machine that is there answers sooner
-KEPT_S = 4.0  # that an idle connection stays open: uvicorn, and so vLLM, hangs up after 5
+CONNECT_S = 10.0  # a running server answers sooner
+KEPT_S = 4.0  # time that an idle connection stays open: uvicorn, and so vLLM, closes it after 5
 MOST_BYTES = 4 * 2**20  # an answer has a few thousand
-SHORTEST_SECRET = 8  # `EMPTY` is what many local servers are given, and may stand in any text
+SHORTEST_SECRET = 8  # shorter keys are no secrets: many local servers are given `EMPTY`
 _HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
-# What keeps a connection from coming about.
+# Errors that mean that there was no connection.
 _UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aiohttp.InvalidURL, UnicodeError)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of asking.
+    """Result of one request.
 
     Attributes:
         payload: the JSON value; None on a fault.
-        fault: why there is no payload, printable and bounded.
-        status: of HTTP; None where none came.
+        fault: why there is no payload; printable and of limited length.
+        status: HTTP status; None without a response.
         unreached: whether there was no connection at all.
-        again: whether another attempt may do better.
-        after_s: seconds that the server asks to wait before it.
-        first_at_s: when the first text of a stream came, by `time.perf_counter`; None where none was seen.
-        retries: attempts that failed before, at the server that gave this.
+        again: whether another attempt may succeed.
+        after_s: seconds that the server asks to wait before another attempt.
+        first_at_s: when the first text of a stream came, by `time.perf_counter`; None if it is not known.
+        retries: earlier failed attempts at the server that gave this reply.
         begun_s: when the first attempt began, by `time.perf_counter`.
-        alone: whether the server had no other request of ours meanwhile.
+        alone: whether the server had no other request of this program at the time.
     """
 
     payload: Any = None
@@ -60,9 +60,9 @@ class Reply:
 
 
 class Client:
-    """Asks servers, all with one key. Redirects are not followed, since the key would go with them.
+    """Sends requests to servers with one key. Redirects are not followed, since they would carry the key.
 
-    Inside `async with` its connections stay open. It sets no bound to how many there are.
+    Inside `async with` connections stay open; their number is not limited.
     """
 
     def __init__(self, server: Server) -> None:
@@ -86,21 +86,22 @@ class Client:
         await self._session.close()
 
     async def get(self, base: str, url: str) -> Reply:
-        """What is at a URL of a server."""
+        """Request a URL of a server."""
         return await self._once("GET", base, url, None, min(CONNECT_S, self._server.timeout_s))
 
     async def post(self, base: str, path: str, content: bytes) -> Reply:
-        """What a server answers to some JSON."""
+        """Send JSON to a server."""
         return await self._once("POST", base, base + path, content, self._server.timeout_s)
 
     async def _once(
         self, method: str, base: str, url: str, content: bytes | None, within_s: float
     ) -> Reply:  # fmt: skip
         try:
-            async with asyncio.timeout(within_s):  # of the whole attempt: a server may drip for ever
+            async with asyncio.timeout(within_s):  # for the whole attempt: a server may send bytes for ever
                 return await self._read(method, base, url, content)
         except (aiohttp.ClientError, UnicodeError) as error:
-            return Reply(fault=self._shown(_said(error)), unreached=isinstance(error, _UNREACHED), again=True)
+            fault = self._shown(_described(error))
+            return Reply(fault=fault, unreached=isinstance(error, _UNREACHED), again=True)
         except TimeoutError:
             return Reply(fault=f"no whole answer within {within_s:g} s", again=True)
 
@@ -141,11 +142,11 @@ class Client:
         )
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
-        """The JSON value without the key, however it was escaped, and whether there is one."""
+        """Parse JSON and remove the key from it, however it is escaped. Returns the value and the success."""
         try:
             payload = json.loads(data.decode("utf-8", "replace"))
             if self._key:
-                # Written again, since JSON knows many spellings of one text.
+                # Encoded again first, since JSON has many spellings of one text.
                 payload = json.loads(self._without_key(json.dumps(payload, ensure_ascii=False)))
         except (ValueError, RecursionError):
             return None, False
@@ -157,7 +158,7 @@ class Client:
         return text.replace(json.dumps(self._key)[1:-1], "[key]").replace(self._key, "[key]")
 
     def _shown(self, text: str) -> str:
-        # Before it is cut, or half of the key might stay.
+        # The key is removed before the text is cut, or half of it might stay.
         return printable(" ".join(self._without_key(text).split()), 200)
 
 
@@ -169,27 +170,27 @@ def _key(server: Server) -> str | None:
 
 
 def _proxy(url: str) -> str | None:
-    """The HTTP proxy that the environment names for a URL, if any."""
+    """Return the HTTP proxy that the environment names for a URL, if any."""
     parts, proxies = urlsplit(url), getproxies()
     if proxy_bypass(parts.hostname or ""):
         return None
     return proxies.get(parts.scheme) or proxies.get("all")
 
 
-def _said(error: Exception) -> str:
+def _described(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def _message(payload: Any) -> str:
-    """What an error says: servers put it under `error`, `error.message`, `message` or `detail`."""
+    """Return an error's message, which servers put at `error`, `error.message`, `message` or `detail`."""
     while isinstance(payload, dict):
-        found = [payload[name] for name in ("error", "message", "detail") if payload.get(name)]
-        payload = found[0] if found else json.dumps(payload)
+        texts = [payload[name] for name in ("error", "message", "detail") if payload.get(name)]
+        payload = texts[0] if texts else json.dumps(payload)
     return str(payload)
 
 
 def _after_s(text: str | None) -> float | None:
-    """Seconds that a Retry-After asks for, as a number or a date; None if it says nothing readable."""
+    """Return the seconds of a Retry-After header, which is a number or a date; None if it is unreadable."""
     if text is None:
         return None
     try:

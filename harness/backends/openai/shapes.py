@@ -1,7 +1,7 @@
-"""What is written to an OpenAI-compatible server, and how its answer is read.
+"""Build the JSON request for an OpenAI-compatible server, and read its answer.
 
-Servers differ in how a constrained answer is asked for. Whatever they promise, `harness.parsing.parse` is
-the judge.
+Servers differ in how a constrained answer is asked for. Whatever they promise, `harness.parsing.parse`
+decides whether an answer is valid.
 """
 
 import json
@@ -22,15 +22,15 @@ from harness.prompts.answer_schema import answer_schema
 from harness.prompts.readout import letters, stated
 
 TOP = 20  # most log-probabilities that servers give for one token
-# Greedy is not enough: some servers punish repetition unless told otherwise (llama_cpp.server by 1.1, vLLM by
-# what a checkpoint's generation_config.json says), and JSON repeats itself.
+# Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1, vLLM by
+# the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
     "vllm": "repetition_penalty",
     "llama-server": "repeat_penalty",
     "llama-cpp-python": "repeat_penalty",
     "lm-studio": "repeat_penalty",
 }
-# Drawing is from all tokens, which some servers cut to the likeliest unless told otherwise.
+# Tokens are drawn from the whole vocabulary; by default some servers draw from the likeliest only.
 _ALL: Mapping[Kind, Mapping[str, int]] = {
     kind: {"top_k": -1 if kind == "vllm" else 0, "min_p": 0} for kind in _PENALTY
 }
@@ -38,7 +38,7 @@ _ALL: Mapping[Kind, Mapping[str, int]] = {
 
 @dataclass(frozen=True)
 class Said:
-    """What a server's answer holds, in the fields of a completion; on an `error` nothing else counts."""
+    """A server's answer in the fields of a completion; if there is an `error`, the others mean nothing."""
 
     text: str = ""
     finish_reason: FinishReason = "error"
@@ -49,23 +49,23 @@ class Said:
 
 
 def data_url(image: Image) -> str:
-    """A picture as a server is sent it."""
+    """Encode a picture as the URL that a server is sent."""
     return f"data:image/png;base64,{b64encode(image.png()).decode()}"
 
 
 def digest_url(image: Image) -> str:
-    """What stands for a picture where a request is shown or kept."""
+    """Return the short URL that stands for a picture where a request is shown or stored."""
     return f"sha256:{image.sha256}"
 
 
 def body(
     card: Card, server: Server, request: Request, url: Callable[[Image], str] = data_url
 ) -> dict[str, Any]:
-    """The JSON of one chat completion, in one piece; `url` says where its picture is."""
+    """Build the JSON request of one chat completion, not streamed; `url` gives the URL of its picture."""
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
-    asked: dict[str, Any] = {
+    json_body: dict[str, Any] = {
         "model": card.weights,
-        # Texts stay texts: not every server and chat template takes parts.
+        # Plain text is not sent as parts, since not every server and chat template takes them.
         "messages": [
             in_parts([message], picture)[0] if picture and "image" in message else dict(message)
             for message in request.messages
@@ -76,36 +76,36 @@ def body(
         "stream": False,
     }
     if server.kind in _PENALTY:
-        asked[_PENALTY[server.kind]] = 1.0
+        json_body[_PENALTY[server.kind]] = 1.0
     if request.temperature:
-        asked |= {"top_p": 1, **_ALL.get(server.kind, {})}
+        json_body |= {"top_p": 1, **_ALL.get(server.kind, {})}
     if card.thinking == "switch":
-        asked["chat_template_kwargs"] = {"enable_thinking": request.thinking}
+        json_body["chat_template_kwargs"] = {"enable_thinking": request.thinking}
     if request.answer == "constrained":
-        asked |= _constraint(server.kind, request)
+        json_body |= _constraint(server.kind, request)
     if request.answer == "readout":
-        asked |= {"max_tokens": 1, "logprobs": True, "top_logprobs": TOP}
-    return asked
+        json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": TOP}
+    return json_body
 
 
 def _constraint(kind: Kind, request: Request) -> dict[str, Any]:
     schema = answer_schema(request.role, request.actions, form=request.form)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
-    if "evidence" in schema["properties"]:  # a constrained answer has no free text, as with local engines
+    if "evidence" in schema["properties"]:  # as with local engines, a constrained answer has no free text
         schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
-    # Numbers of a JSON Schema may run on for ever, or leave 0..1, with most servers; two decimals cannot.
+    # With a JSON Schema most servers allow numbers of any length, or outside 0..1; two decimals prevent both.
     if kind == "vllm":
         return {"structured_outputs": {"regex": _pattern(schema, re.escape)}}
     if kind in ("llama-server", "llama-cpp-python"):
         return {"grammar": f"root ::= {_pattern(schema, canonical_json)}"}
-    wanted = {"name": "answer", "strict": True, "schema": schema}
-    return {"response_format": {"type": "json_schema", "json_schema": wanted}}
+    json_schema = {"name": "answer", "strict": True, "schema": schema}
+    return {"response_format": {"type": "json_schema", "json_schema": json_schema}}
 
 
 def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
-    """Compact JSON of a schema: a regular expression, or a rule of llama.cpp's grammar.
+    """Write the compact JSON of a schema as a regular expression, or as a rule of llama.cpp's grammar.
 
-    For what an answer is made of, the two differ in nothing but how `literal` text is written.
+    For the parts of an answer the two differ only in how `literal` text is written.
     """
     if "enum" in schema:
         return f"({'|'.join(literal(json.dumps(value)) for value in schema['enum'])})"
@@ -119,7 +119,7 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
 
 
 def read(payload: Any, request: Request) -> Said:
-    """What a chat completion says. Anything that is none is an error, in one sentence."""
+    """Read a chat completion. A malformed one becomes an error, in one sentence."""
     try:
         choice = payload["choices"][0]
         message = choice["message"]
@@ -135,16 +135,16 @@ def read(payload: Any, request: Request) -> Said:
     if not isinstance(content, str) and not (content is None and thought):
         kind = "null" if content is None else type(content).__name__
         return Said(error=f"the answer's content is no text but {kind}")
-    # What a server's filter cut off is cut off.
+    # An answer that a server's content filter cut off counts as cut off.
     finish_reason: FinishReason = "length" if finish in ("length", "content_filter") else "stop"
     text = _whole(thought, content or "", finish_reason, request.thinking)
     return Said(text, finish_reason, *tokens)
 
 
 def _whole(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:
-    """The text as the model wrote it, where the server took the thought out: the parser looks for it.
+    """Restore the text as the model wrote it, if the server took out the thought: the parser looks for it.
 
-    An answer that was cut off with nothing behind the thought was cut off inside it, so it stays open.
+    An answer that was cut off with nothing after the thought was cut off inside it, so it stays open.
     """
     if not thought and not (asked and thought is not None):
         return content
@@ -156,10 +156,11 @@ def _whole(thought: str | None, content: str, finish_reason: FinishReason, asked
 def _read_out(
     choice: Mapping[str, Any], request: Request, prompt_tokens: int | None, completion_tokens: int | None
 ) -> Said:
-    """The letters' probabilities out of the likeliest tokens.
+    """Read the letters' probabilities from the list of the likeliest tokens.
 
-    A letter that is not listed is no likelier than the least likely token that is, nor, with all others that
-    are not listed, than what is left: it gets the most that it can have. `label_mass` is that of the listed.
+    A letter that is not listed is at most as likely as the least likely listed token, and all such letters
+    together have at most the remaining probability; each gets the most that it can have. `label_mass` counts
+    the listed letters only.
     """
     try:
         listed = [(t["token"], float(t["logprob"])) for t in choice["logprobs"]["content"][0]["top_logprobs"]]
@@ -167,19 +168,19 @@ def _read_out(
     except (LookupError, TypeError, ValueError, OverflowError):
         return Said(error="the server gives no log-probabilities")
     names = letters(request.actions)
-    found = {
+    listed_p = {
         letter: math.fsum(x for x, (token, _) in zip(p, listed, strict=True) if token == letter)
         for letter in names
     }
-    mass = math.fsum(found.values())
+    mass = math.fsum(listed_p.values())
     if not 0 < math.fsum(p) <= 1.001:
         return Said(error="the server's log-probabilities are none")
     if not mass:
         return Said(error=f"none of the letters {names} is among the {len(p)} likeliest tokens")
     tokens = {token for token, _ in listed}
     missing = [letter for letter in names if letter not in tokens]
-    left = max(0.0, 1.0 - math.fsum(p))
-    shares = [min(min(p), left / len(missing)) if x in missing else found[x] for x in names]
+    rest = max(0.0, 1.0 - math.fsum(p))
+    shares = [min(min(p), rest / len(missing)) if x in missing else listed_p[x] for x in names]
     return Said(stated(request.actions, shares), "stop", prompt_tokens, completion_tokens, min(1.0, mass))
 
 

@@ -1,23 +1,23 @@
-"""A chat completion that a server sends in pieces, put together again, and when its first token came.
+"""Assemble a streamed chat completion, and record when its first token came.
 
-Pieces are server-sent events (WHATWG HTML, 9.2), each a `data:` line of JSON, up to `[DONE]`. Nothing that
-comes raises: what is wrong with it is a fault, in one sentence.
+Pieces are server-sent events (WHATWG HTML, 9.2), each a `data:` line of JSON, up to `[DONE]`. Nothing in a
+stream raises an exception: an error becomes a fault, in one sentence.
 """
 
 import json
 from typing import Any
 
-ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # tokens are counted in the last piece
+ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # the last piece has the token counts
 _CUT_OFF = "the stream ends before the answer does"
 _THOUGHTS = ("reasoning_content", "reasoning")
 
 
 class Stream:
-    """What came so far of one completion.
+    """The received part of one completion.
 
     Attributes:
-        fault: why it is none, unbounded text of the server; None as long as it may become one.
-        again: whether another attempt may do better.
+        fault: why it is no completion, with text of the server of any length; None once it is one.
+        again: whether another attempt may succeed.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class Stream:
         self._last_at_s: float | None = None
 
     def take(self, data: bytes, at_s: float) -> None:
-        """Read on: bytes as they come, cut anywhere, and when they came."""
+        """Add received bytes, which may be cut anywhere, and the time at which they came."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             field, _, value = line.strip().partition(b":")
@@ -54,22 +54,22 @@ class Stream:
             self.fault = f"the stream broke off: {error.get('message') if isinstance(error, dict) else error}"
             return
         self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
-        for choice in (piece.get("choices") or [])[:1]:  # the last piece may have none, but the tokens' count
-            said = choice.get("delta") or {}
-            told = {name: said[name] for name in ("content", *_THOUGHTS) if said.get(name) is not None}
-            for name, text in told.items():
+        for choice in (piece.get("choices") or [])[:1]:  # the last piece may have token counts and no choice
+            delta = choice.get("delta") or {}
+            texts = {name: delta[name] for name in ("content", *_THOUGHTS) if delta.get(name) is not None}
+            for name, text in texts.items():
                 self._texts[name] = self._texts.get(name, "") + text
-            if any(told.values()):
+            if any(texts.values()):
                 self._first_at_s, self._last_at_s = self._first_at_s or at_s, at_s
             if choice.get("finish_reason"):
                 self._finish, self.fault = str(choice["finish_reason"]), None
 
     @property
     def first_at_s(self) -> float | None:
-        """When the first text came; None where all of it came at once: something on the way held it back."""
+        """When the first text came; None if all text came at once, so a buffer on the way hid the time."""
         return None if self._first_at_s == self._last_at_s else self._first_at_s
 
     def payload(self) -> dict[str, Any]:
-        """The completion as it would be in one piece."""
+        """Return the completion as a server would send it in one piece."""
         choice = {"message": {"content": "", **self._texts}, "finish_reason": self._finish}
         return {"choices": [choice], "usage": self._usage}

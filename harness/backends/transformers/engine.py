@@ -1,4 +1,4 @@
-"""Hugging Face transformers as an engine: any causal language model, on CPU or CUDA."""
+"""The Hugging Face transformers engine: any causal language model, on CPU or CUDA."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_bytes, sha256_file
 from harness.core.image import Image
 
-# What decides an answer; a README or a licence does not.
+# Suffixes of the files that decide an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
 
 
@@ -37,21 +37,21 @@ def open(
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
-    """Tokenizer and model of a checkpoint, ready to answer.
+    """Load the tokenizer and the model of a checkpoint.
 
     Raises:
-        UserError: files that do not load, weights that do not fill the model, no chat template.
+        UserError: files do not load, weights do not fill the model, or there is no chat template.
     """
     import transformers
 
     held_to_digest(card, where / "model.safetensors")
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
-    # trust_remote_code=False: else a checkpoint with code of its own asks at the terminal.
+    # trust_remote_code=False: otherwise a checkpoint with its own code asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
     try:
         with catch_warnings():
-            simplefilter("ignore")  # torch's of a pickle: what is wrong with it is said below
+            simplefilter("ignore")  # torch warns about a pickle, whose errors are reported below
             tokenizer = transformers.AutoTokenizer.from_pretrained(where, **options)
             kind = "AutoModelForImageTextToText" if card.vision else "AutoModelForCausalLM"
             model, report = getattr(transformers, kind).from_pretrained(
@@ -70,7 +70,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
             f"model {card.name!r} does not fit on {device}: {reason}; give another device or dtype"
         ) from error
     if report["missing_keys"]:
-        # transformers fills them with random numbers.
+        # transformers fills missing weights with random numbers.
         absent = sorted(report["missing_keys"])
         raise UserError(
             f"model {card.name!r} in {where} lacks {len(absent)} of its weights "
@@ -91,7 +91,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
 
 
 def device_of(asked: str | None) -> str:
-    """The device that a user means: CUDA where there is any, for None. Raises UserError for one not there."""
+    """Return the device that a user names; None means CUDA if there is any. Raises UserError if missing."""
     import torch
 
     if asked is None:
@@ -105,7 +105,7 @@ def device_of(asked: str | None) -> str:
 
 
 def gpus() -> list[str]:
-    """Names of the GPUs that torch sees; none where it is not installed."""
+    """Return the names of the GPUs that torch sees; empty if torch is not installed."""
     try:
         import torch
     except ImportError:
@@ -118,7 +118,7 @@ class TransformersEngine:
 
     Attributes:
         chat: its tokenizer and chat template.
-        context_tokens: the card's bound, else the checkpoint's own.
+        context_tokens: the card's limit, or else the checkpoint's own.
         stops: token ids that end an answer, sorted.
         eyes: its image processor; None if it takes no pictures.
         model: the transformers model.
@@ -143,17 +143,17 @@ class TransformersEngine:
         self._reader = Reader(self.model, self.eyes)
 
     def look(self, image: Image) -> list[int]:
-        """What stands for a picture in a prompt."""
+        """Return the tokens that stand for a picture in a prompt."""
         if self.eyes is None:
             raise ValueError(f"{self.card.name} takes no pictures")
         return self.eyes.look(image)
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
-        """Read some prompts. What they begin with in common, or earlier prompts did, is computed once."""
+        """Read some prompts; a beginning shared with each other or with earlier prompts is computed once."""
         return self._reader.begin(prompts)
 
     def identity(self) -> dict[str, Any]:
-        """What decides the answers: a hub checkpoint is named by its commit, any other by its files."""
+        """Return what decides the answers; a hub checkpoint is named by its commit, others by their files."""
         commit = hub_commit(self.where)
         return {
             "engine": "transformers",

@@ -1,4 +1,4 @@
-"""Pictures for a transformers model: its own image processor, and tokens that stand for what it sees.
+"""Vision of a transformers model: its image processor and encoder, and the tokens that stand for pictures.
 
 Importing this imports torch.
 """
@@ -25,14 +25,14 @@ class Eyes:
     """A loaded model's image processor and vision encoder.
 
     Attributes:
-        image_token: what its chat template writes for a picture.
+        image_token: token that its chat template writes for a picture.
     """
 
     def __init__(self, name: str, where: Path, vision: Vision, tokenizer: Any, model: Any) -> None:
         """Load the processor.
 
         Raises:
-            UserError: there is none, or it makes other tokens of a picture than the card says.
+            UserError: there is none, or a picture does not have as many tokens as the card says.
         """
         self._processor = Processor(name, where, vision)
         if difference := vision.difference(self._processor.tokens):
@@ -42,32 +42,36 @@ class Eyes:
         self.image_token: str = tokenizer.convert_ids_to_tokens(self._filled)
         self._before, self._after = _markers(tokenizer, vision.scaled_to_px is not None)
         self._images: WeakValueDictionary[int, Image] = WeakValueDictionary()
-        # What each layer gets of a picture; those used last are at the end.
+        # Each layer's inputs for a picture; the most recently used are at the end.
         self._encoded: OrderedDict[int, list[torch.Tensor]] = OrderedDict()
 
     def look(self, image: Image) -> list[int]:
-        """What stands for a picture in a prompt; it must be there until that is read."""
+        """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
         tokens = picture_tokens(image, self._processor.measured(image.pixels)[0])
         self._images[picture_of(tokens[0])[0]] = image
         return [*self._before, *tokens, *self._after]
 
     def forget(self, prompt: Sequence[int]) -> None:
-        """Encode a prompt's pictures again when they are read again."""
+        """Drop the encodings of a prompt's pictures, so that they are encoded again."""
         for key in _pictures(prompt):
             self._encoded.pop(key, None)
 
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
-        """The model's inputs for tokens (n, width): their ids, and the pictures among them in their order."""
+        """Return the model's inputs for tokens (n, width): their ids, and their pictures in order."""
         keys = _pictures(ids.flatten().tolist())
-        told: dict[str, Any] = {"input_ids": torch.where(ids < 0, self._filled, ids).to(self._model.device)}
+        token_ids = torch.where(ids < 0, self._filled, ids).to(self._model.device)
+        inputs: dict[str, Any] = {"input_ids": token_ids}
         if keys:
             first, *deeper = zip(*self._encodings(keys), strict=True)
-            seen = SimpleNamespace(pooler_output=first, deepstack_features=deeper)
-            told["mm_encoder_outputs"] = {"image": seen}
-        return told
+            features = SimpleNamespace(pooler_output=first, deepstack_features=deeper)
+            inputs["mm_encoder_outputs"] = {"image": features}
+        return inputs
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
-        """Where a prompt's tokens stand, (3, tokens): in time, height and width; None if in one row."""
+        """Return the positions of a prompt's tokens in time, height and width, (3, tokens).
+
+        None if the model numbers tokens consecutively.
+        """
         if not hasattr(self._model.model, "get_rope_index"):
             return None
         ids = torch.tensor([list(prompt)])
@@ -76,35 +80,35 @@ class Eyes:
             torch.where(ids < 0, self._filled, ids), mm_token_type_ids=(ids < 0).int(),
             image_grid_thw=torch.cat(grids) if grids else None,
         )  # fmt: skip
-        found: torch.Tensor = place[:, 0]
-        return found
+        positions: torch.Tensor = place[:, 0]
+        return positions
 
     def _encodings(self, keys: Sequence[int]) -> list[list[torch.Tensor]]:
-        """What each layer gets of some pictures, which are encoded together where they are not yet."""
-        owed = [key for key in dict.fromkeys(keys) if key not in self._encoded]
-        if owed:
-            made = self._processor([self._images[key].pixels for key in owed])
-            seen = self._model.model.get_image_features(
-                **{name: value.to(self._model.device) for name, value in made.items()}, return_dict=True
+        """Return each layer's inputs for some pictures; those not yet encoded are encoded together."""
+        new = [key for key in dict.fromkeys(keys) if key not in self._encoded]
+        if new:
+            inputs = self._processor([self._images[key].pixels for key in new])
+            features = self._model.model.get_image_features(
+                **{name: value.to(self._model.device) for name, value in inputs.items()}, return_dict=True
             )
-            layers = [seen.pooler_output, *getattr(seen, "deepstack_features", ())]
-            self._encoded |= {key: [layer[i] for layer in layers] for i, key in enumerate(owed)}
+            layers = [features.pooler_output, *getattr(features, "deepstack_features", ())]
+            self._encoded |= {key: [layer[i] for layer in layers] for i, key in enumerate(new)}
         for key in keys:
             self._encoded.move_to_end(key)
-        found = [self._encoded[key] for key in keys]
+        encodings = [self._encoded[key] for key in keys]
         while len(self._encoded) > KEPT:
             self._encoded.popitem(last=False)
-        return found
+        return encodings
 
 
 def _pictures(tokens: Sequence[int]) -> list[int]:
-    """The pictures whose first token is among these, in order."""
-    found = (picture_of(token) for token in tokens if token < 0)
-    return [key for key, place in found if place == 0]
+    """Return the pictures whose first token is among these, in order."""
+    pictures = (picture_of(token) for token in tokens if token < 0)
+    return [key for key, place in pictures if place == 0]
 
 
 def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
-    """Tokens before and behind a picture's, which the processor of some models writes, and no template."""
+    """Return the markers before and after a picture that some models' processors write, and no template."""
     if not written:
         return [], []
     around, whole = map(tokenizer.convert_tokens_to_ids, ("<fake_token_around_image>", "<global-img>"))

@@ -1,6 +1,7 @@
-"""A checkpoint's image processor, held to the limits of its card: pictures in, a model's inputs out.
+"""A checkpoint's image processor, with the limits of its card: turns pictures into a model's inputs.
 
-Importing this imports neither torch nor transformers; making a processor imports both, and reads no weights.
+Importing this imports neither torch nor transformers. Creating a processor imports both, and reads no
+weights.
 """
 
 import math
@@ -24,15 +25,11 @@ class Processor:
     """A checkpoint's image processor.
 
     Attributes:
-        tokens: what it makes of a picture of the card's size.
+        tokens: number of tokens of a picture of the card's size.
     """
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
-        """Load it.
-
-        Raises:
-            UserError: there is none.
-        """
+        """Load the processor. Raises UserError if the checkpoint has none."""
         from transformers import AutoConfig, AutoImageProcessor
 
         side = vision.scaled_to_px and {"longest_edge": max(vision.scaled_to_px)}
@@ -42,7 +39,7 @@ class Processor:
         )
         files = {"local_files_only": True, "trust_remote_code": False}
         try:
-            # Pillow, so that pictures are scaled alike wherever torchvision is installed or not.
+            # Pillow, so that pictures are scaled alike with and without torchvision.
             self._processor = AutoImageProcessor.from_pretrained(where, backend="pil", **files)
             self._config = AutoConfig.from_pretrained(where, **files)
         except Exception as error:  # a broken file surfaces as any of a dozen exception types
@@ -56,33 +53,33 @@ class Processor:
         self.tokens = self.measured(blank)[0]
 
     def __call__(self, pictures: list[Pixels]) -> "Mapping[str, torch.Tensor]":
-        """What the model's vision encoder reads."""
-        # A model that scales to one size takes a list for each row, of one.
+        """Return the inputs of the model's vision encoder."""
+        # A model that scales to one size takes one list of pictures for each row.
         images = [[pixels] for pixels in pictures] if "max_image_size" in self._options else pictures
-        found: Mapping[str, torch.Tensor] = self._processor(
+        inputs: Mapping[str, torch.Tensor] = self._processor(
             images=images, return_tensors="pt", **self._options
         )
-        return found
+        return inputs
 
     def measured(self, pixels: Pixels) -> tuple[int, Any]:
-        """Tokens of a picture of this size, and its grid of patches, where the model has one."""
+        """Return the number of tokens of a picture of this size, and its grid of patches if it has one."""
         if pixels.shape not in self._of_size:
-            made, eyes = self([pixels]), self._config.vision_config
-            grid = made.get("image_grid_thw")
+            inputs, config = self([pixels]), self._config.vision_config
+            grid = inputs.get("image_grid_thw")
             if grid is None:
-                square = eyes.patch_size * self._config.scale_factor
-                patches = [side // square for side in made["pixel_values"].shape[-2:]]
+                square = config.patch_size * self._config.scale_factor
+                patches = [side // square for side in inputs["pixel_values"].shape[-2:]]
             else:
-                patches = [int(side) // eyes.spatial_merge_size for side in grid[0, 1:]]
+                patches = [int(side) // config.spatial_merge_size for side in grid[0, 1:]]
             self._of_size[pixels.shape] = math.prod(patches), grid
         return self._of_size[pixels.shape]
 
 
 def tokens(card: Card) -> int:
-    """Tokens that the processor of a card's checkpoint makes of a picture of the card's size.
+    """Return the number of tokens that a card's processor makes of a picture of the card's size.
 
     Raises:
-        UserError: the checkpoint or its processor is not here.
+        UserError: the checkpoint or its processor is missing.
     """
     if card.vision is None:
         raise ValueError(f"card {card.name} takes no pictures")

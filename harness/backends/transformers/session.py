@@ -1,9 +1,9 @@
-"""Sequences that go forward together through a transformers model, cached keys and values in between.
+"""Sequences that advance together through a transformers model, with cached keys and values.
 
-Sequences of different length are padded on the left of what is new, so pads lie between old tokens and new
-ones. A mask hides them and positions do not count them, which full attention cannot tell from no padding at
-all. Other kinds of layer can (a sliding window counts pads, a recurrent state reads them): a model that has
-one reads each sequence on its own.
+Sequences of different length are padded on the left of the new tokens, so pads lie between old and new ones.
+A mask hides the pads and positions skip them, so full attention gives the same result as without padding.
+Other kinds of layer do not (a sliding window counts pads, a recurrent state reads them): a model that has one
+reads each sequence on its own.
 
 Importing this imports torch.
 """
@@ -26,7 +26,7 @@ class Reader:
     """A model that reads prompts.
 
     Attributes:
-        together: whether sequences can be padded, and so read in one batch.
+        together: whether sequences can be padded, and so be read in one batch.
     """
 
     def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
@@ -39,11 +39,11 @@ class Reader:
 
     def begin(self, prompts: Sequence[Sequence[int]]) -> Session:
         """Read some prompts, none of them empty."""
-        if self._failed:  # for want of memory, perhaps; what the failed call held is gone by now
+        if self._failed:  # perhaps because memory ran out; the failed call has released its own by now
             self._prefixes.clear()
             if self._model.device.type == "cuda":
                 torch.cuda.empty_cache()
-        self._failed = True  # until all went well
+        self._failed = True  # until reading has succeeded
         session = self._read(prompts)
         self._failed = False
         return session
@@ -51,9 +51,9 @@ class Reader:
     def _read(self, prompts: Sequence[Sequence[int]]) -> Session:
         if not self.together:
             return Apart([Rows(self, NOTHING, [prompt]) for prompt in prompts])
-        # Each prompt's last token is left to be read, for what comes after it.
+        # Each prompt's last token is always read, for the distribution after it.
         shared = common([list(prompt[:-1]) for prompt in prompts])
-        # A prompt that is asked again, alone, is read again: else its time would be no answer's time.
+        # A prompt that is repeated alone is read again, or its time would not be an answer's time.
         if self._eyes and len(prompts) == 1 and self._prefixes.holds(list(prompts[0])):
             self._eyes.forget(prompts[0])
         prefix = self._prefixes.longest(shared, but=prompts[0] if len(prompts) == 1 else ())
@@ -61,29 +61,29 @@ class Reader:
             prefix = Prefix(shared, Rows(self, prefix, [shared]).layers())
             self._prefixes.keep(prefix)
         rows = Rows(self, prefix, prompts)
-        if len(prompts) == 1:  # what the next prompt will have in common with it is not known yet
+        if len(prompts) == 1:  # its common beginning with the next prompt is not known yet
             self._prefixes.keep(Prefix(list(prompts[0]), rows.layers()))
         return rows
 
     def cache(self) -> DynamicCache:
-        """An empty cache of the model's layers."""
+        """Return an empty cache of the model's layers."""
         return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
-        """Where each prompt's tokens stand, (3, tokens); None where that is their number."""
+        """Return the positions of each prompt's tokens, (3, tokens); None if they are consecutive."""
         if self._eyes is None or not any(token < 0 for prompt in prompts for token in prompt):
             return None
         places = [self._eyes.positions(prompt) for prompt in prompts]
         return None if places[0] is None else places
 
     def forward(self, cache: DynamicCache, ids: Any, mask: Any, places: Any = None) -> Any:
-        """Logits behind the last column, (n, vocabulary).
+        """Read tokens and return the logits after the last column, (n, vocabulary).
 
         Args:
-            cache: what was read so far; what is read now is added.
+            cache: keys and values so far, to which the new ones are added.
             ids: tokens, (n, width), on the CPU.
-            mask: 1 where there is a token and 0 at a pad, (n, cached + width), on the CPU.
-            places: where they stand, (3, n, width), if not one behind the other.
+            mask: 1 for a token and 0 for a pad, (n, cached + width), on the CPU.
+            places: positions, (3, n, width), if they are not consecutive.
         """
         device = self._model.device
         options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
@@ -116,58 +116,58 @@ class Rows:
         self.advance([prompt[known:] for prompt in prompts])
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Each layer's keys and values so far, (n, heads, tokens, dim); never altered by going on."""
+        """Return each layer's keys and values, (n, heads, tokens, dim); advancing never alters them."""
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
         check_logits(self._logits.amax(-1).tolist())
-        found = []
+        best = []
         for row, tokens in zip(self._logits, among, strict=True):
             if tokens is None:
-                found.append(row.argmax())
+                best.append(row.argmax())
             else:
                 ids = torch.tensor(sorted(tokens), device=row.device)
-                found.append(ids[row[ids].argmax()])
-        chosen: list[int] = torch.stack(found).tolist()
+                best.append(ids[row[ids].argmax()])
+        chosen: list[int] = torch.stack(best).tolist()
         return chosen
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
         logits = self._logits.float()
         check_logits(logits.amax(-1).tolist())
-        some = logits if tokens is None else logits[:, list(tokens)]
-        found: Floats = (some - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
-        return found
+        selected = logits if tokens is None else logits[:, list(tokens)]
+        log_p: Floats = (selected - logits.logsumexp(-1, keepdim=True)).double().cpu().numpy()
+        return log_p
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         width = max(map(len, chunks))
         if width == 0:
             return
-        ids = torch.zeros(len(chunks), width, dtype=torch.long)  # masked where nothing is filled in
+        ids = torch.zeros(len(chunks), width, dtype=torch.long)  # pads stay 0 and are masked
         new = torch.zeros_like(ids)
         for row, chunk in enumerate(chunks):
             if chunk:
                 ids[row, width - len(chunk) :] = torch.tensor(chunk)
                 new[row, width - len(chunk) :] = 1
         self._mask = torch.cat([self._mask, new], dim=1)
-        logits = self._reader.forward(self._cache, ids, self._mask, self._standing(chunks, width))
-        moved = new[:, -1:].bool().to(logits.device)
-        self._logits = logits if self._logits is None else torch.where(moved, logits, self._logits)
+        logits = self._reader.forward(self._cache, ids, self._mask, self._positions(chunks, width))
+        advanced = new[:, -1:].bool().to(logits.device)
+        self._logits = logits if self._logits is None else torch.where(advanced, logits, self._logits)
 
-    def _standing(self, chunks: Sequence[Sequence[int]], width: int) -> Any:
-        """Where new tokens stand, (3, n, width); None if one behind the other."""
+    def _positions(self, chunks: Sequence[Sequence[int]], width: int) -> Any:
+        """Return the positions of new tokens, (3, n, width); None if they are consecutive."""
         if self._places is None:
             return None
-        standing = torch.zeros(3, len(chunks), width, dtype=torch.long)
+        positions = torch.zeros(3, len(chunks), width, dtype=torch.long)
         for row, chunk in enumerate(chunks):
             if not chunk:
                 continue
-            end = int(self._mask[row].sum())  # tokens of the row, these among them
+            end = int(self._mask[row].sum())  # number of the row's tokens, with the new ones
             place, start = self._places[row], end - len(chunk)
-            if end > place.shape[1]:  # behind the prompt each stands one further
+            if end > place.shape[1]:  # after the prompt, positions are consecutive
                 more = torch.arange(1, end - place.shape[1] + 1) + place.max()
                 place = self._places[row] = torch.cat([place, more.expand(3, -1)], dim=1)
-            standing[:, row, -len(chunk) :] = place[:, start:end]
-        return standing
+            positions[:, row, -len(chunk) :] = place[:, start:end]
+        return positions
 
     def keep(self, places: Sequence[int]) -> None:
         if self._places is not None:

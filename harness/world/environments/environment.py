@@ -1,7 +1,7 @@
-"""An environment of highway-env: its name as a scenario, making it, and what of it is used.
+"""Create an environment of highway-env from its scenario name, and access its actions and configuration.
 
-The name is `env:` and the id that gymnasium knows; where something of the configuration is changed, also
-`:config=` and the changes as JSON. So a name is enough to make the same again.
+The name is `env:` and the id that gymnasium knows, and for a changed configuration also `:config=` and the
+changes as JSON. So the name alone is enough to create the same environment again.
 """
 
 import json
@@ -16,34 +16,34 @@ from harness.core.files import canonical_json
 from harness.world.road import Lane
 
 PREFIX, CHANGES = "env:", ":config="
-KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # what reference drivers and the planner take
+KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
 def named(env: str, config: Any = None) -> str:
-    """The scenario's name of an environment, by its id and what its configuration changes."""
+    """Return an environment's scenario name, from its id and the changes of its configuration."""
     return f"{PREFIX}{env}" + (f"{CHANGES}{canonical_json(config)}" if config else "")
 
 
 def split(text: str) -> tuple[str, str | None]:
-    """A name, and settings such as `decisions=5` that may stand behind the id."""
+    """Split a text into the name and settings such as `decisions=5`, which may follow the id."""
     head, config, changes = text.partition(CHANGES)
     name, _, settings = head.rpartition(":")
     return (name + config + changes, settings) if "=" in settings else (text, None)
 
 
 def joined(name: str, settings: Sequence[str]) -> str:
-    """A scenario's name with settings; inverse of `split` for an environment's."""
+    """Add settings to a scenario's name; the inverse of `split`."""
     head, config, changes = name.partition(CHANGES)
     return ":".join([head, *([",".join(settings)] if settings else [])]) + config + changes
 
 
 def shown(name: str) -> str:
-    """A name as messages say it."""
+    """Return a name for use in messages."""
     return printable(name, 80)
 
 
 def reset(name: str, seed: int) -> Any:
-    """An environment at the start of a seed's episode. Raises UserError, in a line, if there is no such."""
+    """Return an environment at the start of a seed's episode. Raises UserError if there is none."""
     env = _made(name)
     _constants().restore()
     try:
@@ -59,7 +59,7 @@ def _made(name: str) -> Any:
     import highway_env
     from highway_env.envs.common.abstract import AbstractEnv
 
-    gymnasium.logger.min_level = gymnasium.logger.ERROR  # an old version is what the user asked for
+    gymnasium.logger.min_level = gymnasium.logger.ERROR  # no warning of an old version: the user named it
     highway_env._register_highway_envs()
     env_id, _, changes = name.removeprefix(PREFIX).partition(CHANGES)
     if not re.search(r"-v\d+$", env_id):
@@ -89,7 +89,7 @@ def _made(name: str) -> Any:
 
 
 def raised(error: Exception) -> str:
-    """What a user's code raised."""
+    """Describe an error that a user's code raised."""
     return f"{type(error).__name__}: {printable(error)}"
 
 
@@ -104,20 +104,20 @@ def _changed(name: str, changes: str) -> dict[str, Any]:
 
 
 def _merged(default: Any, value: Any) -> Any:
-    """A changed part of a configuration; what names its own type is taken whole."""
+    """Merge a change into a part of a configuration; a part that names its own type replaces the default."""
     if isinstance(default, dict) and isinstance(value, dict) and "type" not in value:
         return {**default, **{key: _merged(default.get(key), each) for key, each in value.items()}}
     return value
 
 
 def config(name: str) -> dict[str, Any]:
-    """An environment's whole configuration."""
+    """Return an environment's whole configuration."""
     whole: dict[str, Any] = json.loads(json.dumps(_made(name).config, default=str), parse_constant=str)
     return whole
 
 
 def meta_actions(name: str, env: Any) -> Any:
-    """The type of the ego's actions. Raises UserError if they are no meta-actions, or not of speed."""
+    """Return the type of the ego's actions. Raises UserError unless they are meta-actions of speed."""
     from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 
     kind = env.action_type
@@ -136,7 +136,7 @@ def meta_actions(name: str, env: Any) -> Any:
 
 
 def numbered(env: Any, kind: Any, action: str) -> Any:
-    """An action as the environment's `step` takes it; other controlled vehicles keep to theirs."""
+    """Encode an action for the environment's `step`; other controlled vehicles take IDLE."""
     if kind is env.action_type:
         return kind.actions_indexes[action]
     idle = [each.actions_indexes["IDLE"] for each in env.action_type.agents_action_types[1:]]
@@ -144,20 +144,20 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 
 
 def lane_of(v: Any) -> Lane:
-    """The lane that a vehicle steers for, of plain types: highway-env makes numbers NumPy's."""
+    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's)."""
     begin, end, number = getattr(v, "target_lane_index", v.lane_index)
     return str(begin), str(end), int(number or 0)
 
 
 @dataclass(frozen=True)
 class Constants:
-    """Class constants of highway-env's vehicles, such as IDM's gaps: some environments set all others'."""
+    """Class constants of highway-env's vehicles, such as IDM's gaps, which some environments overwrite."""
 
     values: Mapping[tuple[type, str], Any]
 
     @classmethod
     def now(cls) -> "Constants":
-        """As they are."""
+        """Read the present values."""
         from highway_env.vehicle import behavior, controller, kinematics
 
         kinds = {
@@ -167,7 +167,7 @@ class Constants:
         return cls({(kind, key): v for kind in kinds for key, v in vars(kind).items() if key.isupper()})
 
     def restore(self) -> None:
-        """Set them so again."""
+        """Set all constants to these values."""
         for (kind, key), value in self.values.items():
             if vars(kind)[key] is not value:
                 setattr(kind, key, value)
@@ -175,5 +175,5 @@ class Constants:
 
 @lru_cache(maxsize=1)
 def _constants() -> Constants:
-    """As highway-env has them, if nobody has set them before the first environment is made here."""
+    """Return highway-env's own values, read before the first environment is created here."""
     return Constants.now()

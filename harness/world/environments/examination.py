@@ -1,4 +1,4 @@
-"""Whether an environment can be frozen: tried once, before a dataset is built or an episode is driven."""
+"""Check once whether an environment can be frozen, before a dataset is built or an episode is driven."""
 
 from collections.abc import Sequence
 
@@ -12,9 +12,10 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 
 
 def examine(scenario: Scenario, seed: int) -> None:
-    """Raise UserError unless equal seeds give equal traffic, which copies and single frames go on with.
+    """Raise UserError unless equal seeds give equal traffic, also for copies and frame by frame.
 
-    Some decisions are taken by the environment's own `step`, twice, and frame by frame, by copies of copies.
+    Some decisions are simulated by the environment's own `step`, twice, and frame by frame by copies of
+    copies.
     """
     name = shown(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))
@@ -44,7 +45,7 @@ def examine(scenario: Scenario, seed: int) -> None:
 
 
 def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Places]:
-    """Where everybody is after each decision."""
+    """Return the poses of all vehicles after each decision."""
     env, found = reset(scenario.name, seed), []
     kind = meta_actions(scenario.name, env)
     for action in actions:

@@ -1,7 +1,7 @@
-"""The paths of any of highway-env's road networks: every route through it, on every lane.
+"""Derive the paths of any road network of highway-env: every route through it, on every lane.
 
-A road is named by its two nodes; a route is a chain of roads, each of which goes on where the one before it
-ends, from where nothing leads to where nothing leads on. A path keeps to one lane as far as there is one.
+A road is named by its two nodes. A route is a chain of consecutive roads, from one without a predecessor to
+one without a successor. A path keeps to one lane as long as there is one.
 """
 
 import math
@@ -18,8 +18,8 @@ from harness.world.road import Lane, Path, PathKey
 
 Street = tuple[str, str]  # the two nodes of a road
 Route = tuple[Street, ...]
-GAP_M = 6.0  # a lane that begins farther from a lane's end does not go on from it; lanes are 4 m wide
-TURN_RAD = math.radians(60.0)  # nor does one that is turned more
+GAP_M = 6.0  # a lane that begins farther from another's end does not continue it; lanes are 4 m wide
+TURN_RAD = math.radians(60.0)  # nor does a lane that is turned by more than this
 MOST_ROUTES = 200
 TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the right
 
@@ -29,9 +29,9 @@ class Routes:
     """A network's paths.
 
     Attributes:
-        network: highway-env's.
-        paths: by approach, the node where they begin, and route: where they go, and on which lane.
-        ways: of each route its paths from left to right.
+        network: highway-env's network.
+        paths: paths by approach (the node where they begin) and route (where they go, and on which lane).
+        ways: the paths of each route from left to right.
     """
 
     network: Any
@@ -39,7 +39,7 @@ class Routes:
     ways: dict[Route, tuple[PathKey, ...]]
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
-        """The roads that a vehicle in a lane will take by highway-env's rule, with a plan or without."""
+        """Return the roads that a vehicle in a lane will take by highway-env's rule and its plan, if any."""
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
             end = self.network.get_lane(lane)
@@ -51,14 +51,14 @@ class Routes:
         return tuple(streets)
 
     def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
-        """The paths that a vehicle in this lane may be on, those that go where it will go before others."""
+        """Return the paths that a vehicle in this lane may be on, those that best match its route first."""
         ahead = self.ahead(lane, plan)
         on_lane = [key for key, path in self.paths.items() if lane in path.lanes]
         return sorted(on_lane, key=lambda key: -_together(ahead, self.paths[key].lanes))
 
 
 def _together(ahead: Route, lanes: Sequence[Lane]) -> int:
-    """How many of the roads ahead a path takes."""
+    """Return how many of the roads ahead a path takes."""
     streets = [lane[:2] for lane in lanes]
     rest = streets[streets.index(ahead[0]) :]
     return sum(a == b for a, b in zip(ahead, rest, strict=False))
@@ -68,14 +68,14 @@ def routes(
     name: str, network: Any, begin: Street, origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
 ) -> Routes:  # fmt: skip
-    """Every path of a network as far as it lies within reach.
+    """Build every path of a network, as far as it lies within reach.
 
     Args:
-        name: what the network is of.
-        network: highway-env's.
-        begin: where a route begins on a road that has no beginning.
-        origin_m: of the frame of the paths, in the network's.
-        reach_m: how far from there the paths are drawn.
+        name: name of the environment, for messages.
+        network: highway-env's network.
+        begin: road at which a route begins on a ring.
+        origin_m: origin of the paths' frame, in the network's.
+        reach_m: distance from the origin up to which paths are built.
 
     Raises:
         UserError: there are more than MOST_ROUTES routes.
@@ -102,7 +102,7 @@ def routes(
 
 
 def _left_over(network: Any, covered: set[Lane]) -> Iterator[list[Lane]]:
-    """The lanes that no route takes, such as the inner one of a roundabout, in chains."""
+    """Yield chains of lanes that no route takes, such as the inner lane of a roundabout."""
     for lane in ((*street, n) for street in _streets(network) for n in range(len(_lanes(network, street)))):
         chain: list[Lane] = []
         while lane not in covered:
@@ -142,7 +142,7 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
     for street in streets:
         if street not in led_to:
             extend((street,))
-    for street in (begin, *streets):  # what comes round to itself has no beginning
+    for street in (begin, *streets):  # a ring has no beginning
         if not any(street in route for route in found):
             extend((street,))
             found += rings[:1]
@@ -151,7 +151,7 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
 
 
 def _goes_on(network: Any, street: Street, following: Street) -> bool:
-    """Whether some lane of the second road goes on from one of the first."""
+    """Whether some lane of the second road continues one of the first."""
     return any(
         _apart_m(a, b) <= GAP_M and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
         for a in _lanes(network, street)
@@ -165,12 +165,12 @@ def _lanes(network: Any, street: Street) -> Sequence[Any]:
 
 
 def _apart_m(lane: Any, following: Any) -> float:
-    """From where a lane ends to where another begins."""
+    """Return the distance from the end of a lane to the beginning of another."""
     return float(np.hypot(*(lane.position(lane.length, 0.0) - following.position(0.0, 0.0))))
 
 
 def _variants(network: Any, route: Route) -> list[list[Lane]]:
-    """The lanes of a route's paths, from left to right: one path through each lane of its widest road."""
+    """Return the lanes of a route's paths, from left to right: one path for each lane of its widest road."""
     widest = max(range(len(route)), key=lambda n: len(_lanes(network, route[n])))
     found = []
     for number in range(len(_lanes(network, route[widest]))):
@@ -186,7 +186,7 @@ def _variants(network: Any, route: Route) -> list[list[Lane]]:
 
 
 def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
-    """The lane of the next road, or of the one before, that a lane is joined with: by number, or nearest."""
+    """Return the lane of the next or previous road that joins a lane: by number, or else the nearest."""
     here, lanes = network.get_lane(lane), _lanes(network, street)
     if len(lanes) == len(_lanes(network, lane[:2])):
         return lane[2]
@@ -195,7 +195,7 @@ def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
 
 
 def _labels(network: Any, every: Sequence[Route]) -> list[str]:
-    """What routes are called: their turn where that tells those of one beginning apart, else their end."""
+    """Name routes by their turn if that is unique among those of one beginning, or else by their end."""
     turns = [(route[0][0], _turn(network, route)) for route in every]
     ends = [(route[0][0], f"to {route[-1][1]}") for route in every]
     by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)

@@ -1,4 +1,4 @@
-"""An environment as a scenario: its dials, its road, and where the ego is to go."""
+"""Make a scenario of an environment: its parameters, its road, and the ego's goal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from harness.world.scenario import Parameters as Common
 DIALS = ("decisions", "helpers", "time_limit_s", "delay_allowance_s")
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 AFTER, LIMIT = 2, 5  # decision periods after the last decision: to the goal by cruising, to the time limit
-REACH_M = 500.0  # from the middle of an episode: as far as paths are drawn
-BEHIND_M, BEYOND_M = 30.0, 40.0  # watched of the ego's ways, behind its start and beyond its goal
-BEFORE_M = (5.0, 45.0)  # watched of a path that meets the ego's, before that point
-HALFWAY = 0.4  # of the way to the goal lies the origin, the middle of pictures
+REACH_M = 500.0  # paths are built up to this distance from the middle of an episode
+BEHIND_M, BEYOND_M = 30.0, 40.0  # watched parts of the ego's ways, behind its start and beyond its goal
+BEFORE_M = (5.0, 45.0)  # watched part of a path that meets the ego's, before that point
+HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the middle of pictures
 
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The dials of an environment.
+    """The parameters of an environment.
 
     Attributes:
-        helpers: how many vehicles help: other controlled ones first, then those nearest to the ego.
+        helpers: number of helpers: other controlled vehicles first, then those nearest to the ego.
     """
 
     braking_mps2: float = 20.0  # highway-env's own controller has no limits
@@ -45,20 +45,20 @@ class Parameters(Common):
 
     @property
     def goal_s(self) -> float:
-        """The ego's goal is as far away as it would come in this time at its first target speed."""
+        """Time in which the ego would reach its goal at its first target speed; it defines the goal."""
         return (self.decisions + AFTER) * self.decision_period_s
 
 
 @dataclass(frozen=True)
 class Place:
-    """What is the same for every seed of an environment.
+    """The properties of an environment that are the same for every seed.
 
     Attributes:
         routes: the paths of its network.
         ends: where the network's lanes begin and end, m.
-        road: as the harness knows it.
-        actions: the ego's.
-        parameters: its dials.
+        road: the harness's road.
+        actions: the ego's actions.
+        parameters: the scenario's parameters.
         kind: name of the environment's class.
     """
 
@@ -72,7 +72,7 @@ class Place:
 
 @lru_cache(maxsize=16)
 def scenario(name: str) -> Scenario:
-    """An environment as a scenario. Raises UserError if it is none, or lacks something, in a line."""
+    """Make a scenario of an environment. Raises UserError if there is none, or it lacks something."""
     here = place(name)
     where = here.road.ego[1].partition(" lane ")[0]
     return Scenario(
@@ -94,12 +94,12 @@ def _road(name: str) -> Road:
 
 
 def _layout(seed: int, parameters: Any) -> Layout:
-    """Nobody knows what an environment's seeds hold: no vehicle of it counts as the danger."""
+    """Return an empty layout: the harness does not know an environment's vehicles, nor a danger."""
     return Layout((), (), None, None)
 
 
 def _nobody(xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
-    """An environment's world knows itself how far the ego has to go."""
+    """Return false: `EnvironmentWorld` itself decides whether the ego has reached its goal."""
     return np.zeros(xy_m.shape[:-2], dtype=bool)
 
 
@@ -110,12 +110,12 @@ def _start(scenario: Scenario, seed: int) -> Any:
 
 
 def first_target_mps(ego: Any) -> float:
-    """The speed that the ego aims at; where it is to stand, the highest that it may aim at."""
+    """Return the ego's target speed, or the highest possible one if that is 0."""
     return float(ego.target_speed) or float(max(ego.target_speeds))
 
 
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
-    """Where a network's lanes begin and end, m."""
+    """Return where a network's lanes begin and end, m."""
     return {
         (a, b, n): tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
         for a, nodes in network.graph.items() for b, lanes in nodes.items() for n, lane in enumerate(lanes)
@@ -124,7 +124,7 @@ def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
 
 @lru_cache(maxsize=16)
 def place(name: str) -> Place:
-    """What is the same for every seed, as seed 0 has it."""
+    """Return the properties that are the same for every seed, from seed 0."""
     env = reset(name, 0)
     ego, network = env.vehicle, env.road.network
     available = environment.meta_actions(name, env).actions.values()
@@ -191,7 +191,7 @@ def _sectors(
     paths: Mapping[PathKey, Path], ways: Sequence[PathKey], meetings: Mapping[PathKey, Any],
     watched_m: tuple[float, float],
 ) -> dict[str, Floats]:  # fmt: skip
-    """What must be seen: of each of the ego's ways, and of those that meet it before they do."""
+    """Return the points that must be seen: of the ego's ways, and of paths before they meet it."""
     sectors: dict[str, Floats] = {}
     for key in ways:
         points = _points(paths[key], np.linspace(*watched_m, 15))

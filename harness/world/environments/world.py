@@ -1,8 +1,8 @@
-"""An episode of an environment of highway-env, frame by frame.
+"""Simulate an episode of an environment of highway-env, frame by frame.
 
-`env.step` simulates a whole decision period and hides in which frame what happened. So the frames are
-simulated here, as `env._simulate` does, and at the end of each period `env.step` is called without frames of
-its own: whatever an environment adds to it, new traffic, rewards, ends, happens as it would.
+`env.step` simulates a whole decision period and hides the frame in which something happened. So the frames
+are simulated here, as `env._simulate` does, and at the end of each period `env.step` is called without
+simulating frames: whatever an environment adds to it (new traffic, rewards, endings) happens as usual.
 """
 
 import copy
@@ -23,7 +23,7 @@ from harness.world.simulator import DECIMALS, LAMPS_MPS2
 from harness.world.state import SIZES_M, Building, Kind, Part
 from harness.world.world import Snapshot, Target, World
 
-MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # that have an id in a record
+MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 
 @dataclass
@@ -33,9 +33,9 @@ class EnvironmentWorld(World):
     Attributes:
         env: highway-env's environment.
         constants: highway-env's class constants as this environment wants them.
-        here: what is the same for every seed.
+        here: properties that are the same for every seed.
         everybody: its vehicles in the order of their ids, the ego first.
-        born: how many vehicles there have been.
+        born: number of vehicles that have entered so far.
         action: the action that was taken last.
         taken: the frame and the name of each action.
         failed: whether the environment has ended the episode without success.
@@ -52,7 +52,7 @@ class EnvironmentWorld(World):
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """The start of a seed's episode. Raises UserError if its road or the ego's way is not seed 0's."""
+        """Start a seed's episode. Raises UserError if its road or the ego's way differs from seed 0's."""
         name, env = scenario.name, reset(scenario.name, seed)
         here, ego = place(name), env.vehicle
         if ends_of(env.road.network) != here.ends:
@@ -84,7 +84,7 @@ class EnvironmentWorld(World):
 
     @property
     def period(self) -> int:
-        """Frames between two decisions of the environment's."""
+        """Number of frames between two decisions of the environment."""
         p = self.scenario.parameters
         return round(p.decision_period_s * p.simulation_hz)
 
@@ -99,7 +99,7 @@ class EnvironmentWorld(World):
         self.everybody.append(v)
 
     def _place(self, v: Any) -> None:
-        """Note which path a vehicle is on: the one that it was on, if that can be."""
+        """Update a vehicle's path; it stays on its present one if that is possible."""
         road, now = self.here.road, (v.spawn.approach, v.spawn.route)
         keys: list[PathKey] = self.here.routes.keys(lane_of(v), getattr(v, "route", None))
         if v.spawn.part == "ego":
@@ -109,7 +109,7 @@ class EnvironmentWorld(World):
             v.spawn = replace(v.spawn, approach=approach, route=route)
 
     def branch(self) -> "EnvironmentWorld":
-        """A copy that goes its own way."""
+        """Return an independent copy."""
         network = self.road.network
         shared = (
             self.scenario, self.layout, self.here, self.beacons, self.constants, self.taken, network,
@@ -118,11 +118,11 @@ class EnvironmentWorld(World):
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> Snapshot:
-        """The actions so far: equal actions from the start lead to equal worlds."""
+        """Return the actions so far, since equal actions from the start lead to equal worlds."""
         return {"frame": self.frame, "taken": list(map(list, self.taken))}
 
     def take(self, action: str) -> None:
-        """Set the ego's target by a meta-action, now."""
+        """Set the ego's target by a meta-action."""
         kind = meta_actions(self.scenario.name, self.env)
         kind.act(kind.actions_indexes[action])
         self.action, self.taken = action, (*self.taken, (self.frame, action))
@@ -136,7 +136,7 @@ class EnvironmentWorld(World):
         return " ".join(map(str, aim)), int(ego.speed_index)
 
     def target_after(self, action: str) -> Target:
-        """What the ego would aim at if it took an action now."""
+        """Return the target that the ego would have if it took an action now."""
         ego, kept = self.everybody[0], (self.action, self.taken)
         own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
         self.take(action)
@@ -146,13 +146,13 @@ class EnvironmentWorld(World):
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until so many frames have passed or the episode is decided."""
+        """Simulate until frame `until_frame`, or until the episode is decided."""
         while self.frame < until_frame and not self.outcome.ended:
             super().advance(min(until_frame, (self.frame // self.period + 1) * self.period))
             self._recast()
 
     def _recast(self) -> None:
-        """Let vehicles that have left go, and new ones enter."""
+        """Remove vehicles that have left, and add new ones."""
         there = {id(v) for v in self.road.vehicles}
         self.everybody = [v for v in self.everybody if id(v) in there]
         known = {id(v) for v in self.everybody}
@@ -177,7 +177,7 @@ class EnvironmentWorld(World):
 
     def _end_period(self) -> None:
         env, ego = self.env, self.everybody[0]
-        env._simulate = lambda action=None: None  # its frames are simulated already
+        env._simulate = lambda action=None: None  # the frames have been simulated already
         if not _reads_observations(env):
 
             def nothing() -> None:
@@ -205,19 +205,19 @@ class EnvironmentWorld(World):
 
 
 def _reads_observations(env: Any) -> bool:
-    """Whether an observation, which takes as long as many frames, matters to how the episode goes on."""
+    """Whether observations, each as slow as many frames, affect the episode."""
     own = any(not f.__module__.startswith("highway_env.") for f in (type(env).step, type(env)._info))
     return own or type(env.observation_type).__name__ == "KinematicsGoalObservation"
 
 
 def _kind(v: Any) -> Kind:
-    """The kind whose size is nearest to the vehicle's."""
+    """Return the kind whose size is nearest to the vehicle's."""
     kinds: tuple[Kind, ...] = ("car", "van", "truck")
     return min(kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH))
 
 
 def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
-    """Solid objects on or beside the road, by their outlines along the axes; the nearest to the ego."""
+    """Return the solid objects nearest to the ego as buildings, by their axis-parallel bounding boxes."""
     solid = sorted((thing for thing in env.road.objects if thing.solid), key=partial(_apart_m, env.vehicle))
     boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
     return tuple(

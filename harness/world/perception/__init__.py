@@ -1,1 +1,1 @@
-"""From the world to what one vehicle knows of it: rays, sensors, scene graph."""
+"""What one vehicle perceives of the world: rays, sensors, scene graph, camera pictures."""

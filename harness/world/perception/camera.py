@@ -1,8 +1,8 @@
-"""What a vehicle's cameras see, as a picture: the front above the rear, each 120° wide.
+"""Render the pictures of a vehicle's cameras: the front above the rear, each 120° wide.
 
-Two pinhole cameras at the vehicle's centre, from where the rays of its sensors go out too (`rays`). Whom the
-sensors do not report owns no pixel, and a column of pixels sees past a vehicle only what is higher. A frame
-is a pure function of the state, so datasets hold none.
+Both are pinhole cameras at the vehicle's centre, where the rays of its sensors start as well (`rays`). A
+vehicle that the sensors do not report owns no pixel, and a column of pixels sees past a vehicle only what is
+higher. A frame is a pure function of the state, so datasets store none.
 
 Everything is a box on a flat road: what is on the far side of a lower one shows above it. Heights, paint and
 lamps are declared for this harness; light and weather are those of `harness.world.ambient`.
@@ -31,34 +31,34 @@ Places = NDArray[np.int16]
 Lit = NDArray[np.bool_]
 
 SIZE_PX = (512, 256)  # width and height of both cameras' pictures together
-EYE_M = 1.4  # of a camera above the road
+EYE_M = 1.4  # height of a camera above the road
 BUILDING_M = 6.0
-HORIZON = 0.36  # of a camera's rows that are above it
-REACH_M, CELL_M = 160.0, 0.2  # of the map of the ground, from the origin; beyond there is grass
+HORIZON = 0.36  # share of a camera's rows that are above the horizon
+REACH_M, CELL_M = 160.0, 0.2  # reach of the ground map from the origin (grass beyond), and its cell size
 LINE_M = 0.4  # width of a painted line
 DASH_M, GAP_M = 3.0, 4.5
 NOBODY = -1
-KEPT = 64  # frames drawn lately, 0.65 MB each
+KEPT = 64  # cached frames, 0.65 MB each
 
 GLARE = (255, 247, 224)
 GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
 WALL, BRICK = (182, 166, 142), (150, 132, 108)
-ROWS, COLUMNS = 32, 48  # of what is painted on a wall
+ROWS, COLUMNS = 32, 48  # resolution of the paint on a wall
 GLASS, TYRE, PLATE = (38, 48, 60), (28, 28, 30), (226, 226, 220)
 HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (250, 246, 222), (128, 22, 26), (255, 36, 32), (255, 170, 20)
-# None is like a lamp.
+# No coat has the colour of a lamp.
 COATS = ((36, 74, 140), (226, 228, 230), (56, 58, 62), (146, 150, 156), (44, 102, 70), (196, 176, 138))
 FRONT, RIGHT, REAR, LEFT = range(4)  # walls of a vehicle, as `VehicleState.corners` has them
 SHADE = np.array([0.96, 0.80, 0.88, 0.72])
-LAMPS = AMBIENTS[DAY]  # light of their own carries as by day
+LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 
 
 class Frame(Image):
-    """What the cameras of a vehicle see.
+    """A picture of a vehicle's cameras.
 
     Attributes:
-        owners: (height, width) place in `ids` of whose pixel it is; -1 for road, grass and sky.
-        ids: of vehicles and buildings.
+        owners: index in `ids` of the object that each pixel shows, (height, width); -1 for road, grass, sky.
+        ids: ids of vehicles and buildings.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
@@ -66,7 +66,7 @@ class Frame(Image):
         self.owners, self.ids = owners, ids
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
-        """Left, top, right and bottom of what each owns in either half, the last two beyond its pixels."""
+        """Return each object's bounding boxes in either half: left, top, right and bottom (exclusive)."""
         half, found = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
         for place, name in enumerate(self.ids):
             for top in (0, half):
@@ -78,7 +78,7 @@ class Frame(Image):
 
 
 def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX) -> Frame:
-    """What the cameras of one vehicle see, in a picture of this width and height, which is even."""
+    """Render the cameras of one vehicle, in a picture of this width and height; the height is even."""
     width, height = size_px
     viewer = state.vehicle(viewer_id)
     ambient = scenario.parameters.light
@@ -100,7 +100,7 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[
 
 @dataclass(frozen=True, eq=False)
 class Sight(Image):
-    """A frame that is drawn when its pixels are asked for, and not kept; another process gets the pixels."""
+    """A frame that is rendered when its pixels are read, and not stored; it is pickled as its pixels."""
 
     scenario: Scenario
     state: WorldState
@@ -125,14 +125,14 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 
 @dataclass(frozen=True)
 class Box:
-    """Something solid.
+    """A vehicle or building as a box.
 
     Attributes:
-        name: its id.
-        corners: (4, 2) m.
-        height_m: above the road.
-        walls: the paint on its walls, (4, ROWS, COLUMNS, 3).
-        lamps: which of that shines by itself, (4, ROWS, COLUMNS).
+        name: id.
+        corners: corners, (4, 2) m.
+        height_m: height above the road.
+        walls: paint on its walls, (4, ROWS, COLUMNS, 3).
+        lamps: which of that is a lamp that shines, (4, ROWS, COLUMNS).
     """
 
     name: str
@@ -143,18 +143,18 @@ class Box:
 
 
 def focal_px(width: int) -> float:
-    """Focal length of a camera whose pictures are so wide."""
+    """Return the focal length of a camera whose pictures are `width` pixels wide."""
     return width / 2 / math.tan(HALF_FIELD_RAD)
 
 
 def _half(
     scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float, width: int, rows: int
 ) -> tuple[Pixels, Places]:
-    """Pixels and owners of one camera, (rows, width, ...)."""
+    """Render pixels and owners of one camera, (rows, width, ...)."""
     eye, focal = np.array([viewer.x_m, viewer.y_m]), focal_px(width)
     heading = viewer.heading_rad + turned_rad
     ahead, right = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    # A ray of a column goes 1 m ahead, so that its parameter is the depth in metres.
+    # A column's ray has a component of 1 m ahead, so that its parameter is the depth in metres.
     across = (np.arange(width) + 0.5 - width / 2) / focal
     rays = ahead + across[:, None] * right
     below = np.arange(0.5, rows) - HORIZON * rows  # the horizon
@@ -172,7 +172,7 @@ def _half(
     near_first = np.argsort(depth, axis=1, kind="stable")
     up_to_m = np.where(np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0)
     nearer_m = np.pad(np.maximum.accumulate(up_to_m, axis=1), ((0, 0), (1, 0)))[:, :-1]
-    # All are higher than the eye: who is not higher than what is nearer does not show.
+    # All boxes are higher than the camera, so one shows only if it is higher than all nearer ones.
     for place, shows in reversed(list(zip(near_first.T, (up_to_m > nearer_m).T, strict=True))):
         columns = np.flatnonzero(shows)
         if not len(columns):
@@ -183,7 +183,7 @@ def _half(
         row, column = np.nonzero((height_m >= 0) & (height_m < heights[box]))
         onward = np.minimum(u * COLUMNS, COLUMNS - 1).astype(int)
         shades = SHADE[side, None, None] * walls[box, side, :, onward]
-        # Of each column, from the road up.
+        # A strip for each column, from the road up.
         strips = np.where(
             lamps[box, side, :, onward][..., None], _hazy(shades, z[:, None], LAMPS),
             _hazy(ambient.light * shades, z[:, None], ambient),
@@ -196,14 +196,14 @@ def _half(
 
 
 def _vehicle(state: WorldState, v: VehicleState) -> Box:
-    """A vehicle, in a coat that says nothing of it, with its lamps."""
+    """Return the box of a vehicle with its lamps; the colour of its coat tells nothing about it."""
     coat = COATS[int(noise.uniforms((1,), "coat", state.episode_seed, v.id)[0] * len(COATS))]
     return Box(v.id, v.corners(), HEIGHTS_M[v.kind], *_vehicle_walls(v.kind, coat, v.indicator, v.braking))
 
 
 @lru_cache(maxsize=256)
 def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tuple[Pixels, Lit]:
-    """What is painted on a vehicle from the road up, and what of it shines."""
+    """Paint the walls of a vehicle from the road up; return them and which parts are shining lamps."""
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = coat
     low, high = {"car": (0.55, 0.92), "van": (0.52, 0.86), "truck": (0.45, 0.72)}[kind]
@@ -234,7 +234,7 @@ def _building(name: str, corners: Floats) -> Box:
 
 @lru_cache(maxsize=1)
 def _building_walls() -> tuple[Pixels, Lit]:
-    """What is painted on any building from the ground up, of which nothing shines."""
+    """Paint the walls of a building from the ground up, without lamps."""
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = WALL
     walls[:, ::6] = BRICK
@@ -247,7 +247,7 @@ def _paint(
     colour: Colour,
     mirrored: bool = False,
 ) -> None:
-    """Paint from one share of its height to another, and of its length."""
+    """Paint a rectangle, given by shares of the wall's height and length (bottom, top, start, end)."""
     bottom, top, start, end = part
     if mirrored:
         start, end = 1 - end, 1 - start
@@ -255,7 +255,7 @@ def _paint(
 
 
 def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) -> Pixels:
-    """Sky and ground, (rows, width, 3)."""
+    """Render sky and ground, (rows, width, 3)."""
     ambient = scenario.parameters.light
     pixels = np.empty((len(below), len(rays), 3), dtype=np.uint8)
     sky = int(np.count_nonzero(below <= 0))
@@ -277,13 +277,13 @@ def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) ->
 
 
 def _hazy(colours: Floats, depth_m: Floats, ambient: Ambient) -> Floats:
-    """Colours as they are after so much air."""
+    """Fade colours towards the haze by their distance."""
     clear = np.exp(-depth_m / ambient.fades_m)[..., None]
     return np.asarray(clear * colours + (1 - clear) * np.array(ambient.haze))
 
 
 def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
-    """One camera's pixels with the sun at this angle to the right of its middle."""
+    """Add glare to one camera's pixels, with the sun at this angle to the right of its axis."""
     width = pixels.shape[1]
     off = turned(np.arctan((np.arange(width) + 0.5 - width / 2) / focal_px(width)) - sun_rad)
     clear = (1 - np.exp(-((off / ambient.glare_rad) ** 2)))[:, None]
@@ -292,7 +292,7 @@ def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
 
 @lru_cache(maxsize=8)
 def _ground_map(scenario: Scenario) -> Pixels:
-    """What lies where, (y, x) by `CELL_M` from the north-west: 0 grass, 1 asphalt, 2 paint."""
+    """Map the ground in cells of `CELL_M`, (y, x) from the north-west: 0 grass, 1 asphalt, 2 paint."""
     ground = scenario.road().ground(REACH_M)
     middles = (np.arange(round(2 * REACH_M / CELL_M)) + 0.5) * CELL_M - REACH_M
     x, y = np.meshgrid(middles, middles)
@@ -300,16 +300,16 @@ def _ground_map(scenario: Scenario) -> Pixels:
     marks = [dash for mark in ground.marks for dash in _dashes(shapely.LineString(mark * NORTH))]
     marks += [shapely.LineString(stop * NORTH) for stop in ground.stops]
     surface = np.zeros(x.shape, dtype=np.uint8)
-    for edge in edges:  # what is inside of two is no road: it goes round it
+    for edge in edges:  # the area inside of two edges is an island and no road
         surface ^= _inside(edge, x, y)
     for line in (*marks, *(edge.exterior for edge in edges)):
         surface[_inside(line.buffer(LINE_M / 2, cap_style="flat"), x, y) & (surface > 0)] = 2
-    surface[[0, -1]] = surface[:, [0, -1]] = 0  # what lies beyond is taken to be like the edge
+    surface[[0, -1]] = surface[:, [0, -1]] = 0  # grass, since look-ups beyond the map are clipped to its edge
     return surface
 
 
 def _inside(area: shapely.Geometry, x: Floats, y: Floats) -> NDArray[np.bool_]:
-    """Which of the grid's points lie in an area."""
+    """Return which of the grid's points lie in an area."""
     inside = np.zeros(x.shape, dtype=bool)
     west, north, east, south = area.bounds
     columns = slice(*np.searchsorted(x[0], (west, east)))

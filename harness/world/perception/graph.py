@@ -22,8 +22,8 @@ from harness.world.state import SIZES_M, VehicleState, WorldState, indicator
 
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
 ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
-ALIKE = 0.05  # paths that share a lane cost the same but for rounding
-STANDING_MPS = 0.5  # below that, a sensor's noise
+ALIKE = 0.05  # tolerance of costs: paths that share a lane differ by rounding only
+STANDING_MPS = 0.5  # a lower speed is taken for sensor noise
 ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
 
 Graph = dict[str, Any]
@@ -32,25 +32,25 @@ Graph = dict[str, Any]
 def scene_graph(
     scenario: Scenario, state: WorldState, viewer_id: str, left_out: Collection[str] = ()
 ) -> Graph:
-    """What the sensors of one vehicle know; some may be left out, as if no sensor reported them."""
+    """Return the scene graph of one vehicle's sensors; ids in `left_out` are treated as undetected."""
     road, viewer = scenario.road(), state.vehicle(viewer_id)
     detected = detect(state, viewer, sweep(state, viewer), scenario.parameters.light)
     detections = [d for d in detected if d.id not in left_out]
-    # What no sensor reports must not show by what it hides.
+    # An undetected vehicle must not reveal itself by what it hides.
     reported = {viewer.id, *(d.id for d in detections)}
     known = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
     return _graph(scenario, state, viewer, detections, _sectors(road, known, viewer))
 
 
 def blinded(graph: Mapping[str, Any]) -> Graph:
-    """What its viewer would know without sensors: itself and the ego's beacon, and nothing of any sector."""
+    """Return the graph of a viewer without sensors, who knows only itself and the ego's beacon."""
     unseen = {"seen_share": 0.0, "occluded": True, "by": []}
     sectors = [{**sector, **unseen} for sector in graph["sectors"]]
     return {**graph, "nodes": [], "conflicts": [], "sectors": sectors}
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> Graph:
-    """The ego's graph with everything in view and no noise: what only `full-view` may read."""
+    """Return the ego's graph with everything in view and no noise, which only `full-view` may read."""
     exact = list(map(_exact, state.vehicles[1:]))
     return _graph(scenario, state, state.ego, exact, [])
 
@@ -76,7 +76,7 @@ def _graph(
     def lamps(d: Detection) -> Graph:
         return {"braking": d.braking} if scenario.brake_lamps else {}
 
-    # Another one's place is in the ego's way too.
+    # The viewer itself may be in the ego's way, too.
     for d in [*detections, *([] if road.form == 1 or viewer.id == ego.id else [_exact(viewer)])]:
         path = _path_of(road, d)
         arc = path.project(d.x_m, d.y_m)[0] if path else None
@@ -120,7 +120,7 @@ def _relative(viewer: VehicleState, x_m: float, y_m: float) -> dict[str, float]:
 
 
 def _tenths(value: float) -> float:
-    """The value to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
+    """Round to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
     return round(float(value), 1) + 0.0
 
 
@@ -143,9 +143,9 @@ def _node(viewer: VehicleState, d: Detection, lane: str) -> Graph:
 
 
 def _path_of(road: Road, d: Detection) -> Path | None:
-    """The path an object is taken to follow: the nearest that fits its heading and its indicator.
+    """Return the path that an object seems to follow: the nearest that fits its heading and indicator.
 
-    Of paths alike the road's first.
+    Of equally good paths, the road's first one is taken.
     """
     best, least = None, ON_PATH_M
     alike = ALIKE if road.form == 2 else 0.0
@@ -154,7 +154,7 @@ def _path_of(road: Road, d: Detection) -> Path | None:
         turned = 0.0 if d.heading_rad is None else float(np.cos(d.heading_rad - heading))
         if d.heading_rad is not None and turned < np.cos(ALIGNED_RAD):
             continue
-        # Where routes part later they fit alike: a turn shows by the indicator, or under way.
+        # Routes that part later fit equally well until then, so the indicator decides.
         forks = ((path.approach, path.route), path.section(arc)) in road.forks
         unlikely = forks and indicator(path.route) != (d.indicator or "off")
         cost = lateral + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
@@ -166,7 +166,7 @@ def _path_of(road: Road, d: Detection) -> Path | None:
 def _meeting(
     road: Road, viewer: VehicleState, d: Detection, path: Path, arc: float, ego: VehicleState, ego_arc: float
 ) -> Graph | None:
-    """Where another's path crosses the ego's or merges into it, unless one of them is past it."""
+    """Return the conflict where another's path crosses or merges into the ego's; None if one is past it."""
     crossing = road.crossings.get((path.approach, path.route))
     if crossing is None:
         return None
@@ -190,9 +190,9 @@ def _meeting(
 def _along(
     road: Road, viewer: VehicleState, d: Detection, path: Path, arc: float, ego: VehicleState, ego_arc: float
 ) -> Iterator[Graph]:
-    """Where another meets the ego in a lane that both are in or the ego may change to, at their speeds now.
+    """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
 
-    Of who is behind whom only the one behind has a way to go; of two that meet head-on, both.
+    Of two vehicles in a row only the one behind has a distance to go; of two that meet head-on, both have.
     """
     its_heading, own = path.at(arc)[2], (ego.approach, ego.route)
     for side, key in road.beside(own, road.paths[own].project(d.x_m, d.y_m)[0]).items():
@@ -224,7 +224,7 @@ def _along(
 
 
 def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
-    """Arc length left (m, negative once past), and the seconds it takes (None at a standstill)."""
+    """Return the remaining arc length (m, negative once past) and time (s, None at a standstill)."""
     return {
         "arc_m": _tenths(to_go_m),
         "time_s": _tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None,
@@ -232,7 +232,7 @@ def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
 
 
 def _sectors(road: Road, state: WorldState, viewer: VehicleState) -> list[Graph]:
-    """How much of what must be seen of each sector is in sight, and which known thing hides the rest."""
+    """Return the share of each sector's points that is in sight, and which known objects hide the rest."""
     found = iter(blocked_by(state, viewer, road.watched))
     sectors = []
     for sector, points in road.sectors.items():

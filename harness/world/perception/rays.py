@@ -1,4 +1,4 @@
-"""Ray casting: what a vehicle has a line of sight to, past buildings and other vehicles."""
+"""Ray casting: which objects a vehicle has a line of sight to, past buildings and other vehicles."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,9 +18,9 @@ class Sweep:
     """One full turn of rays from a vehicle's centre.
 
     Attributes:
-        bearing_rad: (RAYS,) direction in the world frame.
-        range_m: (RAYS,) distance to the first surface; inf where there is none.
-        hits: id of a vehicle or building to the indices of the rays that end on it.
+        bearing_rad: direction of each ray in the world frame, (RAYS,).
+        range_m: distance to the first surface, (RAYS,); inf if there is none.
+        hits: indices of the rays that end on each vehicle or building, by id.
     """
 
     bearing_rad: Floats
@@ -29,19 +29,19 @@ class Sweep:
 
 
 def turned(angle_rad: Any) -> Any:
-    """The same angle, or angles, from -pi to pi."""
+    """Wrap an angle, or angles, to -pi to pi."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats]:
-    """Ids and corners (n, 4, 2) of everything that stops a ray, the viewer itself left out."""
+    """Return ids and corners (n, 4, 2) of everything that stops a ray, except the viewer itself."""
     solid = [v for v in state.vehicles if v.id != viewer.id]
     ids = [v.id for v in solid] + [b.id for b in state.buildings]
     return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Where rays meet the walls of surfaces; wall k of a surface goes from its corner k to the next.
+    """Intersect rays with the walls of surfaces; wall k of a surface goes from its corner k to the next.
 
     Args:
         origin: (2,) m.
@@ -49,20 +49,20 @@ def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, 
         corners: (n, 4, 2) m.
 
     Returns:
-        Ray parameter (r, 4n), inf where a wall is not met, and where along the wall from 0 to 1, (r, 4n).
+        Ray parameter, (r, 4n), inf if a wall is not met; and position along the wall from 0 to 1, (r, 4n).
     """
     start, along = (part.reshape(-1, 2) for part in _walls(origin, corners))
     return _met(start, along, targets[:, None])
 
 
 def _walls(origin: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Where each wall of surfaces (n, 4, 2) begins, seen from the origin, and how it goes on, both alike."""
+    """Return each wall's beginning relative to the origin and its vector, both (n, 4, 2)."""
     start = corners - origin
     return start, np.roll(corners, -1, axis=1) - origin - start
 
 
 def _met(start: Floats, along: Floats, targets: Floats) -> tuple[Floats, Floats]:
-    """`meetings` of walls (..., 2) and rays (..., 2) that fit each other."""
+    """Compute `meetings` for walls (..., 2) and rays (..., 2) that broadcast against each other."""
     (x, y), (dx, dy), (ray_x, ray_y) = (np.moveaxis(part, -1, 0) for part in (start, along, targets))
     # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
     determinant = ray_x * dy - ray_y * dx
@@ -73,7 +73,7 @@ def _met(start: Floats, along: Floats, targets: Floats) -> tuple[Floats, Floats]
 
 
 def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Where rays first meet a surface.
+    """Find where rays first meet a surface.
 
     Args:
         origin: (2,) m.
@@ -81,7 +81,7 @@ def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats
         corners: (n, 4, 2) m.
 
     Returns:
-        Ray parameter (r,), inf where nothing is met, and index (r,) of the object that is met first.
+        Ray parameter, (r,), inf if nothing is met; and index of the object that is met first, (r,).
     """
     t, _ = meetings(origin, targets, corners)
     edge = t.argmin(axis=1)
@@ -89,7 +89,7 @@ def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats
 
 
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
-    """Cast rays all round a vehicle."""
+    """Cast rays in all directions from a vehicle."""
     bearing, rays = _all_round()
     ids, corners = surfaces(state, viewer)
     origin = np.array([viewer.x_m, viewer.y_m])
@@ -110,14 +110,14 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
 
 
 def _towards(origin: Floats, corners: Floats) -> list[NDArray[np.intp]]:
-    """Indices of the rays that may meet each surface: from one side of its corners to the other."""
+    """Return the indices of the rays that may meet each surface: those between its outermost corners."""
     to = corners - origin
     bearing = np.arctan2(to[..., 1], to[..., 0])
     aside = turned(bearing - bearing[:, :1])
     step = 2 * np.pi / RAYS
     first = np.floor((bearing[:, 0] + aside.min(axis=1)) / step).astype(int).tolist()
     last = np.ceil((bearing[:, 0] + aside.max(axis=1)) / step).astype(int).tolist()
-    # Who stands in it, or right at it, may meet it all round.
+    # A viewer inside a surface, or right beside it, may meet it in any direction.
     all_round = (np.ptp(aside, axis=1) >= np.pi - step).tolist()
     return [
         np.arange(RAYS) if everywhere else np.arange(begin - 1, end + 2) % RAYS
@@ -127,13 +127,13 @@ def _towards(origin: Floats, corners: Floats) -> list[NDArray[np.intp]]:
 
 @lru_cache(maxsize=1)
 def _all_round() -> tuple[Floats, Floats]:
-    """Bearings (RAYS,) and their directions (RAYS, 2). Shared: not to be written to."""
+    """Return bearings (RAYS,) and their directions (RAYS, 2); shared arrays, not to be written to."""
     bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
     return bearing, np.column_stack([np.cos(bearing), np.sin(bearing)])
 
 
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
-    """For each of the points (k, 2) the id of what stands in its line of sight, None where it is seen."""
+    """Return for each of the points (k, 2) the id of what blocks the view of it; None if it is seen."""
     ids, corners = surfaces(state, viewer)
     origin = np.array([viewer.x_m, viewer.y_m])
     distance, met = first_hits(origin, points - origin, corners)

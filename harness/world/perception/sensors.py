@@ -1,4 +1,4 @@
-"""Three sensors on every vehicle, their reach and their noise.
+"""The three sensors of every vehicle, with their range and their noise.
 
 LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8 m/s.
 Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°, range rate
@@ -28,19 +28,19 @@ LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
 
 @dataclass(frozen=True)
 class Detection:
-    """One object as a vehicle's sensors together have it, in the world frame.
+    """One object as all of a vehicle's sensors together report it, in the world frame.
 
     Attributes:
-        id: the object's id (association across vehicles is taken to be perfect).
-        sensors: those that reported it, of `camera`, `lidar`, `radar`.
-        kind: class by camera, else None.
-        indicator: turn indicator by camera: `left`, `right` or `off`; else None.
+        id: the object's id (association across vehicles is assumed to be perfect).
+        sensors: those of `camera`, `lidar` and `radar` that reported it.
+        kind: class from the camera; None without one.
+        indicator: turn indicator from the camera: `left`, `right` or `off`; None without one.
         x_m: estimated position of the centre.
         y_m: estimated position of the centre.
-        heading_rad: estimated heading; None where only the radar saw it.
+        heading_rad: estimated heading; None if only the radar saw it.
         speed_mps: estimated speed.
-        range_rate_mps: closing is negative; by radar, else None.
-        braking: whether it is seen to brake; by camera, else None.
+        range_rate_mps: range rate from the radar, negative when closing; None without one.
+        braking: whether it is seen to brake, from the camera; None without one.
     """
 
     id: str
@@ -58,7 +58,7 @@ class Detection:
 def detect(
     state: WorldState, viewer: VehicleState, view: Sweep, ambient: Ambient = AMBIENTS[DAY]
 ) -> list[Detection]:
-    """What the sensors of one vehicle report, in the order of ids."""
+    """Return the detections of one vehicle's sensors, in the order of the state's vehicles."""
     found = []
     for v in state.vehicles:
         if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS:
@@ -83,7 +83,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState, ambient: Am
         return None
     z = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
 
-    # Across its bearing the radar is far coarser than the LiDAR, which gives the position where both see.
+    # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both see.
     if seen["lidar"]:
         x, y = v.x_m + LIDAR_NOISE_M * z[0], v.y_m + LIDAR_NOISE_M * z[1]
     else:
@@ -113,7 +113,7 @@ def _fused(state: WorldState, viewer: VehicleState, v: VehicleState, ambient: Am
 
 
 def _dazzled(state: WorldState, bearing_rad: float, ambient: Ambient) -> bool:
-    """Whether the sun shines into a camera from there."""
+    """Whether the sun blinds a camera in this direction."""
     if not ambient.glare_rad:
         return False
     return bool(abs(turned(bearing_rad - sun_rad(state.episode_seed))) < ambient.glare_rad)

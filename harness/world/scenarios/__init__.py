@@ -1,4 +1,4 @@
-"""Scenarios: a file each, named with `-` for `_`, that has a `SCENARIO`. A new scenario is a new file.
+"""Registry of scenarios. Each file here has a `SCENARIO`, whose name is the file's with `-` for `_`.
 
 Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
 """
@@ -18,18 +18,18 @@ from harness.world.environments import scenario as environments
 from harness.world.scenario import DIALS, Parameters, Scenario
 
 GROUP = "swarmdrive.scenarios"
-DEFAULT = "occluded-intersection"  # where none is named
+DEFAULT = "occluded-intersection"  # taken if none is named
 
 
 def names() -> tuple[str, ...]:
-    """Every scenario, in alphabetical order."""
+    """Return the names of all scenarios in alphabetical order."""
     return tuple(sorted({*_files(), *entry_points(group=GROUP).names}))
 
 
 def get(text: str) -> Scenario:
-    """The scenario of that name, or one with other beacons or light: `occluded-intersection:ambient=fog`.
+    """Return a scenario by name, with other settings if given: `occluded-intersection:ambient=fog`.
 
-    Raises UserError if there is none, or no such setting, or a value is not allowed.
+    Raises UserError if there is no such scenario or setting, or a value is not allowed.
     """
     if text.startswith(environment.PREFIX):
         name, settings = environment.split(text)
@@ -44,7 +44,7 @@ def get(text: str) -> Scenario:
 
 
 def dials(scenario: Scenario) -> tuple[str, ...]:
-    """The parameters that a name may set: `NAME:beacon_loss=0.3`, `NAME:ambient=fog`."""
+    """Return the parameters that a name may set: `NAME:beacon_loss=0.3`, `NAME:ambient=fog`."""
     return (*DIALS, *(environments.DIALS if scenario.start else ()))
 
 
@@ -74,12 +74,12 @@ def _named(name: str) -> Scenario:
 
 
 def is_here(name: str) -> bool:
-    """Whether a scenario is one of this package."""
+    """Whether a scenario is in this package."""
     return name in _files()
 
 
 def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
-    """A scenario with the parameters that a manifest states. Raises UserError where it has no such ones."""
+    """Return a scenario with the parameters of a manifest. Raises UserError if it has other parameters."""
     scenario = get(name)
     try:
         values: dict[str, Any] = {
@@ -95,10 +95,10 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:
-    """A scenario that came from another process."""
+    """Restore a pickled scenario."""
     return replace(get(name), parameters=parameters)
 
 
-@cache  # asked for every answer of the proxy
+@cache  # called for every answer of the proxy
 def _files() -> frozenset[str]:
     return frozenset(module.name.replace("_", "-") for module in iter_modules(__path__))
