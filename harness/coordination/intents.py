@@ -76,7 +76,7 @@ class Intents:
     def of_helpers(self, places: Ints) -> "Intents":
         """Return the helpers at these indices `(n, H')`, of decisions `(n, H)`; one may be repeated."""
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
-        taken = {
+        selected = {
             name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
             for name, array in self.arrays().items()
             if name not in ("own", "helpers")
@@ -88,7 +88,7 @@ class Intents:
             site=self.site and self.site.of_helpers(places),
             outlook=self.outlook and self.outlook.of_helpers(places),
             claims=self.claims and self.claims.of_helpers(places),
-            **taken,
+            **selected,
         )
 
     def arrays(self) -> dict[str, Any]:

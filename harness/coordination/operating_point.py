@@ -208,10 +208,10 @@ class OperatingPoint:
 
         Raises UserError for an unknown key, or for a value that is not allowed.
         """
-        known = [field.name for field in fields(cls)]
+        allowed = [field.name for field in fields(cls)]
         for key in values:
-            if key not in known:
-                raise unknown("operating point setting", str(key), known)
+            if key not in allowed:
+                raise unknown("operating point setting", str(key), allowed)
         if "name" not in values:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
@@ -370,8 +370,8 @@ def named_point(text: str) -> OperatingPoint:
         key, _, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
         if field not in SETTINGS and field not in channel_settings:
-            known = (*SETTINGS, *SHORT, *channel_settings)
-            raise unknown(f"setting of operating point {name}", key, known, f"; as in {name}:window_s=0.3")
+            allowed = (*SETTINGS, *SHORT, *channel_settings)
+            raise unknown(f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3")
         if field in settings or field in radio:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
         if field not in SETTINGS:

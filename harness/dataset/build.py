@@ -267,16 +267,16 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
 
 
-def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
+def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, audited: Audit | None) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
         f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
     )
     parameters = config["parameters"]
-    told = "Not audited for tells."
-    if found:
-        auc = found.auc["danger"]
-        told = (
+    audit_text = "Not audited for tells."
+    if audited:
+        auc = audited.auc["danger"]
+        audit_text = (
             "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
             f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness scenario audit`, n = {auc.n} "
             "layouts; .50 is a guess)."
@@ -290,7 +290,7 @@ Built by `{command}`.
 A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
 built every reference driver drove every layout in closed loop too, and ended as in the trees.
 
-{told}
+{audit_text}
 
 | who decides | success, % of {seeds} layouts |
 |---|---|

@@ -250,10 +250,10 @@ def find(name: str) -> Path:
     """Return the folder of a dataset, given by its path, or by its name if it is shipped or the project's."""
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         return Path(name)
-    known = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
-    if name in known:
+    names = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
+    if name in names:
         return beside("datasets", name)
-    raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
+    raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 
 
 def argument(path: Path) -> str:

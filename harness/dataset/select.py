@@ -35,17 +35,19 @@ class Selection:
     @property
     def given(self) -> dict[str, int | str]:
         """The conditions that are set, except `limit`, by name."""
-        others = {key: value for key, value in asdict(self).items() if key != "limit" and value is not None}
+        conditions = {
+            key: value for key, value in asdict(self).items() if key != "limit" and value is not None
+        }
         if self.sample is None:
-            del others["sample_seed"]
-        return others
+            del conditions["sample_seed"]
+        return conditions
 
     def of(self, dataset: Dataset) -> Dataset:
         """Return the dataset with only these episodes. Raises UserError for none, or an unknown danger."""
         numbers = list(dataset.episodes)
         if self.only is not None:
-            wanted = _numbers(self.only, max(numbers) + 1)
-            numbers = [n for n in numbers if n in wanted]
+            chosen = _numbers(self.only, max(numbers) + 1)
+            numbers = [n for n in numbers if n in chosen]
         if self.danger is not None:
             sectors = tuple(dataset.scenario.road().sectors)
             if self.danger not in (*sectors, NONE):

@@ -161,18 +161,18 @@ class Asker:
         chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
-        owed = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        if len(owed) < len(chunks):
-            self._progress(len(asked) - sum(map(len, owed)))
+        incomplete = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
+        if len(incomplete) < len(chunks):
+            self._progress(len(asked) - sum(map(len, incomplete)))
         new_answers: dict[str, Answer] = {}
         for answers in _answer_chunks(
-            partial(self._answered, backend), owed, 1 + math.ceil(window(backend) / size)
+            partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
         ):
             new_answers |= {answer.id: answer for answer in answers}
             if self._kept:
                 _keep(self._kept, answers)
             self._progress(len(answers))
-        self.answers |= {request.id: new_answers[request.id] for chunk in owed for request in chunk}
+        self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> list[Answer]:
         """Answer each request; one whose answer cannot be parsed gets a repair turn if its prompt has one."""
@@ -196,9 +196,9 @@ class Asker:
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
         """Return intents where helpers are shown nothing; NaN for those of moments not in `at`."""
-        wanted = [moments[n] for n in at.tolist()]
-        if any(self.lacks(wanted, blind=True)):
-            self.answer(list(requests(self.spec, self._not_given(wanted, blind=True), blind=True)))
+        blind_moments = [moments[n] for n in at.tolist()]
+        if any(self.lacks(blind_moments, blind=True)):
+            self.answer(list(requests(self.spec, self._not_given(blind_moments, blind=True), blind=True)))
         return self.laid_out(moments, blind=True)
 
     def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:

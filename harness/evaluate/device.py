@@ -53,7 +53,7 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
         own_row = agent.card.name.partition(":")[0] == row.model
         answerer = agent.card.name + ("" if own_row else f"'s answers at the speed of {row.model}")
         rates = [cast("Constant", getattr(row, rate)) for rate in devices.RATES]
-        origin = "; ".join(dict.fromkeys(f"{each.status}: {each.source}" for each in rates))
+        origin = "; ".join(dict.fromkeys(f"{rate.status}: {rate.source}" for rate in rates))
         joules = {c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES}
         descriptions.append(
             f"{answerer} on {device.name} ({row.precision}, batch {row.batch_size}; joules "

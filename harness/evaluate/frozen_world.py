@@ -63,8 +63,8 @@ class FrozenSource:
 
     def options(self) -> list[tuple[str, object]]:
         """Return the options for the dataset's folder and the selection of its episodes."""
-        given = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
-        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *given]
+        selection = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
+        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *selection]
 
 
 class _Walks:

@@ -54,11 +54,11 @@ def another(spec: Spec, scene: Scene) -> Scene:
     dataset = spec.source.dataset
     forest = dataset.forest
     n = forest.place[scene.id]
-    others = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
-    if not len(others):
+    candidates = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
+    if not len(candidates):
         raise UserError(
             f"--image another: no other episode of {dataset.name} has a decision point at step "
             f"{int(forest.step[n])}; give a greater --limit"
         )
-    drawn = int(noise.uniforms((1,), "another picture", scene.id)[0] * len(others))
-    return dataset.scenes([forest.ids[others[drawn]]])[0]
+    index = int(noise.uniforms((1,), "another picture", scene.id)[0] * len(candidates))
+    return dataset.scenes([forest.ids[candidates[index]]])[0]

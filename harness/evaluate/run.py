@@ -125,11 +125,11 @@ def evaluate_shard(
     """
     refuse_finished(out)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
-    mine = shard.part(chunks)
-    more(sum(map(len, mine)))
+    own_chunks = shard.part(chunks)
+    more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
-        _drive(spec, begun, mine, place, progress, None, workers)
-    return sum(map(len, mine))
+        _drive(spec, begun, own_chunks, place, progress, None, workers)
+    return sum(map(len, own_chunks))
 
 
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
@@ -274,12 +274,12 @@ def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[in
     """Walk a chunk in a worker process and return its files by name."""
 
     def backend() -> Backend:
-        asked = together(spec.cards, _open_all(spec), cache)
-        if digest(asked.identity()) != digest(begun.identity):
+        combined = together(spec.cards, _open_all(spec), cache)
+        if digest(combined.identity()) != digest(begun.identity):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
-        return asked
+        return combined
 
     return _walk_world(spec, _world_of(spec, chunk), Asker(spec, backend, begun.latency))
 

@@ -242,7 +242,7 @@ def _fusion_calls(
     """
     calls = {}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.asks_again):
-        alike = {point: each for point, each in due.items() if point.rewrites == rewrites}
+        alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
         calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said, sent), rewrites)
     return calls
 
@@ -253,10 +253,10 @@ def heard_codes(
 ) -> Ints:  # fmt: skip
     """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
-    for point, each in due.items():
+    for point, due_here in due.items():
         if point.asks_again:
             on_time = sent[point].on_time
-            codes.append(codes_of(on_time, each.at, shown(point, said[point]))[on_time.any(axis=1)])
+            codes.append(codes_of(on_time, due_here.at, shown(point, said[point]))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
 

@@ -250,13 +250,13 @@ class Decisions:
             if name not in table.column_names:
                 table = table.append_column(name, pa.nulls(len(table), NUMBER))
         helpers = sum(name.startswith("helper_") for name in table.column_names)
-        wanted = schema(actions, helpers)
-        if missing := [name for name in wanted.names if name not in table.column_names]:
+        expected = schema(actions, helpers)
+        if missing := [name for name in expected.names if name not in table.column_names]:
             raise ValueError(f"it lacks {', '.join(missing)}")
         for name in NEVER_UNKNOWN:
             if table[name].null_count:
                 raise ValueError(f"{name} is unknown in some rows")
-        return cls(table.select(wanted.names).cast(wanted).unify_dictionaries(), tuple(actions), helpers)
+        return cls(table.select(expected.names).cast(expected).unify_dictionaries(), tuple(actions), helpers)
 
     def frame(self) -> "pd.DataFrame":
         """Return a pandas table: names are categories, and flags may be unknown."""
@@ -291,8 +291,8 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
     return _of_buffer(numbers, ~np.isnan(numbers), NUMBER).cast(kind)
 
 
-def _of_buffer(values: Any, known: Any, kind: pa.DataType) -> pa.Array:
-    mask = None if known is None else pa.py_buffer(np.packbits(known, bitorder="little"))
+def _of_buffer(values: Any, valid: Any, kind: pa.DataType) -> pa.Array:
+    mask = None if valid is None else pa.py_buffer(np.packbits(valid, bitorder="little"))
     return pa.Array.from_buffers(kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))])
 
 
@@ -304,5 +304,5 @@ def _values(column: Any, unknown: float | int, kind: type) -> Any:
     if not array.null_count:
         return values
     end = array.offset + len(array)
-    known = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
-    return np.where(known, values, unknown)
+    valid = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
+    return np.where(valid, values, unknown)

@@ -184,9 +184,9 @@ def _with_summary(path: str, listed: Listed) -> Listed:
     """Return an entry as finished, with the best condition of its summary."""
     with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
         # Parse only the rows needed: a folder may hold a thousand summaries of a thousand rows.
-        wanted = (f",{SUCCESS},", f",{FAILED},")
+        markers = (f",{SUCCESS},", f",{FAILED},")
         head, *lines = [
-            line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in wanted)
+            line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
         ]
     table = list(csv.DictReader([head, *lines]))
     rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]

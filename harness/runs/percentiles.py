@@ -38,10 +38,10 @@ def differences(
     n = len(set().union(*(set(of_a[0].tolist()) for of_a, _ in common)))
     if not n:
         return
-    before, after = (
+    values_a, values_b = (
         known_mean(np.array([_percentiles(pair[side], weights) for pair in common]), 0) for side in (0, 1)
     )
-    for percent, x, y in zip(PERCENTILES, before, after, strict=True):
+    for percent, x, y in zip(PERCENTILES, values_a, values_b, strict=True):
         estimate = Estimate(float(y[0] - x[0]), *_ends(y - x, n), n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate
 
@@ -68,8 +68,8 @@ def _common(a: Decided, b: Decided) -> tuple[Decided, Decided]:
     """Return the known values of both runs, of the episodes in which both have some."""
     (known_a, known_b) = ((place[~np.isnan(v)], v[~np.isnan(v)]) for place, v in (a, b))
     in_both = np.intersect1d(known_a[0], known_b[0])
-    kept = [(p[np.isin(p, in_both)], v[np.isin(p, in_both)]) for p, v in (known_a, known_b)]
-    return kept[0], kept[1]
+    shared = [(p[np.isin(p, in_both)], v[np.isin(p, in_both)]) for p, v in (known_a, known_b)]
+    return shared[0], shared[1]
 
 
 def _percentiles(decided: Decided, weights: Ints) -> Floats:
