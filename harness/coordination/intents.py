@@ -1,4 +1,4 @@
-"""Define `Intents`: what every vehicle intends, with all that coordination needs about a set of decisions."""
+"""Define `Intents`: what vehicles intend in a set of decisions, and what else coordination needs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -1,4 +1,4 @@
-"""Consensus rules by name, with those that other packages add.
+"""Find consensus rules by name, those that other packages add included.
 
 A package adds a rule by an entry point in the group `swarmdrive.rules`; `Pool` makes a rule of a function of
 (p, weights). `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its prompt (the

@@ -1,4 +1,4 @@
-"""Schedules by name: formulas, files `schedules/*.toml` (shipped or a project's), and other packages'.
+"""Find schedules by name: formulas, files `schedules/*.toml` and those that other packages add.
 
 A file holds a learnt schedule and what it was learnt from; `harness schedule learn` writes it. A package adds
 a schedule by an entry point in the group `swarmdrive.schedules`.

@@ -1,4 +1,4 @@
-"""Schedules decide whom the ego asks and when, from what the ego knows before it asks.
+"""Schedules: rules for whom the ego asks and when, from what it knows before it asks.
 
 A schedule is one function of `Known` and one entry in `FORMULAS`, or a learnt network (`learnt.py`);
 `schedules.py` has all of them by name. It returns what asking each helper is worth, in its own unit. Helpers

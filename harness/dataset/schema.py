@@ -1,4 +1,4 @@
-"""The schema of a frozen dataset: the types of its manifest, trees and decision points, as JSON Schemas, too.
+"""The schema of a frozen dataset: the types of its manifest, trees and decision points.
 
 The types are enforced when a dataset is built and read. They are published beside it as JSON Schema, their
 docstrings included, and released datasets pin those files: a docstring here is part of the format.

@@ -1,4 +1,4 @@
-"""Ask the agents: one answer for each viewer at each decision point, kept at once so that a run resumes."""
+"""Ask the agents: one answer for each viewer at each decision point, kept so that a run can resume."""
 
 import math
 import os

@@ -1,7 +1,7 @@
-"""Choose the inference times that decide who is heard: the paper's, a card's, the user's, or a device's.
+"""Choose the inference times that decide which helpers are heard in time.
 
-The times, which may also be measured, are fixed before a run, so that its own speed changes none of its rows.
-The times that its answers took are recorded beside them.
+They come from the paper, a card, the user or a device profile, or are measured. They are fixed before a run,
+so that its own speed changes none of its rows. The times that its answers took are recorded beside them.
 """
 
 import math

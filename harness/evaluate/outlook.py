@@ -1,4 +1,4 @@
-"""Compute what an ego sees of the regions, and what it can infer that its helpers see before it asks any."""
+"""Compute what an ego sees of the regions, and what it can infer about its helpers' views before it asks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The registry of metrics: how each follows from the tables of decisions and episodes, and its words."""
+"""The registry of metrics: each one's meaning, and its values from decisions or episodes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Define the records of a run's files: their fields are the files' names, which docs/files.md explains."""
+"""Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
 from typing import Annotated, Any, Literal
 
