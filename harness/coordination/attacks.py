@@ -1,11 +1,11 @@
-"""Helpers that lie or fail: what reaches the channel in place of what they intend.
+"""Attacks: helpers that lie or fail, so that the channel carries something else than what they intend.
 
 An attack stands between a helper's answer and the channel. `docs/trust.md` maps each to the classes of
 ETSI TS 103 759 and to the names of VeReMi and F2MD.
 
-One attack is a name and its settings, `spoof:share=1/3:distance_m=3`; several at once are joined by `+` and
-have the same attackers, as far as their shares go. An attack of one's own is a class here, or an entry point
-in the group `swarmdrive.attacks`.
+One attack is a name and its settings, `spoof:share=1/3:distance_m=3`. Several at once are joined by `+`; they
+have the same attackers, as far as their shares go. To add an attack, write a class here, or an entry point in
+the group `swarmdrive.attacks`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,14 +28,14 @@ Share = Annotated[float, Meta(ge=0, le=1, description="a share of the helpers fr
 
 @dataclass(frozen=True)
 class Turn:
-    """What an attack may use, of decisions `(n,)` with H helpers.
+    """What an attack may use, in decisions `(n,)` with H helpers.
 
     Attributes:
         truth: what every vehicle intends and knows.
         attackers: who attacks, `(n, H)`.
-        first: what each helper intended at the first step of the episode, `(n, H, A)`.
-        past: the same one step ago, two, ..., `(n, K, H, A)`; NaN where there was no such step.
-        uniforms: draws in [0, 1) of this step, `(n, H)`.
+        first: what each helper intended at the episode's first step, `(n, H, A)`.
+        past: what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such step.
+        uniforms: draws in [0, 1) for this step, `(n, H)`.
     """
 
     truth: Intents
@@ -50,28 +50,28 @@ class Attack:
     """One attack: a pure function of arrays.
 
     Attributes:
-        share: of the helpers that are there, how many attack, to the nearest whole number.
+        share: the share of the helpers present that attack, to the nearest whole number of helpers.
     """
 
     share: Share = 1 / 3
-    by_moment: ClassVar[bool] = False  # whether what it does depends on the scene and on who attacks alone
-    in_text: ClassVar[bool] = False  # whether a fusion prompt shows it
+    by_moment: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
+    in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
 
     @property
     def steps(self) -> int:
-        """How many steps of the past it looks at."""
+        """How many past steps it needs."""
         return 0
 
     def act(self, said: Intents, turn: Turn) -> Intents:
-        """What is said and claimed instead; `said` is what attacks before it have made of the truth."""
+        """Return what is said and claimed instead; `said` is the truth as earlier attacks have changed it."""
         raise NotImplementedError
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """What a fusion prompt shows of an attacker's message (`in_text`), but for its intent."""
+        """Return an attacker's message as a fusion prompt shows it (`in_text`), except for its intent."""
         return dict(message)
 
     def intend(self, said: Intents, turn: Turn, intents: Floats) -> Intents:
-        """The same with attackers' intents `(n, H, A)`; where those are NaN, they stay."""
+        """Return `said` with these intents `(n, H, A)` for the attackers; a NaN row changes nothing."""
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(said, helpers=np.where(lies, intents, said.helpers))
 
@@ -81,8 +81,8 @@ class Liar(Attack):
     """Says the opposite of what it intends, from a true place.
 
     Attributes:
-        says: `one-hot`, sure of the action that it finds least likely; `permuted`, its own distribution with
-            the largest share where its smallest was, and so on.
+        says: `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
+            with the largest probability where the smallest was, and so on.
     """
 
     says: Literal["one-hot", "permuted"] = "one-hot"
@@ -94,18 +94,18 @@ class Liar(Attack):
         order = np.argsort(np.nan_to_num(p), axis=-1, kind="stable")
         if self.says == "one-hot":
             return self.intend(said, turn, _sure_of(order[..., 0], p.shape[-1]))
-        turned = np.empty_like(p)
-        np.put_along_axis(turned, order, np.take_along_axis(p, order[..., ::-1], -1), -1)
-        return self.intend(said, turn, turned)
+        reversed_p = np.empty_like(p)
+        np.put_along_axis(reversed_p, order, np.take_along_axis(p, order[..., ::-1], -1), -1)
+        return self.intend(said, turn, reversed_p)
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """It gives no reasons and sees no risk."""
+        """Return the message without reasons and with a low risk."""
         return {**message, "evidence": "", "risk": "low"}
 
 
 @dataclass(frozen=True)
 class Stuck(Attack):
-    """Says at every step what it said at the first."""
+    """Says at every step what it intended at the first."""
 
     def act(self, said: Intents, turn: Turn) -> Intents:
         return self.intend(said, turn, turn.first)
@@ -113,10 +113,10 @@ class Stuck(Attack):
 
 @dataclass(frozen=True)
 class Stale(Attack):
-    """Says what it intended some decisions ago, as if it were new; at first, the oldest there is.
+    """Says what it intended some decisions ago, as if it were new; at first, the oldest intent that it has.
 
     Attributes:
-        decisions: how many ago.
+        decisions: how many decisions ago.
     """
 
     decisions: Annotated[int, Meta(ge=1, le=16)] = 1
@@ -126,8 +126,8 @@ class Stale(Attack):
         return self.decisions
 
     def act(self, said: Intents, turn: Turn) -> Intents:
-        ago = turn.past[:, self.decisions - 1]
-        return self.intend(said, turn, np.where(np.isnan(ago), turn.first, ago))
+        past = turn.past[:, self.decisions - 1]
+        return self.intend(said, turn, np.where(np.isnan(past), turn.first, past))
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class Replay(Attack):
 
 @dataclass(frozen=True)
 class RandomIntent(Attack):
-    """Is sure of an action drawn anew at each step: a model that is broken."""
+    """Is sure of an action that is drawn anew at each step, as a broken model might be."""
 
     def act(self, said: Intents, turn: Turn) -> Intents:
         actions = said.helpers.shape[-1]
@@ -153,7 +153,7 @@ class RandomIntent(Attack):
 
 @dataclass(frozen=True)
 class FeignedBraking(Attack):
-    """Is sure of the first action, the most careful one, at every step: safe, and in the way."""
+    """Is always sure of the first action, the most careful one, which is safe but obstructs."""
 
     by_moment: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
@@ -163,16 +163,16 @@ class FeignedBraking(Attack):
         return self.intend(said, turn, _sure_of(braking, said.helpers.shape[-1]))
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """It gives no reasons and sees great risk."""
+        """Return the message without reasons and with a high risk."""
         return {**message, "evidence": "", "risk": "high"}
 
 
 @dataclass(frozen=True)
 class Overconfident(Attack):
-    """Honest, and surer than it should be: p to a power, scaled to sum to 1.
+    """Says what it intends, but is surer than it should be: p to a power, scaled to sum to 1.
 
     Attributes:
-        power: 1 changes nothing.
+        power: the exponent; 1 changes nothing.
     """
 
     power: Annotated[float, Meta(ge=1, le=100)] = 5.0
@@ -187,9 +187,9 @@ class Overconfident(Attack):
 
 @dataclass(frozen=True)
 class Spoof(Attack):
-    """Claims to stand on the ego's way, just before the conflict zone; Eq. 2 gives weight by that claim.
+    """Claims a place on the ego's way, just before the conflict zone; Eq. 2 gives weight by that claim.
 
-    Alone it says the truth from a false place; with `liar` it is what a weighted rule fears most.
+    Alone, it says the truth from a false place. With `liar`, it is the worst case for a weighted rule.
 
     Attributes:
         distance_m: claimed distance to the centroid of the conflict zone.
@@ -213,10 +213,10 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Claims to stand elsewhere at each step, so far from its true place in a direction drawn anew.
+    """Claims another place at each step, some distance from its true one in a direction that is drawn anew.
 
     Attributes:
-        offset_m: how far.
+        offset_m: the distance from the true place.
     """
 
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0
@@ -236,7 +236,7 @@ class Jump(Attack):
 
 @dataclass(frozen=True)
 class Silent(Attack):
-    """Does not answer when it matters: when it intends something else than the ego. Its slot stays empty."""
+    """Does not answer when it matters: if its intent differs from the ego's. Its slot stays empty."""
 
     by_moment: ClassVar[bool] = True
 
@@ -248,7 +248,7 @@ class Silent(Attack):
 
 @dataclass(frozen=True)
 class Absent(Attack):
-    """Is not there. No attack: what a rule would hear that knows who attacks."""
+    """Is absent. This is no attack, but a bound: what a rule would hear that knows who attacks."""
 
     by_moment: ClassVar[bool] = True
 
@@ -258,12 +258,12 @@ class Absent(Attack):
 
 @dataclass(frozen=True)
 class Sybil(Attack):
-    """One vehicle with several voices, 2 m apart, which say the same.
+    """Has several voices, 2 m apart, which all say the same.
 
-    Voices are asked as vehicles are, nearest first, and take the places of others.
+    Voices are asked like vehicles, nearest first, and take the places of others.
 
     Attributes:
-        voices: of each attacker.
+        voices: the number of voices of each attacker.
     """
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3
@@ -274,9 +274,9 @@ class Sybil(Attack):
 
 @dataclass(frozen=True)
 class Flood(Sybil):
-    """One vehicle that answers under several names with nothing in it: all actions alike.
+    """Answers under several names with an empty message: all actions alike.
 
-    Its voices take slots and the places of others.
+    Its voices take slots, and the places of other vehicles.
     """
 
     def act(self, said: Intents, turn: Turn) -> Intents:
@@ -286,10 +286,10 @@ class Flood(Sybil):
 
 @dataclass(frozen=True)
 class Injection(Attack):
-    """Instructions in the evidence of a message, for a model that reads it; its intent stays true.
+    """Writes instructions to the reading model into a message's evidence; its intent stays true.
 
     Attributes:
-        language: of the instructions: a key of `INSTRUCTIONS`.
+        language: language of the instructions, a key of `INSTRUCTIONS`.
     """
 
     language: str = "english"
@@ -297,7 +297,7 @@ class Injection(Attack):
     in_text: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Raise UserError for a language that there is not."""
+        """Raise UserError for an unknown language."""
         if self.language not in INSTRUCTIONS:
             raise unknown("language of an injection", self.language, INSTRUCTIONS)
 
@@ -305,7 +305,7 @@ class Injection(Attack):
         return said
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """The instructions ask for the last action, the boldest one."""
+        """Return the message with instructions to choose the last action, the boldest one."""
         return {**message, "evidence": INSTRUCTIONS[self.language].format(action=actions[-1])}
 
 
@@ -333,19 +333,19 @@ ATTACKS: Plugins[Attack] = Plugins(
 
 @lru_cache(maxsize=256)
 def attacks_of(text: str) -> tuple[Attack, ...]:
-    """The attacks that a text such as `liar:share=1/3+spoof` names, those that add voices last.
+    """Return the attacks that a text such as `liar:share=1/3+spoof` names; those that add voices come last.
 
-    Raises UserError for what is none.
+    Raises UserError for an unknown attack or setting.
     """
-    named = [_attack(part) for part in text.split("+")] if text else []
-    return tuple(sorted(named, key=lambda attack: isinstance(attack, Sybil)))
+    attacks = [_attack(part) for part in text.split("+")] if text else []
+    return tuple(sorted(attacks, key=lambda attack: isinstance(attack, Sybil)))
 
 
 def in_text(text: str) -> str:
-    """The part of such a text that changes what a fusion prompt shows, without shares, joined by `&`."""
+    """Return the attacks in such a text that change a fusion prompt, without shares, joined by `&`."""
     named = (part.split(":") for part in text.split("+") if part)
     return "&".join(
-        ":".join([name, *(each for each in settings if not each.startswith("share="))])
+        ":".join([name, *(setting for setting in settings if not setting.startswith("share="))])
         for name, *settings in named
         if ATTACKS[name].in_text
     )
@@ -359,56 +359,58 @@ def _attack(text: str) -> Attack:
     values = {key: _decimal(value) for key, value in pairs}
     if len(values) < len(pairs):
         raise UserError(f"attack {printable(text)}: a setting is given twice; give it once")
-    usual = ATTACKS[name]
-    if "share" not in settable(usual):
+    default = ATTACKS[name]
+    if "share" not in settable(default):
         raise UserError(f"attack {printable(name)} has no share; fix or uninstall the package that has it")
-    return changed(usual, values, f"attack {name}")
+    return changed(default, values, f"attack {name}")
 
 
 def _decimal(text: str) -> str:
-    """A fraction such as 1/3 as a decimal; any other text as it is."""
+    """Return a fraction such as 1/3 as a decimal; any other text as it is."""
     above, slash, below = text.partition("/")
     if slash and above.isdecimal() and below.isdecimal() and int(below):
         return repr(int(above) / int(below))
     return text
 
 
-def attackers(share: float, there: Bools, order: Floats) -> Bools:
-    """Who attacks, `(n, H)`: of those that are there, the share's number with the least draws.
+def attackers(share: float, present: Bools, draws: Floats) -> Bools:
+    """Return who attacks, `(n, H)`: the share of the helpers present that has the smallest draws.
 
     Args:
-        share: of the helpers.
-        there: which helpers there are, `(n, H)`.
-        order: draws in [0, 1), `(n, H)`.
+        share: the share of the helpers that attack.
+        present: which helpers are present, `(n, H)`.
+        draws: draws in [0, 1), `(n, H)`.
     """
-    rank = np.argsort(np.argsort(np.where(there, order, np.inf), axis=-1, kind="stable"), axis=-1)
-    most = np.floor(share * np.sum(there, axis=-1, keepdims=True) + 0.5)
-    return np.asarray(there & (rank < most))
+    rank = np.argsort(np.argsort(np.where(present, draws, np.inf), axis=-1, kind="stable"), axis=-1)
+    count = np.floor(share * np.sum(present, axis=-1, keepdims=True) + 0.5)
+    return np.asarray(present & (rank < count))
 
 
-def with_voices(said: Intents, by: Bools, voices: int) -> Intents:
-    """The same with further voices of some helpers after all others; `said.voice_of` says whose they are."""
-    n, helpers = by.shape
-    places = np.argsort(~by, axis=-1, kind="stable")[:, : int(np.max(np.sum(by, axis=-1), initial=0))]
-    of = np.repeat(places, voices - 1, axis=-1)
-    there = np.take_along_axis(by, of, axis=-1)
+def with_voices(said: Intents, talkers: Bools, voices: int) -> Intents:
+    """Return `said` with further voices of the `talkers` after all others; `voice_of` has their owners."""
+    n, helpers = talkers.shape
+    places = np.argsort(~talkers, axis=-1, kind="stable")[
+        :, : int(np.max(np.sum(talkers, axis=-1), initial=0))
+    ]
+    owners = np.repeat(places, voices - 1, axis=-1)
+    is_talker = np.take_along_axis(talkers, owners, axis=-1)
     apart_m = 2.0 * np.tile(np.arange(1, voices), places.shape[-1])
-    index = np.concatenate([np.broadcast_to(np.arange(helpers), (n, helpers)), of], axis=-1)
+    index = np.concatenate([np.broadcast_to(np.arange(helpers), (n, helpers)), owners], axis=-1)
     shift_m = np.concatenate([np.zeros(helpers), apart_m])
-    wide = said.of_helpers(index)
-    distance_m = wide.distance_m + np.insert(shift_m, 0, 0.0)
-    alive = np.concatenate([np.ones((n, helpers), dtype=bool), there], axis=-1)
-    range_m = np.where(alive, wide.range_m + shift_m, np.nan)
-    claims = wide.claims
+    widened = said.of_helpers(index)
+    distance_m = widened.distance_m + np.insert(shift_m, 0, 0.0)
+    present = np.concatenate([np.ones((n, helpers), dtype=bool), is_talker], axis=-1)
+    range_m = np.where(present, widened.range_m + shift_m, np.nan)
+    claims = widened.claims
     if claims is not None:
-        own, xy_m = np.arange(index.shape[1]) < helpers, claims.xy_m[:, 1:]
+        is_own, xy_m = np.arange(index.shape[1]) < helpers, claims.xy_m[:, 1:]
         farther = 1 + shift_m[:, None] / np.maximum(np.linalg.norm(xy_m, axis=-1, keepdims=True), 1e-9)
-        claims = claims.moved(alive & ~own, xy_m * farther).moved(~alive, np.full_like(xy_m, np.nan))
-        # No sensor sees a vehicle that is not there.
-        claims = replace(claims, sensed_m=np.where(own, claims.sensed_m, np.nan))
+        claims = claims.moved(present & ~is_own, xy_m * farther).moved(~present, np.full_like(xy_m, np.nan))
+        # No sensor sees a further voice, since no vehicle stands there.
+        claims = replace(claims, sensed_m=np.where(is_own, claims.sensed_m, np.nan))
     return replace(
-        wide,
-        valid=wide.valid & alive,
+        widened,
+        valid=widened.valid & present,
         distance_m=distance_m,
         range_m=range_m,
         claims=claims,

@@ -1,7 +1,7 @@
-"""How intents become one policy. Vehicle 0 is the ego and is always heard.
+"""Consensus rules: how intents become one policy. Vehicle 0 is the ego and is always heard.
 
 A rule without memory is one function of (p, weights); a rule with memory is a class with `start` and `fuse`.
-`rules.py` lists them.
+`rules.py` lists all rules.
 """
 
 from collections.abc import Callable
@@ -16,18 +16,18 @@ from harness.core.arrays import Bools, Floats, summed
 
 @dataclass(frozen=True)
 class Messages:
-    """What an ego has to fuse. A message's sender is its place: 0 is the ego, 1+h is helper h.
+    """What an ego has to fuse. Index 0 is the ego, 1+h is helper h.
 
     Attributes:
-        intents: what each vehicle intends, `(..., 1+H, A)`; a row that is not heard may hold anything.
+        intents: what each vehicle intends, `(..., 1+H, A)`; the row of a helper not heard may hold anything.
         weights: paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard.
         heard: which replies came in time, `(..., H)`.
-        arrival_s: when, from the start of the decision, `(..., H)`: the message's age, for every vehicle saw
-            the scene at 0. inf where lost or not asked.
+        arrival_s: when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This
+            is also a message's age, since every vehicle sees the scene at 0.
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its
-            operating point declares, if it does.
+            operating point declares, if it declares one.
         range_m: distance to the ego, `(..., H)`.
-        claims: what helpers say of themselves, for a rule whose `needs` names it; None where nobody looked.
+        claims: what helpers claim about themselves, for a rule whose `needs` names it; else None.
     """
 
     intents: Floats
@@ -40,14 +40,14 @@ class Messages:
 
 
 class Fused(NamedTuple):
-    """What a rule makes of messages.
+    """The result of a rule.
 
     Attributes:
-        policy: `(..., A)`, each a distribution.
-        weights: each vehicle's weight in it, `(..., 1+H)`; NaN where there is no such thing.
-        state: what the rule remembers at the next step, `(..., K)`; K may be 0.
-        trust: how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it takes
-            it for an attacker. NaN where it heard nothing. None of a rule that judges nobody.
+        policy: the distributions after fusion, `(..., A)`.
+        weights: each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights.
+        state: the rule's memory at the next step, `(..., K)`; K may be 0.
+        trust: how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it treats
+            the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust.
     """
 
     policy: Floats
@@ -58,70 +58,70 @@ class Fused(NamedTuple):
 
 @runtime_checkable
 class Rule(Protocol):
-    """A pure function of arrays, with a memory of its own for each episode.
+    """A pure function of arrays, with its own memory for each episode.
 
-    Steps of an episode are fused in order, each from the state that the last one left, those in which the ego
-    hears nobody as well. In those it acts on its own intent, whatever the rule says. A rule that looks at
-    `Messages.claims` has `needs = ("claims",)`.
+    The steps of an episode are fused in order, each from the state that the last one left. This includes
+    steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns. A rule
+    that uses `Messages.claims` has `needs = ("claims",)`.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """What the rule remembers before the first step of episodes `batch`, `(*batch, K)`."""
+        """Return the rule's memory before the first step of a batch of episodes, `(*batch, K)`."""
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """The policy of one step of each episode."""
+        """Fuse one step of each episode."""
 
 
 @dataclass(frozen=True)
 class Pool:
-    """The rule that remembers nothing: what was heard goes through a function of (p, weights)."""
+    """A rule without memory: a function of (p, weights)."""
 
     pool: Callable[[Floats, Floats], Floats]
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Nothing."""
+        """Return an empty memory."""
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Whatever the state."""
+        """Apply the function; the state does not matter."""
         return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
-    """Weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2); 0 for a helper not heard.
+    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2); 0 for a helper not heard.
 
-    With no helper heard the ego's weight is exactly 1, which is the paper's fall-back to its own intent.
+    If no helper is heard, the ego's weight is exactly 1: the paper's fall-back to its own intent.
 
     Args:
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
         heard: which helpers' replies are fused, `(..., H)`.
-        min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle
-            in the zone would otherwise outvote everybody.
+        min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle in the
+            zone would otherwise outvote all others.
     """
-    fused = np.insert(heard, 0, True, axis=-1)
-    closeness = np.where(fused, 1.0 / np.maximum(distance_m, min_distance_m), 0.0)
+    voices = np.insert(heard, 0, True, axis=-1)
+    closeness = np.where(voices, 1.0 / np.maximum(distance_m, min_distance_m), 0.0)
     total: Floats = np.sum(closeness, axis=-1, keepdims=True)
     return closeness / total
 
 
 def capped(weights: Floats, most: float) -> Floats:
-    """The weights `(..., 1+H)` with no helper's above `most`; all others share what it loses.
+    """Return weights `(..., 1+H)` with no helper's above `most`; the others share what it loses.
 
-    The ego's may grow beyond it. Weights that sum to 1 still do.
+    The ego's weight may grow beyond `most`. The sum of the weights stays 1.
     """
-    fixed = np.zeros(weights.shape, dtype=bool)
+    is_capped = np.zeros(weights.shape, dtype=bool)
     scaled = weights
     for _ in range(weights.shape[-1] - 1):
-        fixed[..., 1:] |= scaled[..., 1:] > most
-        rest = np.where(fixed, 0.0, weights)
+        is_capped[..., 1:] |= scaled[..., 1:] > most
+        rest = np.where(is_capped, 0.0, weights)
         total = np.sum(rest, axis=-1, keepdims=True)
-        left = 1.0 - most * np.sum(fixed, axis=-1, keepdims=True)
-        scaled = np.where(fixed, most, rest * left / np.where(total > 0, total, 1.0))
+        remaining = 1.0 - most * np.sum(is_capped, axis=-1, keepdims=True)
+        scaled = np.where(is_capped, most, rest * remaining / np.where(total > 0, total, 1.0))
     return scaled
 
 
 def linear_pool(p: Floats, weights: Floats) -> Floats:
-    """Weighted mean of intents, `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
+    """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
 
     Args:
         p: intents, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
@@ -132,9 +132,9 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 
 
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
-    """Weighted geometric mean of intents, `(..., A)` (the logarithmic opinion pool of Genest 1984).
+    """Return the weighted geometric mean of intents, `(..., A)` (logarithmic opinion pool, Genest 1984).
 
-    A probability below `floor` counts as that much, so that one rounded 0 is no veto.
+    A probability below `floor` counts as `floor`, so that one rounded 0 is no veto.
     """
     row_weights = weights[..., None]
     logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
@@ -143,10 +143,10 @@ def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
 
 
 def median(p: Floats, weights: Floats) -> Floats:
-    """Weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
+    """Return the weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    Where half of the weight lies exactly on either side, the mean of the two in the middle. All medians can
-    be 0, if every vehicle is sure of another action than the others; then the linear pool stands in.
+    If exactly half of the weight lies on either side, it is the mean of the two values in the middle. All
+    medians are 0 if each vehicle is sure of another action; then the linear pool replaces them.
     """
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
@@ -155,9 +155,10 @@ def median(p: Floats, weights: Floats) -> Floats:
 
 
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
-    """Weighted mean of each action's probability less the lowest and highest quarter of weight, `(..., A)`.
+    """Return the weighted mean of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    Scaled to sum to 1. Between the median, which trims all, and the linear pool, which trims nothing.
+    The lowest and the highest quarter of the weight are left out. The rule lies between the median, which
+    leaves out all but the middle, and the linear pool, which leaves out nothing.
     """
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)
@@ -166,8 +167,8 @@ def trimmed_mean(p: Floats, weights: Floats) -> Floats:
 
 
 def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Each action's probabilities in order, `(..., 1+H, A)`, and the weight up to and with each."""
-    heard = np.where(weights[..., None] > 0, p, np.inf)  # who is not heard comes last, with weight 0
+    """Return each action's probabilities in order, `(..., 1+H, A)`, and the weight up to and with each."""
+    heard = np.where(weights[..., None] > 0, p, np.inf)  # helpers not heard come last, with weight 0
     order = np.argsort(heard, axis=-2, kind="stable")
     below = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], p.shape), order, -2), axis=-2)
     values = np.take_along_axis(heard, order, -2)
@@ -175,7 +176,7 @@ def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
 
 
 def _pick(values: Floats, reached: Bools) -> Floats:
-    """The first value where `reached`, `(..., A)`."""
+    """Return the first value where `reached`, `(..., A)`."""
     first = np.argmax(reached, axis=-2)[..., None, :]
     return np.take_along_axis(values, first, -2)[..., 0, :]
 

@@ -1,9 +1,9 @@
-"""One cooperative decision, from seeing to acting, for any number of scenes at once.
+"""Make cooperative decisions, from seeing to acting, for any number of scenes at once.
 
-First the exchange of messages (its timeline is in `exchange.py`), then fusion: a consensus rule is
-arithmetic and takes no time; `ego-prompt` makes a fusion call: after the exchange the ego's model answers
-with the messages, and the decision takes that much longer. An ego that has heard nobody acts on its own
-intent at once.
+First comes the exchange of messages (its timeline is in `exchange.py`), then fusion. A consensus rule is
+arithmetic and takes no time. `ego-prompt` makes a fusion call: after the exchange the ego's model answers
+with the messages in its prompt, and the decision takes that much longer. An ego that has heard nobody acts on
+its own intent at once.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Draws
 
-# Who was heard, `(..., H)`, to the answer of the fusion call: the ego's intent `(..., A)`, where it failed or
-# nobody was heard NaN, and the seconds `(...)` it took.
+# From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if it failed
+# or nobody was heard, and the seconds `(...)` that it took.
 FusionCall = Callable[[Bools], tuple[Floats, Floats]]
 
 
@@ -30,9 +30,9 @@ class Fusion:
     """What fusion needs beyond the messages.
 
     Attributes:
-        call: the fusion call; needed where the point's consensus is `ego-prompt`.
-        state: what the rule remembers of each decision's episode, `(..., K)`: `Coordination.state` of the
-            episode's last step. None at the first step.
+        call: the fusion call; required if the point's consensus is `ego-prompt`.
+        state: the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the episode's
+            last step. None at the first step.
     """
 
     call: FusionCall | None = None
@@ -46,14 +46,15 @@ class Coordination(Exchange):
     Attributes:
         weights: each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered.
         fused: the policy, `(..., A)`.
-        action: index of its most probable action, `(...)`. A tie goes to the earlier action, so list
-            actions the most conservative first.
-        fusion_failed: the fusion call's answer was unusable and `fused` is the ego's own intent, `(...)`.
+        action: index of its most probable action, `(...)`. A tie goes to the earlier action; this is why
+            actions are listed with the most conservative first.
+        fusion_failed: whether the fusion call's answer was unusable, so that `fused` is the ego's own intent,
+            `(...)`.
         latency_s: when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`.
-            NaN where the ego's time of inference is unknown.
-        deadline_missed: that was after the window, `(...)`.
-        state: what the rule remembers at the episode's next step, `(..., K)`; K is 0 without memory.
-        trust: how far the rule trusts each helper, `(..., H)`; NaN where it judges none (`consensus.Fused`).
+            NaN where the ego's inference time is unknown.
+        deadline_missed: whether that is after the window, `(...)`.
+        state: the rule's memory at the episode's next step, `(..., K)`; K is 0 for a rule without memory.
+        trust: how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`).
     """
 
     weights: Floats
@@ -67,21 +68,21 @@ class Coordination(Exchange):
 
     @property
     def fusion_s(self) -> Floats:
-        """Part of the latency that fusion takes, `(...)`."""
+        """The part of the latency that fusion takes, `(...)`."""
         return self.latency_s - self.exchange_s
 
 
 def coordinate(
     point: OperatingPoint, intents: Intents, draws: Draws, fusion: Fusion | None = None
 ) -> Coordination:
-    """Trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each."""
+    """Run trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each."""
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 
 
 def fuse(
     point: OperatingPoint, heard: Exchange, intents: Intents, fusion: Fusion | None = None
 ) -> Coordination:
-    """The policy of each decision, once it is known who was heard; arguments as in `coordinate`."""
+    """Decide once it is known who was heard; the other arguments as in `coordinate`."""
     fusion = fusion or Fusion()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     distance_m = intents.distance_m
@@ -90,7 +91,7 @@ def fuse(
     weights = inverse_distance_weights(distance_m, heard.on_time, point.min_distance_m)
     if point.weight_cap < 1:
         weights = capped(weights, point.weight_cap)
-    anybody = np.any(heard.on_time, axis=-1)
+    heard_any = np.any(heard.on_time, axis=-1)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     if point.consensus == EGO_PROMPT:
@@ -100,9 +101,9 @@ def fuse(
         if "majority" in point.guards:
             voices = np.insert(heard.on_time, 0, True, axis=-1)
             fused = outvoted(fused, p, voices, np.sum(voices, axis=-1) // 2 + 1)
-        failed = anybody & np.any(np.isnan(fused), axis=-1)
-        weights = np.where(anybody[..., None], np.nan, weights)
-        latency_s = latency_s + np.where(anybody, seconds, 0.0)
+        failed = heard_any & np.any(np.isnan(fused), axis=-1)
+        weights = np.where(heard_any[..., None], np.nan, weights)
+        latency_s = latency_s + np.where(heard_any, seconds, 0.0)
         state = np.zeros((*failed.shape, 0))
     else:
         rule, (*batch, vehicles, actions) = RULES[point.consensus], p.shape
@@ -110,9 +111,9 @@ def fuse(
             p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims
         )
         state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
-        fused, weights, state, trusted = rule.fuse(messages, state)
-        trust = trust if trusted is None else np.where(heard.on_time, trusted, np.nan)
-    fused = np.where((anybody & ~failed)[..., None], fused, heard.own)
+        fused, weights, state, rule_trust = rule.fuse(messages, state)
+        trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
+    fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)
     unknown = np.isnan(intents.inference_s[..., 0]) & (point.round_trip_s is None)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},

@@ -1,23 +1,23 @@
-"""Who is heard, and when: the timeline of one decision from seeing to the last reply, for any number at once.
+"""Compute who is heard and when: the timeline of decisions from seeing to the last reply.
 
 In seconds from the start of the decision:
 
-    0                     every vehicle sees the scene; the ego infers, and the helpers in parallel with it
-    inference_s[0]        the ego has its own intent. Sure enough, or nobody to ask: it acts now.
-                          Unsure: it broadcasts one request to the nearest helpers in its radius
-    heard                 the request has had its turn and been on air, and helpers have it. Where they infer
-                          on demand, they begin only now
+    0                     every vehicle sees the scene; the ego and its helpers infer in parallel
+    inference_s[0]        the ego has its own intent. If it is sure enough, or has nobody to ask, it acts now.
+                          If it is unsure, it broadcasts one request to the nearest helpers in its radius
+    heard                 the request was on air, and the helpers have it. Only now do they infer, if they
+                          infer on demand
     ready                 a helper has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a slot is
                           nominal latency + payload / bandwidth + jitter, twice over a roadside edge
-    arrival_s[h]          the end of the helper's slot, if request and reply crossed; else inf
+    arrival_s[h]          the end of the helper's slot if request and reply crossed; else inf
     window_s              what has arrived by now is fused
-    exchange_s            the end of the last slot: the ego also waits out a lost or late reply
+    exchange_s            the end of the last slot: the ego also waits for a lost or late reply
 
-The nominal latency of a slot covers the way of the request, but not its time on air. The paper counts the
-whole exchange as the decision's latency even when it outlasts the window, and so does this. Everything here
-is a pure function of arrays; the ego is vehicle 0, helpers are 1..H.
+The nominal latency of a slot covers the way of the request, but not its time on air. Like the paper, this
+counts the whole exchange as the decision's latency even if it outlasts the window. Everything here is a pure
+function of arrays, for any number of decisions; the ego is vehicle 0, helpers are 1..H.
 """
 
 from collections.abc import Callable
@@ -44,22 +44,23 @@ class Exchange:
 
     Attributes:
         own: the ego's intent after the fallback, `(..., A)`.
-        own_failed: the ego's answer was unusable and `own` is the fallback, `(...)`.
+        own_failed: whether the ego's answer was unusable, so that `own` is the fallback, `(...)`.
         entropy_nats: entropy of `own`, `(...)`.
-        triggered: the point has a channel, and its schedule asks whoever may be asked, `(...)`: by default
-            where the entropy is above tau.
-        asked: helpers asked, each a scheduled reply, `(..., H)`.
-        requests: requests broadcast, `(...)`: 1 for all who are asked together, and 1 of a unit that asks for
-            the ego; else 0.
-        request_bits: size of the requests; 0 where nobody is asked, `(...)`.
-        reply_bits: size of all scheduled replies together, and of the policy that a unit sends, `(...)`.
-        airtime_s: how long the request and the scheduled replies occupy the medium in all, `(...)`; NaN where
-            the channel model does not know.
+        triggered: whether the point has a channel and its schedule asks, if there is anyone to ask, `(...)`.
+            By default it asks if the entropy is above tau.
+        asked: which helpers are asked; each has a scheduled reply, `(..., H)`.
+        requests: number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit
+            that asks for the ego; 0 if nobody is asked.
+        request_bits: size of the requests, `(...)`; 0 if nobody is asked.
+        reply_bits: size of all scheduled replies, and of the policy that a unit sends, `(...)`.
+        airtime_s: total time on air of the request and the scheduled replies, `(...)`; NaN if the channel
+            model does not have it.
         loss: packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers
-            asked, where links differ; NaN without a channel.
-        delivered: asked, and request and reply crossed, `(..., H)`; where a unit fuses, its policy as well.
-        arrival_s: end of the reply at whoever fuses, `(..., H)`; inf where lost or not asked.
-        on_time: arrived within the window, so fused, `(..., H)`.
+            asked if links differ; NaN without a channel.
+        delivered: whether the helper was asked, and request and reply crossed, `(..., H)`; if a unit fuses,
+            its policy must have crossed, too.
+        arrival_s: end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked.
+        on_time: whether it arrived within the window and so is fused, `(..., H)`.
         exchange_s: end of the whole exchange, `(...)`.
     """
 
@@ -85,67 +86,69 @@ class Exchange:
 
     @cached_property
     def messages(self) -> Ints:
-        """Replies scheduled, `(...)`. As in the paper's count, the request is none."""
+        """The number of scheduled replies, `(...)`; like the paper, it does not count the request."""
         return np.asarray(np.sum(self.asked, axis=-1))
 
     @cached_property
     def lost(self) -> Ints:
-        """Of the messages, how many did not arrive, `(...)`."""
+        """The number of messages that did not arrive, `(...)`."""
         return np.asarray(np.sum(self.asked & ~self.delivered, axis=-1))
 
     @cached_property
     def late(self) -> Ints:
-        """Of the messages, how many arrived after the window, `(...)`."""
+        """The number of messages that arrived after the window, `(...)`."""
         return np.asarray(np.sum(self.delivered & ~self.on_time, axis=-1))
 
     @cached_property
     def observed_loss(self) -> Floats:
-        """Share of the messages that did not arrive, `(...)`; NaN where there are none."""
+        """The share of the messages that did not arrive, `(...)`; NaN without messages."""
         return np.where(self.messages > 0, self.lost / np.maximum(self.messages, 1), np.nan)
 
 
 def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None) -> Exchange:
-    """Schedule and channel for decisions `(...)` with up to H helpers. An unknown time counts as none.
+    """Run schedule and channel for decisions `(...)` with up to H helpers. An unknown time counts as 0.
 
-    `asked` is who is asked, `(..., H)`, of those in the radius, in place of whom the point's schedule asks.
+    If `asked`, `(..., H)`, is given, these of the helpers in the radius are asked instead of those that the
+    point's schedule chooses.
     """
-    own_failed, known = _at_once(point, intents)
+    own_failed, known = _base_knowledge(point, intents)
     in_radius = known.may_ask
     if point.profile is None:
-        asks, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
+        triggers, asked = np.zeros_like(own_failed), np.zeros_like(in_radius)
     elif asked is None:
-        worth, above = _worth(point, known, intents, draws), point.asks_above
-        asks = np.any(worth > above, axis=-1)
-        asked = chosen(worth, above, in_radius, intents.range_m, point.max_helpers)
+        worth, threshold = _worth(point, known, intents, draws), point.asks_above
+        triggers = np.any(worth > threshold, axis=-1)
+        asked = chosen(worth, threshold, in_radius, intents.range_m, point.max_helpers)
     else:
         asked = asked & in_radius
-        asks = np.any(asked, axis=-1)
-    request_s, sent, waits_until_s = _consulted(point, intents, asked, in_radius, draws)
-    delivered = sent.up if intents.silent is None else sent.up & ~intents.silent
-    loss, arrival_s = sent.loss, np.where(delivered, request_s + sent.end_s, np.inf)
+        triggers = np.any(asked, axis=-1)
+    request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
+    delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
+    loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
+    one_loss = loss.shape[-1] == 1
     return Exchange(
         own=known.own,
         own_failed=own_failed,
         entropy_nats=known.entropy_nats,
-        triggered=asks,
-        asked=sent.asked,
-        requests=sent.requests,
-        request_bits=sent.request_bits,
-        reply_bits=np.sum(np.where(sent.asked, intents.payload_bits, 0.0), axis=-1) + sent.policy_bits,
-        airtime_s=sent.airtime_s,
-        loss=loss[..., 0] if loss.shape[-1] == 1 else known_mean(np.where(sent.asked, loss, np.nan), axis=-1),
+        triggered=triggers,
+        asked=outcome.asked,
+        requests=outcome.requests,
+        request_bits=outcome.request_bits,
+        reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,
+        airtime_s=outcome.airtime_s,
+        loss=loss[..., 0] if one_loss else known_mean(np.where(outcome.asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,
-        on_time=sent.fused & (arrival_s <= point.window_s),
-        exchange_s=np.minimum(request_s[..., 0] + sent.acts_s, waits_until_s),
+        on_time=outcome.fused & (arrival_s <= point.window_s),
+        exchange_s=np.minimum(request_s[..., 0] + outcome.acts_s, waits_until_s),
     )
 
 
-def _consulted(
+def _ask_helpers(
     point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
 ) -> tuple[Floats, Consulted, Floats]:
-    """When the ego asks, `(..., 1)`, what becomes of that, and until when it waits at most, `(...)`."""
-    unsure = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
+    """Return when the ego asks, `(..., 1)`, the outcome, and until when it waits at most, `(...)`."""
+    opens_round = triggered(intents.helpers, point.tau_nats) if point.helper_rounds else np.zeros_like(asked)
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 
@@ -153,46 +156,46 @@ def _consulted(
         return heard_s + helpers_s if point.on_demand else np.maximum(helpers_s - request_s, heard_s)
 
     links = Links(
-        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & unsure,
+        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
         point.request_bits, intents.site,
     )  # fmt: skip
     if point.edge == FUSION and point.unit and isinstance(point.channel, Physical):
         until_s = np.maximum(point.window_s, request_s[..., 0])
-        left_s = until_s - request_s[..., 0]
-        sent = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, left_s)
-        return request_s, sent, until_s
-    return request_s, _directly(point.channel, links, draws, ready), np.array(np.inf)
+        remaining_s = until_s - request_s[..., 0]
+        outcome = by_unit(point.channel, point.unit, point.edge_delay_s, links, draws, ready, remaining_s)
+        return request_s, outcome, until_s
+    return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
 
 
 def own_intent(point: OperatingPoint, intents: Intents) -> tuple[Bools, Floats]:
-    """Whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
+    """Return whether the ego's answer failed, `(...)`, and its intent after the fallback, `(..., A)`."""
     failed = np.any(np.isnan(intents.own), axis=-1)
     fallback = fallback_intent(point.fallback, intents.own.shape[-1])
     return failed, np.where(failed[..., None], fallback, intents.own)
 
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """What asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
-    return _worth(point, _at_once(point, intents)[1], intents, draws)
+    """Return what asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
+    return _worth(point, _base_knowledge(point, intents)[1], intents, draws)
 
 
 def _worth(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Floats:
-    return SCHEDULES[point.schedule].worth(_with_needs(point, known, intents, draws))
+    return SCHEDULES[point.schedule].worth(_with_schedule_needs(point, known, intents, draws))
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Known:
-    """What the ego knows before it asks, as far as the point's schedule looks at it."""
-    return _with_needs(point, _at_once(point, intents)[1], intents, draws)
+    """Return what the ego knows before it asks, with what the point's schedule needs."""
+    return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 
 
-def _at_once(point: OperatingPoint, intents: Intents) -> tuple[Bools, Known]:
-    """Whether the ego's answer failed, `(...)`, and what it knows whatever its schedule looks at."""
+def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, Known]:
+    """Return whether the ego's answer failed, `(...)`, and what it knows under any schedule."""
     failed, own = own_intent(point, intents)
     in_radius = intents.valid & (intents.range_m <= point.radius_m)
     return failed, Known(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
 
 
-def _with_needs(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Known:
+def _with_schedule_needs(point: OperatingPoint, known: Known, intents: Intents, draws: Draws) -> Known:
     if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
         raise UserError(NO_SCENE.format(printable(point.schedule)))
     return replace(
@@ -207,25 +210,28 @@ NO_SCENE = (
     "schedule {} needs vehicles that are somewhere, and the paper's study has none; "
     "take `harness eval` or `harness drive`"
 )
-IMAGINED = 8  # exchanges, from which the ego expects what this one will be
+IMAGINED = 8  # how many imagined exchanges the ego's expectation averages
 
 
 def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Draws) -> Floats:
-    """Probability that a reply is there in the window, `(..., H)`, over exchanges with draws of their own.
+    """Return the probability that a reply arrives in the window, `(..., H)`, over imagined exchanges.
 
-    Both crossings count as independent; a second path, over a roadside unit, is left out.
+    These have draws of their own. The crossings of request and reply count as independent. A second path,
+    over a roadside unit, is left out.
     """
     total = np.zeros(may_ask.shape)
     for n in range(IMAGINED):
-        others = draws.of(f".imagined-{n}") if draws.trips else draws
-        imagined = replace(others, jitter=np.full_like(draws.jitter, (n + 0.5) / IMAGINED))
-        request_s, sent, _ = _consulted(point, intents, may_ask, may_ask, imagined)
-        total += (1.0 - sent.loss) ** 2 * (request_s + sent.end_s <= point.window_s)
+        own_draws = draws.of(f".imagined-{n}") if draws.trips else draws
+        imagined = replace(own_draws, jitter=np.full_like(draws.jitter, (n + 0.5) / IMAGINED))
+        request_s, outcome, _ = _ask_helpers(point, intents, may_ask, may_ask, imagined)
+        total += (1.0 - outcome.loss) ** 2 * (request_s + outcome.end_s <= point.window_s)
     return total / IMAGINED
 
 
-def _directly(channel: Channel, links: Links, draws: Draws, ready: Callable[[Floats], Floats]) -> Consulted:
-    """The ego asks the helpers itself, and waits until the last slot has ended."""
+def _ask_directly(
+    channel: Channel, links: Links, draws: Draws, ready: Callable[[Floats], Floats]
+) -> Consulted:
+    """Let the ego ask the helpers itself, and wait until the last slot has ended."""
     request = channel.request(links.request_bits, draws)
     heard_s = np.asarray(request.heard_s)[..., None]
     up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready(heard_s)), draws)
@@ -246,7 +252,7 @@ def _directly(channel: Channel, links: Links, draws: Draws, ready: Callable[[Flo
 
 
 def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
+    """Return the seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
     ego_s: Floats | float = intents.inference_s[..., 0]
     if point.round_trip_s is not None:
         ego_s = point.round_trip_s
@@ -258,7 +264,7 @@ def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
 
 
 def fallback_intent(fallback: str, n_actions: int) -> Floats:
-    """What a failed ego answer becomes, `(A,)`: `uniform`, or `brake`, sure of the first action."""
+    """Return what replaces a failed answer of the ego, `(A,)`: `uniform`, or `brake`, the first action."""
     if fallback == "brake":
         first: Floats = np.eye(1, n_actions)[0]
         return first

@@ -1,4 +1,4 @@
-"""What coordination needs to know of a set of decisions."""
+"""Define `Intents`: what vehicles intend in a set of decisions, and what else coordination needs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,19 +19,19 @@ class Intents:
     Attributes:
         own: the ego's intent, `(..., A)`; a row with a NaN is a failed answer.
         helpers: helpers' intents, `(..., H, A)`.
-        valid: the helper exists and its answer parsed, `(..., H)`. Any other sends nothing, takes no
-            slot, and may hold NaN in every array.
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; a helper's as
-            the ego knows it, from beacons.
+        valid: whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing,
+            takes no slot, and may hold NaN in every array.
+        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a
+            helper is as the ego knows it, from beacons.
         range_m: distance to the ego, `(..., H)`, as the ego knows it.
         payload_bits: size of the reply, `(..., H)`.
         inference_s: seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown.
-        site: where the vehicles truly are, for a channel that needs it; else None.
-        silent: the helper is asked and sends nothing in its slot, `(..., H)`. None: nobody.
-        voice_of: place of the vehicle whose voice each of the H is, `(..., H)`, where one has several. None:
-            each its own.
-        outlook: what the ego sees and helpers would add, for a schedule that needs it; else None.
-        claims: what helpers say of themselves, for a rule or an attack that needs it; else None.
+        site: where the vehicles truly are, if the channel needs it; else None.
+        silent: whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is.
+        voice_of: index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one
+            voice.
+        outlook: what the ego sees and what helpers would add, if a schedule needs it; else None.
+        claims: what helpers claim about themselves, if a rule or an attack needs it; else None.
     """
 
     own: Floats
@@ -48,7 +48,7 @@ class Intents:
     claims: Claims | None = None
 
     def take(self, at: Any) -> "Intents":
-        """The decisions at these places of the leading dimension."""
+        """Return the decisions at these indices of the leading dimension."""
         return replace(
             self,
             site=self.site and self.site.take(at),
@@ -59,13 +59,13 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Decisions of as many vehicles, one part below the other; none has parts of a scene."""
+        """Concatenate decisions with the same number of vehicles; none has a site, an outlook or claims."""
         arrays = [part.arrays() for part in parts]
-        joint: dict[str, Any] = {name: np.concatenate([each[name] for each in arrays]) for name in arrays[0]}
+        joint: dict[str, Any] = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
         return cls(**joint)
 
     def of_first(self, helpers: int) -> "Intents":
-        """The same with so many helpers, of decisions without parts of a scene."""
+        """Return only the first helpers, of decisions without a site, an outlook or claims."""
         cut = {
             name: array[..., : helpers + (name in WITH_EGO)]
             for name, array in self.arrays().items()
@@ -74,9 +74,9 @@ class Intents:
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
-        """The same with the helpers of these places `(n, H')`, of decisions `(n, H)`; one may come again."""
+        """Return the helpers at these indices `(n, H')`, of decisions `(n, H)`; one may be repeated."""
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
-        taken = {
+        selected = {
             name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
             for name, array in self.arrays().items()
             if name not in ("own", "helpers")
@@ -88,11 +88,11 @@ class Intents:
             site=self.site and self.site.of_helpers(places),
             outlook=self.outlook and self.outlook.of_helpers(places),
             claims=self.claims and self.claims.of_helpers(places),
-            **taken,
+            **selected,
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Those that are there, by name."""
+        """Return the arrays that are not None, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if name not in PARTS and value is not None}
 

@@ -1,4 +1,4 @@
-"""A learnt schedule: what asking a helper is worth, by a small network, from what the ego knows before."""
+"""Learnt schedules: a small network says what asking a helper is worth, from what the ego knows before."""
 
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
@@ -9,7 +9,7 @@ from harness.coordination.scheduling import Known
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 
-FAR_S, FAR_M = 6.0, 100.0  # beyond, farther is all the same
+FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
 INPUTS = (
     "entropy", "margin", "most careful", "least careful", "unseen, most", "unseen, mean", "added, most",
     "added, mean", "range", "helper to zone", "ego to zone", "seconds to zone", "others nearer", "others",
@@ -18,15 +18,15 @@ INPUTS = (
 
 @dataclass(frozen=True)
 class Network:
-    """One hidden layer; F inputs, J units.
+    """A network with one hidden layer, of F inputs and J units.
 
     Attributes:
-        centre: of each input, (F,).
-        scale: by which it is divided, (F,).
-        into: weights into the units, (F, J).
-        bias: of the units, (J,).
-        out: their weights in the output, (J,).
-        base: of the output.
+        centre: what is subtracted from each input, (F,).
+        scale: what each input is then divided by, (F,).
+        into: weights from the inputs to the units, (F, J).
+        bias: bias of each unit, (J,).
+        out: weights from the units to the output, (J,).
+        base: bias of the output.
     """
 
     centre: Floats
@@ -37,27 +37,27 @@ class Network:
     base: float
 
     def __call__(self, inputs: Floats) -> Floats:
-        """The output `(...)` for inputs `(..., F)`."""
+        """Return the output `(...)` for inputs `(..., F)`."""
         units = np.tanh(((inputs - self.centre) / self.scale) @ self.into + self.bias)
         return np.asarray(units @ self.out + self.base)
 
 
 @dataclass(frozen=True)
 class Learnt:
-    """By how much asking the helper, and nobody else, is expected to raise the probability of success."""
+    """A schedule whose worth is the expected gain in success probability from asking only this helper."""
 
     network: Network
     threshold: float
     needs: ClassVar[tuple[str, ...]] = ("outlook",)
 
     def worth(self, known: Known) -> Floats:
-        """What the network says of each helper, `(..., H)`."""
+        """Return the network's output for each helper, `(..., H)`; NaN for one that may not be asked."""
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A `Network` as a file has it."""
+    """A `Network` as a file states it."""
 
     centre: tuple[float, ...]
     scale: tuple[float, ...]
@@ -69,17 +69,17 @@ class Weights:
 
 @dataclass(frozen=True)
 class Stated:
-    """What a file of `schedules/` says.
+    """The content of a file of `schedules/`.
 
     Attributes:
         description: one sentence.
-        command: which made it.
-        learnt_from: the runs, with their layout seeds.
+        command: the command that made the file.
+        learnt_from: the runs that it was learnt from, with their layout seeds.
         tuned_on: the runs on which the threshold was chosen, with their layout seeds.
-        condition: the operating point that it was learnt under.
-        threshold: its own.
-        inputs: what the network looks at, `INPUTS`.
-        network: its weights.
+        condition: the operating point under which it was learnt.
+        threshold: the schedule's threshold.
+        inputs: the names of the network's inputs, `INPUTS`.
+        network: the network's weights.
     """
 
     description: str
@@ -92,7 +92,7 @@ class Stated:
     network: Weights
 
     def schedule(self, where: str) -> Learnt:
-        """The schedule. Raises UserError where inputs are others, or weights do not go together."""
+        """Return the schedule. Raises UserError for other inputs than `INPUTS`, or weights of other sizes."""
         arrays: dict[str, Any] = {name: np.array(value) for name, value in asdict(self.network).items()}
         f, j = len(INPUTS), len(self.network.bias)
         shapes = {"centre": (f,), "scale": (f,), "into": (f, j), "bias": (j,), "out": (j,), "base": ()}
@@ -102,25 +102,25 @@ class Stated:
 
 
 def inputs(known: Known) -> Floats:
-    """`INPUTS` of each helper, `(..., H, F)`; anything for one that may not be asked."""
-    seen, may_ask = known.outlook, known.may_ask
-    assert seen is not None
+    """Return `INPUTS` for each helper, `(..., H, F)`; arbitrary for one that may not be asked."""
+    outlook, may_ask = known.outlook, known.may_ask
+    assert outlook is not None
     ranked = np.sort(known.own, axis=-1)
-    regions = max(seen.unseen.shape[-1], 1)
+    regions = max(outlook.unseen.shape[-1], 1)
     range_m = np.where(may_ask, known.range_m, np.inf)
     nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
-    of_ego = (
+    ego_inputs = (
         known.entropy_nats, 1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1), known.own[..., 0],
-        known.own[..., -1], seen.unseen.max(axis=-1, initial=0.0), seen.unseen.sum(axis=-1) / regions,
-        known.distance_m[..., 0] / FAR_M, np.minimum(seen.to_zone_s, FAR_S) / FAR_S,
+        known.own[..., -1], outlook.unseen.max(axis=-1, initial=0.0), outlook.unseen.sum(axis=-1) / regions,
+        known.distance_m[..., 0] / FAR_M, np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
         may_ask.sum(axis=-1) - 1.0,
     )  # fmt: skip
     entropy, margin, careful, bold, unseen_most, unseen, ego_m, to_zone, others = (
-        np.broadcast_to(of[..., None], may_ask.shape) for of in of_ego
+        np.broadcast_to(column[..., None], may_ask.shape) for column in ego_inputs
     )
     columns = (
-        entropy, margin, careful, bold, unseen_most, unseen, seen.added.max(axis=-1, initial=0.0),
-        seen.added.sum(axis=-1) / regions, known.range_m / FAR_M, known.distance_m[..., 1:] / FAR_M, ego_m,
+        entropy, margin, careful, bold, unseen_most, unseen, outlook.added.max(axis=-1, initial=0.0),
+        outlook.added.sum(axis=-1) / regions, known.range_m / FAR_M, known.distance_m[..., 1:] / FAR_M, ego_m,
         to_zone, nearer, others,
     )  # fmt: skip
     return np.stack(columns, axis=-1)

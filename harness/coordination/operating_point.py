@@ -1,4 +1,4 @@
-"""An operating point: everything a cooperative decision depends on, besides the scene and the model."""
+"""Define operating points: everything a cooperative decision depends on besides the scene and the model."""
 
 import sys
 from collections.abc import Mapping
@@ -21,10 +21,10 @@ from harness.radio.wrapped import AtLoss
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
 DEFENCES = ("quoted", "schema", "majority")
-OVERRIDES = ("loss", "latency_s", "density_coupled")  # fields of a channel
+OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
-UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # of a unit with a place
+UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
 _LARGEST = sys.float_info.max
 
 
@@ -32,9 +32,9 @@ class Rewrites(NamedTuple):
     """How a fusion call shows messages.
 
     Attributes:
-        blind: they are those of helpers that are shown nothing.
-        attack: what attackers make of theirs (`attacks.in_text`); empty for nothing.
-        defences: what the ego makes of all.
+        blind: whether they come from helpers that are shown nothing.
+        attack: the attack that changes attackers' messages (`attacks.in_text`); empty for none.
+        defences: the defences that change every message.
     """
 
     blind: bool = False
@@ -47,54 +47,54 @@ AS_SENT = Rewrites()
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Raises UserError for a value that is not allowed.
+    """The settings of one condition. Raises UserError for a value that is not allowed.
 
     Attributes:
-        name: what reports call it.
+        name: its name in reports.
         profile: channel profile; None disables V2V.
-        tau_nats: the ego asks when its entropy is above this.
-        schedule: whom the ego asks, and when: `entropy`, the paper's, or another of `SCHEDULES`.
-        threshold: what asking has to be worth more than by another schedule, in its unit; None keeps the
+        tau_nats: the entropy above which the ego asks.
+        schedule: the rule for whom the ego asks and when: `entropy`, the paper's, or another of `SCHEDULES`.
+        threshold: the worth above which another schedule asks, in that schedule's unit; None keeps the
             schedule's own.
         window_s: decision window, from the start of the decision; a later reply is not fused.
         radius_m: the paper's R; helpers farther from the ego are not asked.
-        max_helpers: the cooperative neighbourhood; of more helpers the nearest are asked.
+        max_helpers: the cooperative neighbourhood; if there are more helpers, the nearest are asked.
         min_distance_m: lower bound of d in the paper's Eq. 2.
-        ego_distance_m: the ego's d in Eq. 2, in place of its distance to the centroid of the conflict zone;
-            None keeps that. The paper's preset declares a proxy of 3.5 m (section IV-A).
-        fallback: what a failed ego answer becomes: `uniform`, all actions alike, or `brake`, all mass on
-            the first action, which is the most conservative one.
+        ego_distance_m: the ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone.
+            The paper's preset declares a proxy of 3.5 m (section IV-A).
+        fallback: what replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
+            on the first action, which is the most conservative one.
         consensus: consensus rule, or `ego-prompt`.
-        request_bits: size of the ego's request. By default 50 bytes: who asks whom, and until when, as
-            compact JSON, which is how replies are counted, without a signature or headers.
-        loss: probability that one crossing is lost, in place of the profile's or of what follows from a link;
-            None keeps that.
-        latency_s: nominal seconds of one exchange, in place of the profile's; None keeps the profile's.
-        density_coupled: loss follows the number of active vehicles, in place of the profile's.
-        helper_rounds: a helper whose entropy is above tau opens a round of its own and loads the channel.
-        edge: what a roadside unit does: `relay`, it sends replies once more; `fusion`, it asks the helpers
-            for the ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
+        request_bits: size of the ego's request. The default is 50 bytes: who asks whom and until when, as
+            compact JSON without a signature or headers. Replies are counted in the same way.
+        loss: probability that one crossing is lost; None keeps that of the profile or of the link.
+        latency_s: nominal seconds of one exchange; None keeps the profile's.
+        density_coupled: whether loss follows the number of active vehicles, instead of the profile's loss.
+        helper_rounds: whether a helper whose entropy is above tau opens a round of its own, which loads the
+            channel.
+        edge: what a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the
+            ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
             (`constant.Radio`).
-        edge_delay_s: between what the unit has received and what it sends for that: processing and backhaul.
-            0 is a declared default, a unit that has nothing to wait for.
-        edge_x_m: its place, m to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it.
-        edge_y_m: m to the south of it.
+        edge_delay_s: time from the end of what the unit receives to the start of what it sends: processing
+            and backhaul. The default, 0, is declared: a unit that has nothing to wait for.
+        edge_x_m: the unit's place, m to the east of the centroid of the conflict zone; 0 and 0 is a gantry
+            above it.
+        edge_y_m: the unit's place, m to the south of the centroid.
         edge_antenna_m: height of its antenna; by default 5 m (TR 37.885, table 6.1.4-1, a roadside unit).
-        on_demand: a helper infers when it is asked, and not in parallel with the ego.
-        messages: what the ego hears: its `own` helpers, or, as a control, what helpers say in another layout
-            (`shuffled`), or what they say who see nothing (`blind`). A gain of cooperation that stays is no
-            gain of what helpers see.
-        round_trip: network over which the ego asks its model in a cloud, a name of `harness.radio.networks`:
-            each decision draws a round trip, which comes on top of the model's inference.
-        round_trip_s: seconds from the ego's question to the answer of a model in a cloud, in place of its own
-            inference.
-        radio: further settings of the profile's channel, in place of its own:
-            `density_per_km=200,power_dbm=23`.
-        attack: what some of the helpers do instead of saying what they intend, `liar:share=1/3+spoof`
-            (`harness.coordination.attacks`); empty for honest ones.
-        defence: what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted`, evidence is a JSON
-            string; `schema`, messages have no free text; `majority`, an action that most of the voices agree
-            on stands against the call's.
+        on_demand: whether a helper infers only when it is asked, and not in parallel with the ego.
+        messages: what the ego hears: its `own` helpers, or as a control what helpers say in another layout
+            (`shuffled`) or what helpers say that are shown nothing (`blind`). A gain that remains under a
+            control does not come from what helpers see.
+        round_trip: network over which the ego asks its model in a cloud, a name of `harness.radio.networks`.
+            Each decision draws a round trip, which is added to the model's inference.
+        round_trip_s: seconds from the ego's question to the answer of a model in a cloud; they replace the
+            ego's own inference.
+        radio: further settings of the profile's channel, such as `density_per_km=200,power_dbm=23`.
+        attack: what some helpers do instead of saying what they intend, such as `liar:share=1/3+spoof`
+            (`harness.coordination.attacks`); empty for honest helpers.
+        defence: what guards a fusion call, some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON
+            string; `schema` removes free text from messages; `majority` lets an action on which most voices
+            agree win against the call's.
         weight_cap: largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
     """
 
@@ -204,23 +204,23 @@ class OperatingPoint:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
-        """Operating point from a configuration's table; without a profile it has no V2V.
+        """Return the operating point of a configuration's table; without a profile it has no V2V.
 
-        Raises UserError, for an unknown key too.
+        Raises UserError for an unknown key, or for a value that is not allowed.
         """
-        known = [field.name for field in fields(cls)]
+        allowed = [field.name for field in fields(cls)]
         for key in values:
-            if key not in known:
-                raise unknown("operating point setting", str(key), known)
+            if key not in allowed:
+                raise unknown("operating point setting", str(key), allowed)
         if "name" not in values:
             raise UserError('operating point without a name: add name = "..."')
         return cls(**{"profile": None, **values})
 
     @cached_property
     def channel(self) -> Channel:
-        """The profile's, with the point's overrides, as its file was when the point was made.
+        """The profile's channel with the point's overrides; its file is read once, when the point is made.
 
-        Raises UserError for an override that the profile has not.
+        Raises UserError for an override of a setting that the profile does not have.
         """
         if self.profile is None:
             return NO_CHANNEL
@@ -229,7 +229,8 @@ class OperatingPoint:
         overrides = {
             key: value for key, value in settings.items() if value is not None and value is not False
         }
-        loss = overrides.pop("loss", None) if isinstance(channel, Physical) else None  # no setting of its own
+        # A physical channel has no field for a loss: AtLoss wraps it below.
+        loss = overrides.pop("loss", None) if isinstance(channel, Physical) else None
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
                 raise self._wrong(key, f"left out: channel profile {self.profile} has no such setting")
@@ -246,7 +247,7 @@ class OperatingPoint:
         return channel
 
     def _relayed(self, channel: Channel) -> Channel:
-        """A channel without places, whose relay is a second path of the same kind."""
+        """Return a channel without places, with the relay as a second path of the same kind."""
         if self.edge == FUSION:
             raise self._wrong(
                 "edge", f"none or relay: links of channel profile {self.profile} have no places"
@@ -264,29 +265,29 @@ class OperatingPoint:
 
     @property
     def unit(self) -> Unit | None:
-        """The roadside unit, where there is one with a place."""
+        """The roadside unit; None if there is none, or none with a place."""
         return self._unit if self.edge != "none" and isinstance(self.channel, Physical) else None
 
     @cached_property
     def network(self) -> Network | None:
-        """The network to a cloud, as its file was when the point was made. Raises UserError."""
+        """The network to a cloud, or None; its file is read once. Raises UserError if it is unknown."""
         return network(str(self.round_trip)) if self.round_trip else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
-        """The same with these settings of its channel. Raises UserError for one that it has not."""
+        """Return the point with these settings of its channel. Raises UserError for an unknown setting."""
         texts = {**pairs(self.radio), **settings}
         return replace(self, radio=",".join(f"{key}={value}" for key, value in texts.items()))
 
     @cached_property
     def asks_above(self) -> float:
-        """What asking has to be worth more than, in the schedule's unit."""
+        """The worth above which the ego asks, in the schedule's unit."""
         if self.schedule == PAPER:
             return self.tau_nats
-        own = SCHEDULES[self.schedule].threshold
-        return self.threshold if self.threshold is not None else 0.0 if own is None else own
+        default = SCHEDULES[self.schedule].threshold
+        return self.threshold if self.threshold is not None else 0.0 if default is None else default
 
     def needs(self, what: str) -> bool:
-        """Whether its schedule, its rule or an attack looks at `in_time`, `outlook`, `lot` or `claims`."""
+        """Whether its schedule, its rule or an attack needs `in_time`, `outlook`, `lot` or `claims`."""
         return what in self._needs
 
     @cached_property
@@ -303,12 +304,12 @@ class OperatingPoint:
 
     @property
     def asks_blind(self) -> bool:
-        """Whether helpers are asked who see nothing."""
+        """Whether the helpers that are asked are shown nothing."""
         return self.profile is not None and self.messages == "blind"
 
     @property
     def guards(self) -> tuple[str, ...]:
-        """What guards its fusion calls."""
+        """The defences of its fusion calls."""
         return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
     @property
@@ -325,7 +326,7 @@ class OperatingPoint:
             raise self._wrong(key, allowed)
         if value == 0 and not zero:
             raise self._wrong(key, allowed)
-        # A configuration's 1 and 1.0 are one point, with one digest.
+        # 1 and 1.0 in a configuration are the same point, with the same digest.
         object.__setattr__(self, key, float(value))
 
     def _wrong(self, key: str, allowed: str) -> UserError:
@@ -341,38 +342,43 @@ POINTS = {
         OperatingPoint("6g", "6g"),
     )
 }
-# The paper's cloud reference, which it cites; nobody runs it unasked.
+# The cloud reference that the paper cites; it runs only if it is named.
 CLOUD = OperatingPoint("cloud", None, round_trip_s=0.51)
 
 
 def named_point(text: str) -> OperatingPoint:
-    """One of the paper's operating points, or a change of one: `6g:consensus=ego-prompt,window_s=0.4`.
+    """Return an operating point by its name and changes, such as `6g:consensus=ego-prompt,window_s=0.4`.
 
-    A setting may go by its name in `SHORT`, and may be one of the channel's own. Every channel profile is a
-    point of the profile's name, with the defaults. The text is the point's name. Raises UserError if there is
-    no such point or setting, or a value is not allowed.
+    The name is one of the paper's points, or a channel profile, which stands for a point with that profile
+    and the defaults. A setting may have its name in `SHORT`, and may be one of the channel's own. The whole
+    text becomes the point's name.
+
+    Raises:
+        UserError: there is no such point or setting, or a value is not allowed.
     """
     name, colon, rest = text.partition(":")
-    named = {**POINTS, CLOUD.name: CLOUD}
-    if name not in named and name not in CHANNELS:
-        raise unknown("operating point", name, {*named, *CHANNELS})
-    point = named.get(name) or OperatingPoint(name, name)
-    its_own = [key for key in settable(point.channel) if key not in OVERRIDES] if point.profile else []
+    points = {**POINTS, CLOUD.name: CLOUD}
+    if name not in points and name not in CHANNELS:
+        raise unknown("operating point", name, {*points, *CHANNELS})
+    point = points.get(name) or OperatingPoint(name, name)
+    channel_settings = (
+        [key for key in settable(point.channel) if key not in OVERRIDES] if point.profile else []
+    )
     settings: dict[str, Any] = {}
     radio: dict[str, str] = {}
     for setting in rest.split(",") if colon else ():
         key, _, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
-        if field not in SETTINGS and field not in its_own:
-            known = (*SETTINGS, *SHORT, *its_own)
-            raise unknown(f"setting of operating point {name}", key, known, f"; as in {name}:window_s=0.3")
+        if field not in SETTINGS and field not in channel_settings:
+            allowed = (*SETTINGS, *SHORT, *channel_settings)
+            raise unknown(f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3")
         if field in settings or field in radio:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
         if field not in SETTINGS:
             radio[field] = value
             continue
-        given = setting_of(field, value)
-        settings[field] = given * scale if isinstance(given, float) else given
+        parsed = setting_of(field, value)
+        settings[field] = parsed * scale if isinstance(parsed, float) else parsed
     for key in (*OVERRIDES, "edge", *UNIT):
         if key in settings and point.profile is None:
             raise UserError(
@@ -380,21 +386,21 @@ def named_point(text: str) -> OperatingPoint:
                 "leave it out"
             )
     if "round_trip" in settings and "round_trip_s" not in settings:
-        settings["round_trip_s"] = None  # of `cloud`, the paper's
+        settings["round_trip_s"] = None  # `cloud` has the paper's; only one of the two may be set
     point = point.of_radio(radio) if radio else point
     return replace(point, name=text, **settings) if settings or radio else point
 
 
 def pairs(text: str) -> dict[str, str]:
-    """Names and values in `density_per_km=200,power_dbm=23`; of a name without a value, an empty one."""
-    return {key: value for key, _, value in (each.partition("=") for each in text.split(",") if each)}
+    """Return the names and values in `density_per_km=200,power_dbm=23`; a missing value is empty."""
+    return {key: value for key, _, value in (pair.partition("=") for pair in text.split(",") if pair)}
 
 
-# Settings by another name, as `harness sweep --over` has them, each with what makes its unit the setting's.
+# Short names of settings, as in `harness sweep --over`, each with the factor from its unit to the setting's.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
 SETTINGS = tuple(f.name for f in fields(OperatingPoint) if f.name not in ("name", "profile", "radio"))
 
 
 def setting_of(key: str, text: str) -> object:
-    """A setting from its text, of the kind that is usual; what is not stays text, which no setting allows."""
+    """Parse a setting's text by the type of its default; another text stays text, which no setting allows."""
     return value_of(getattr(POINTS["6g"], key), text)

@@ -1,8 +1,8 @@
-"""Consensus rules that count heads: a claimed distance gives nobody more weight.
+"""Consensus rules that count heads, so that a claimed distance gives no helper more weight.
 
-Each of them keeps a promise of robustness: where at least two others agree on an action, the ego among them,
-no single helper makes it another one. A pool of probabilities alone does not: with each action's median taken
-for itself, one voice can make a second choice of all others the first.
+Each of them makes the same promise: if at least two others, the ego among them, agree on an action, no single
+helper can change it. A pool of probabilities alone does not keep it: if each action's median is taken by
+itself, one voice can make the second choice of all others the first.
 """
 
 from dataclasses import dataclass
@@ -14,21 +14,18 @@ from harness.core.arrays import Bools, Floats, Ints
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
 CLIP_ROUNDS = 5
-RELIABILITY = 0.8  # of a helper in the Bayesian pool: the share of messages that say what is the case
-NEVER = 1e-9  # what a probability of 0 that the ego gives counts for
+RELIABILITY = 0.8  # share of a helper's messages that are true, in the Bayesian pool
+NEVER = 1e-9  # what a probability of 0 of the ego counts as
 WEISZFELD_ROUNDS = 60
-SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite where a message is the median itself
+SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median itself
 
 
 @dataclass(frozen=True)
 class Heads(Pool):
-    """A pool over heads, whose result no single helper flips where all others agree.
-
-    Whoever is heard has the same weight.
-    """
+    """A pool in which all who are heard weigh the same, and no helper flips what all others agree on."""
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """The pool; where it leaves what all but one want, the mean of those."""
+        """Apply the pool; if it departs from what all but one want, return the mean of their intents."""
         voices = messages.weights > 0
         heads = np.sum(voices, axis=-1)
         weights = voices / heads[..., None]
@@ -37,27 +34,33 @@ class Heads(Pool):
 
 
 def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
-    """The policy; where so many voices, the ego's among them, want another action, the mean of those.
+    """Return the policy, or the mean of the majority's intents where a majority wants another action.
+
+    A majority counts only if the ego is in it.
 
     Args:
-        policy: `(..., A)`.
-        p: intents, `(..., 1+H, A)`; those of no voice may hold anything.
-        voices: who counts, `(..., 1+H)`.
-        votes: how many have to agree, more than half, `(...)`.
+        policy: the policy to check, `(..., A)`.
+        p: intents, `(..., 1+H, A)`; the row of a vehicle that has no voice may hold anything.
+        voices: which vehicles count, `(..., 1+H)`.
+        votes: how many make a majority, more than half, `(...)`.
     """
     choices = np.where(voices, np.argmax(np.where(voices[..., None], p, -1.0), axis=-1), -1)
     counts = np.sum(choices[..., None] == np.arange(p.shape[-1]), axis=-2)
-    wanted = np.argmax(counts, axis=-1)
-    agree = choices == wanted[..., None]
-    of_those = linear_pool(p, agree / np.maximum(np.sum(agree, axis=-1, keepdims=True), 1))
-    stands = (np.max(counts, axis=-1) >= votes) & agree[..., 0] & (np.argmax(policy, axis=-1) != wanted)
-    return np.where(stands[..., None], of_those, policy)
+    majority_action = np.argmax(counts, axis=-1)
+    in_majority = choices == majority_action[..., None]
+    majority_mean = linear_pool(p, in_majority / np.maximum(np.sum(in_majority, axis=-1, keepdims=True), 1))
+    overrides = (
+        (np.max(counts, axis=-1) >= votes)
+        & in_majority[..., 0]
+        & (np.argmax(policy, axis=-1) != majority_action)
+    )
+    return np.where(overrides[..., None], majority_mean, policy)
 
 
 def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
-    """Mean of each action's probability less the highest and the lowest head, scaled to sum to 1.
+    """Return each action's mean probability without the highest and the lowest head, scaled to sum to 1.
 
-    Of fewer than three heads nothing is trimmed. The k-truncated mean of Guo and Kong (2024) with k = 1.
+    With fewer than three heads, none is left out. The k-truncated mean of Guo and Kong (2024) with k = 1.
     """
     voices = weights > 0
     heads = np.sum(voices, axis=-1)[..., None, None]
@@ -72,7 +75,7 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
 
 
 def geometric_median(p: Floats, weights: Floats) -> Floats:
-    """The distribution with the least sum of distances to all messages (Weiszfeld 1937), `(..., A)`."""
+    """Return the distribution with the least sum of distances to messages, `(..., A)` (Weiszfeld 1937)."""
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
     for _ in range(WEISZFELD_ROUNDS):
@@ -83,9 +86,10 @@ def geometric_median(p: Floats, weights: Floats) -> Floats:
 
 
 def centred_clipping(p: Floats, weights: Floats) -> Floats:
-    """From the ego's intent, the mean of the steps to all messages, none longer than `CLIP`, `(..., A)`.
+    """Return the ego's intent, moved by the mean of the steps to all messages, `(..., A)`, in some rounds.
 
-    Karimireddy, He and Jaggi (2021), with the ego in place of the last round's aggregate.
+    No step is longer than `CLIP`. Karimireddy, He and Jaggi (2021), starting from the ego's intent instead of
+    the last round's aggregate.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
@@ -97,22 +101,22 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
 
 
 def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY) -> Floats:
-    """Product of what messages say, each true with a probability and else saying nothing, `(..., A)`.
+    """Return the product of all messages, each true with a probability and else uninformative, `(..., A)`.
 
-    A message is worth `r p + (1 - r) / A`, so that no voice counts for more than `(1 - r + A r) / (1 - r)`
-    to one. The ego counts as it is. Prior: all actions alike; voices independent, which those of vehicles
-    that see the same are not.
+    A message counts as `r p + (1 - r) / A`, so no voice weighs more than `(1 - r + A r) / (1 - r)` to one.
+    The ego's intent counts as it is. The prior is uniform over the actions. Voices are taken as independent,
+    which those of vehicles that see the same are not.
 
     Args:
         p: intents, `(..., 1+H, A)`.
-        weights: 0 for who is not heard.
-        reliability: of helpers, `(..., H)` or one for all.
+        weights: 0 for a helper not heard.
+        reliability: reliability of the helpers, `(..., H)` or one for all.
     """
     actions = p.shape[-1]
-    helper = np.broadcast_to(np.asarray(reliability), weights[..., 1:].shape)
-    r = np.concatenate([np.ones(weights[..., :1].shape), helper], axis=-1)[..., None]
-    worth = r * np.where((weights > 0)[..., None], p, 1 / actions) + (1 - r) / actions
-    logs = np.sum(np.log(np.maximum(worth, NEVER)), axis=-2)
+    helper_r = np.broadcast_to(np.asarray(reliability), weights[..., 1:].shape)
+    r = np.concatenate([np.ones(weights[..., :1].shape), helper_r], axis=-1)[..., None]
+    evidence = r * np.where((weights > 0)[..., None], p, 1 / actions) + (1 - r) / actions
+    logs = np.sum(np.log(np.maximum(evidence, NEVER)), axis=-2)
     pooled = np.exp(logs - np.max(logs, axis=-1, keepdims=True))
     return np.asarray(pooled / np.sum(pooled, axis=-1, keepdims=True))
 

@@ -1,7 +1,7 @@
-"""The consensus rules by name, and what packages add to them.
+"""Find consensus rules by name, those that other packages add included.
 
-A package adds a rule by an entry point in the group `swarmdrive.rules`, a function of (p, weights) wrapped by
-`Pool`. `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its prompt (the
+A package adds a rule by an entry point in the group `swarmdrive.rules`; `Pool` makes a rule of a function of
+(p, weights). `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its prompt (the
 paper's section III-C).
 """
 
@@ -20,5 +20,5 @@ EGO_PROMPT = "ego-prompt"
 
 
 def names() -> tuple[str, ...]:
-    """What an operating point's `consensus` may be."""
+    """Return the allowed values of an operating point's `consensus`."""
     return (*RULES, EGO_PROMPT)

@@ -1,4 +1,4 @@
-"""Schedules by name: formulas, files `schedules/*.toml`, shipped and a project's, and what packages add.
+"""Find schedules by name: formulas, files `schedules/*.toml` and those that other packages add.
 
 A file holds a learnt schedule and what it was learnt from; `harness schedule learn` writes it. A package adds
 a schedule by an entry point in the group `swarmdrive.schedules`.
@@ -16,16 +16,16 @@ from harness.core.plugins import FilesAndPlugins
 
 
 class Schedules(FilesAndPlugins[Schedule]):
-    """All schedules."""
+    """All schedules, by name."""
 
     folder = "schedules"
 
     def read(self, file: Any) -> Schedule:
-        """The learnt schedule."""
+        """Return the learnt schedule in a file."""
         return _read(file)
 
     def file_sha256(self, name: str) -> str | None:
-        """Digest of the file that holds a schedule; None for one that no file holds."""
+        """Return the digest of the file that holds a schedule; None if it is not in a file."""
         file = self.file(name)
         return sha256_file(file) if file else None
 

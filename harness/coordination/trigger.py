@@ -1,4 +1,4 @@
-"""When a vehicle is unsure enough to ask the others."""
+"""Compute entropy, and the trigger: when a vehicle is unsure enough to ask the others."""
 
 import numpy as np
 
@@ -6,13 +6,13 @@ from harness.core.arrays import Bools, Floats, summed
 
 
 def entropy_nats(p: Floats) -> Floats:
-    """Shannon entropy of intents `(..., A)`, in nats, with 0 log 0 = 0. Shape `(...)`."""
-    # No term of a distribution is positive; abs() also turns -0.0 into 0.0.
+    """Return the Shannon entropy of intents `(..., A)`, in nats, with 0 log 0 = 0; shape `(...)`."""
+    # p log p is never positive; abs() negates it, and also turns -0.0 into 0.0.
     return summed(np.abs(p * np.log(np.where(p > 0, p, 1.0))), axis=-1)
 
 
 def normalised_entropy(p: Floats) -> Floats:
-    """Entropy of intents `(..., A)` over its largest value ln A: 0 sure, 1 uniform; 0 if A is 1."""
+    """Return the entropy of intents `(..., A)` over its maximum ln A: 0 sure, 1 uniform; 0 if A is 1."""
     return entropy_nats(p) / (np.log(p.shape[-1]) if p.shape[-1] > 1 else 1.0)
 
 

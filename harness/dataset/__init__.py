@@ -1,1 +1,1 @@
-"""Frozen datasets: scenes taken out of the simulator, with where every action leads."""
+"""Frozen datasets: scenes taken from the simulator, and where every action leads."""

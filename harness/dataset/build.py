@@ -1,8 +1,7 @@
-"""`harness dataset build`: layouts into a folder, in any number of processes, and on after a kill.
+"""Build a dataset, for `harness dataset build`: freeze layouts in any number of processes, and resume.
 
-Each finished layout is a file of its own under `.work/`; when all are there they become one
-`layouts.zip`. What is in it depends on the scenario, the seed, the number of episodes and the folder's name
-alone.
+Each finished layout is a file under `.work/`; when all are finished, they become one `layouts.zip`. Its
+content depends only on the scenario, the seed, the number of episodes and the folder's name.
 """
 
 import json
@@ -46,7 +45,7 @@ from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 
-LEAST_AUDITED = 100  # layouts; of fewer an audit says little
+LEAST_AUDITED = 100  # fewest layouts that are audited; an audit of fewer says little
 
 
 def build(
@@ -54,27 +53,27 @@ def build(
     progress: Callable[[int], None], audits: bool = True, more: Callable[[int], None] = lambda count: None,
     shard: Shard | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Build a dataset in `out`, or freeze a shard's part of one, for `harness merge`.
+    """Build a dataset in `out`, or freeze a shard of one, which `harness merge` combines.
 
     Args:
-        scenario: what is frozen.
-        out: folder to make; its name is the dataset's name.
-        episodes: how many; episode e has layout seed `seed + e`.
-        seed: first layout seed.
-        workers: who freezes.
+        scenario: the scenario to freeze.
+        out: the folder to make; its name is the dataset's name.
+        episodes: the number of episodes; episode e has layout seed `seed + e`.
+        seed: the first layout seed.
+        workers: processes or a cluster.
         progress: called with the number of layouts just finished.
-        audits: whether the layouts are audited for tells, from `LEAST_AUDITED` on.
-        more: called with the number of layouts that are still to be audited then.
-        shard: which part of the layouts is frozen; None for the whole.
+        audits: whether to audit the layouts for tells, if there are `LEAST_AUDITED` or more.
+        more: called with the number of layouts to audit, before the audit.
+        shard: the part of the layouts to freeze; None for all.
 
     Returns:
-        The manifest; of a shard what it begins with.
+        The manifest; for a shard the settings that it begins with.
 
     Raises:
         UserError: the folder holds a finished dataset, or one begun with other settings, or something else;
             the seeds are for several purposes; or the audit needs a package that is missing.
     """
-    audits = audits and episodes >= LEAST_AUDITED and not scenario.start  # no danger is known of
+    audits = audits and episodes >= LEAST_AUDITED and not scenario.start  # an environment states no danger
     if audits and not shard:
         extras.need("an audit", "sklearn")
     config = {
@@ -100,21 +99,22 @@ def build(
             raise UserError(
                 f"--out {printable(out)} already holds a finished dataset; choose another folder or delete it"
             )
-        made: dict[str, Any] = msgspec.to_builtins(read_manifest(out)[0])  # stopped while it tidied up
-        work.same(out, config, {key: made[key] for key in config})
+        # A build was stopped while it tidied up.
+        finished: dict[str, Any] = msgspec.to_builtins(read_manifest(out)[0])
+        work.same(out, config, {key: finished[key] for key in config})
         work.tidy(out)
-        return made
+        return finished
     part = str(shard or "")
-    mine = shard.part(range(episodes)) if shard else range(episodes)
+    own_episodes = shard.part(range(episodes)) if shard else range(episodes)
     if begun := work.begun(out, work.Begun):
         work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
     elif scenario.start:
         examine(scenario, seed)
     with work.working(out, begun or work.Begun(settings=config, shard=part)) as place:
-        _freeze_missing(scenario, place, seed, mine, workers, progress)
+        _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
         if shard:
             return config
-        manifest = _joined(scenario, out, place, config, workers, progress, audits, more)
+        manifest = _write_dataset(scenario, out, place, config, workers, progress, audits, more)
         work.tidy(out)
     return manifest
 
@@ -123,10 +123,11 @@ def merge(
     folders: Sequence[Path], out: Path, workers: Workers, progress: Callable[[int], None],
     audits: bool = True, more: Callable[[int], None] = lambda count: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Make one dataset of its shards: the bytes of a build without any (see `build`).
+    """Combine the shards of a dataset into the one that `build` makes without shards, byte for byte.
 
     Raises:
-        UserError: as of `build`, or these are not all shards of one build, finished and of the same bytes.
+        UserError: as in `build`; or the folders are not all the shards of one build, a shard is unfinished,
+            or two hold different bytes for the same layout.
     """
     begun = shards.read(folders, work.Begun)
     config = begun[0].settings
@@ -134,8 +135,8 @@ def merge(
     parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
     if not (out / "manifest.json").exists():
         whole = work.Begun(settings=config)
-        if left := work.begun(out, work.Begun):
-            work.same(out, whole.settings, left.settings)
+        if stopped := work.begun(out, work.Begun):
+            work.same(out, whole.settings, stopped.settings)
         with work.working(out, whole) as place:
             shards.collect(parts, place)
     scenario = scenarios.stated(config["scenario"], config["parameters"])
@@ -149,29 +150,29 @@ def _freeze_missing(
     todo = [e for e in episodes if not (place / part_of(e)).is_file()]
     progress(len(episodes) - len(todo))
 
-    def took(at: int, data: bytes) -> None:
-        write_whole(place / part_of(todo[at]), data)
+    def keep(index: int, data: bytes) -> None:
+        write_whole(place / part_of(todo[index]), data)
         progress(1)
 
-    each(partial(_frozen, scenario, seed), todo, workers, took, named)
+    each(partial(_freeze_layout, scenario, seed), todo, workers, keep, named)
 
 
-def _joined(
+def _write_dataset(
     scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: Workers,
     progress: Callable[[int], None], audits: bool, more: Callable[[int], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Write the dataset's files of what is frozen, the manifest last."""
+    """Write the dataset's files from the frozen layouts, the manifest last."""
     episodes, seed = config["episodes"], config["seed"]
-    texts = _join(place, episodes, out / LAYOUTS)
+    texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters.delay_allowance_s)
-    found = None
+    audited = None
     if audits:
         more(episodes)
-        found = audit(scenario, episodes, seed, progress, workers)
+        audited = audit(scenario, episodes, seed, progress, workers)
     command = _command(scenario, episodes, seed, audits)
     files = {
-        "README.md": _readme(out.absolute().name, command, config, forest, found).encode(),
+        "README.md": _readme(out.absolute().name, command, config, forest, audited).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
         "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
@@ -190,8 +191,8 @@ def _joined(
     return manifest
 
 
-def _frozen(scenario: Scenario, seed: int, episode: int) -> bytes:
-    """A layout as a file of the working folder."""
+def _freeze_layout(scenario: Scenario, seed: int, episode: int) -> bytes:
+    """Freeze a layout and return its file in the working folder."""
     levels, scenes = freeze(scenario, seed + episode, episode)
     texts = ["".join(canonical_json(record) + "\n" for record in level).encode() for level in scenes]
     for line in b"".join(texts).splitlines():
@@ -211,18 +212,18 @@ def _frozen(scenario: Scenario, seed: int, episode: int) -> bytes:
 
 
 def _check(scenario: Scenario, tree: Tree) -> None:
-    """Drive the layout: a tree in which a reference driver ends otherwise is a bug."""
+    """Drive the layout in closed loop; a reference driver that ends otherwise than in the tree is a bug."""
     forest = Forest.of([tree], scenario.actions, scenario.parameters.delay_allowance_s)
     [driven] = drive_all(scenario, [tree.episode_seed])
     for driver, outcome in driven.items():
         end = forest.end(int(forest.last_edge(forest.drivers[driver])[0]))
-        walked = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
-        if walked != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
+        in_tree = bool(forest.driver_success(driver)[0]), end.time_s, end.partner, end.fault
+        if in_tree != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
             raise RuntimeError(f"layout {tree.episode_seed}: {driver} drives to {outcome}, walks to {end}")
 
 
-def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
-    """One file of all layouts; returns their trees as they are in it."""
+def _join_layouts(work: Path, episodes: int, layouts: Path) -> list[bytes]:
+    """Join all layouts in one file, and return the bytes of their trees in it."""
     trees = []
     with replacing(layouts) as part, ZipFile(part, "w") as file:
         for episode in range(episodes):
@@ -234,18 +235,18 @@ def _join(work: Path, episodes: int, layouts: Path) -> list[bytes]:
 
 
 def _entry(name: str) -> ZipInfo:
-    entry = ZipInfo(name)  # of the year 1980: no clock in a dataset
+    entry = ZipInfo(name)  # dated 1980, so that no clock changes a dataset's bytes
     entry.compress_type = ZIP_DEFLATED
     return entry
 
 
 def part_of(episode: int) -> str:
-    """Name of the file that keeps a layout in a working folder."""
+    """Return the name of a layout's file in a working folder."""
     return f"{episode:05d}.zip"
 
 
 def named(episode: int) -> str:
-    """A layout for people."""
+    """Return a layout's name for people."""
     return f"layout {episode}"
 
 
@@ -254,28 +255,28 @@ def _pretty(value: Any) -> bytes:
 
 
 def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
-    """What builds the same again."""
-    usual, p = scenarios.get(scenario.name).parameters, scenario.parameters
+    """Return the command that builds the same dataset again."""
+    default, p = scenarios.get(scenario.name).parameters, scenario.parameters
     dials = [
         f"{dial}={canonical_json(getattr(p, dial))}"
-        for dial in scenarios.dials(scenario) if getattr(p, dial) != getattr(usual, dial)
+        for dial in scenarios.dials(scenario) if getattr(p, dial) != getattr(default, dial)
     ]  # fmt: skip
     name = shlex.quote(environment.joined(scenario.name, dials))
-    lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != usual.decision_lag_s else ""
+    lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != default.decision_lag_s else ""
     unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
 
 
-def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, found: Audit | None) -> str:
+def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, audited: Audit | None) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
         f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
     )
     parameters = config["parameters"]
-    told = "Not audited for tells."
-    if found:
-        auc = found.auc["danger"]
-        told = (
+    audit_text = "Not audited for tells."
+    if audited:
+        auc = audited.auc["danger"]
+        audit_text = (
             "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
             f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness scenario audit`, n = {auc.n} "
             "layouts; .50 is a guess)."
@@ -289,7 +290,7 @@ Built by `{command}`.
 A decision acts {1000 * parameters["decision_lag_s"]:.0f} ms after its moment, everybody's. When this was
 built every reference driver drove every layout in closed loop too, and ended as in the trees.
 
-{told}
+{audit_text}
 
 | who decides | success, % of {seeds} layouts |
 |---|---|

@@ -1,11 +1,11 @@
-"""The decision trees of a dataset as arrays: where each action leads, what it is worth, how a walk ends.
+"""Hold the decision trees of a dataset as arrays: where each action leads, its worth, and how a walk ends.
 
-The rule. An episode succeeds if the ego reaches its goal, no later than the delay allowance after the
-full-view driver of the same layout, who decides at the same moments and with the same lag. From the leaves
-backwards follows, exactly, the earliest time at which the goal can still be reached after each action. An
-action is *safe* if that is early enough for success; a decision that is not safe, where a safe one was there,
-has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by which the earliest
-time grows.
+The rule: an episode succeeds if the ego reaches its goal no later than the delay allowance after the
+full-view driver of the same layout, which decides at the same moments and with the same lag. A pass from the
+leaves backwards gives, exactly, the earliest time at which the goal can still be reached after each action.
+An action is *safe* if that is early enough for success. A decision that is not safe, though a safe one was
+possible, has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by which the
+earliest time grows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,22 +22,22 @@ from harness.world.outcome import ROUNDING_S
 
 @dataclass(frozen=True)
 class Forest:
-    """Trees E, decision points N, actions A. Decision points of a level follow those of the level before.
+    """E trees with N decision points and A actions; within a tree, decision points are ordered by level.
 
     Attributes:
-        actions: meta-actions.
-        allowance_s: needless delay that an episode is forgiven.
-        episodes: their numbers, (E,).
-        seeds: their layout seeds, (E,).
-        dangers: where their dangers come from; None without one.
-        root: their first decision points, (E,).
-        ids: of the decision points.
-        tree: of which tree each is, (N,).
-        step: at which step, (N,).
-        child: the decision point that an action leads to, (N, A); -1 where the episode ends.
+        actions: the meta-actions.
+        allowance_s: needless delay that an episode may have.
+        episodes: the episode's number of each tree, (E,).
+        seeds: the layout seed of each tree, (E,).
+        dangers: the sector from which each tree's danger comes; None without one.
+        root: the first decision point of each tree, (E,).
+        ids: the ids of the decision points.
+        tree: the tree of each decision point, (N,).
+        step: the step of each decision point, (N,).
+        child: the decision point to which an action leads, (N, A); -1 if the episode ends.
         edge: the edge that an action takes, (N, A).
-        edges: of all trees.
-        drivers: index of each reference driver's action, (N,).
+        edges: the edges of all trees.
+        drivers: the index of each reference driver's action, (N,).
     """
 
     actions: tuple[str, ...]
@@ -56,50 +56,50 @@ class Forest:
 
     @classmethod
     def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], allowance_s: float) -> "Forest":
-        """The trees of a dataset with these actions."""
-        place = {action: n for n, action in enumerate(actions)}
-        starts, total = [], 0  # of each level of each tree
+        """Make a forest of the trees of a dataset with these actions."""
+        action_index = {action: n for n, action in enumerate(actions)}
+        starts, total = [], 0  # the first index of each level of each tree
         for tree in trees:
             starts.append([total := total + size for size in (0, *map(len, tree.levels))])
         child, edge = np.full((total, len(actions)), -1), np.full((total, len(actions)), -1)
         edges: list[Edge] = []
         points = [point for tree in trees for level in tree.levels for point in level]
         following = [
-            start for tree, of_tree in zip(trees, starts, strict=True)
-            for level, start in zip(tree.levels, of_tree[1:], strict=True) for _ in level
+            start for tree, tree_starts in zip(trees, starts, strict=True)
+            for level, start in zip(tree.levels, tree_starts[1:], strict=True) for _ in level
         ]  # fmt: skip
         for n, (point, start) in enumerate(zip(points, following, strict=True)):
-            for each in point.edges:
-                at = [place[action] for action in each.actions]
-                edge[n, at] = len(edges)
-                if each.to is not None:
-                    child[n, at] = start + each.to
-                edges.append(each)
+            for branch in point.edges:
+                columns = [action_index[action] for action in branch.actions]
+                edge[n, columns] = len(edges)
+                if branch.to is not None:
+                    child[n, columns] = start + branch.to
+                edges.append(branch)
         sizes = [list(map(len, tree.levels)) for tree in trees]
         return cls(
             actions, allowance_s, np.array([t.episode for t in trees]),
             np.array([t.episode_seed for t in trees]), tuple(t.danger.sector for t in trees),
-            np.array([of_tree[0] for of_tree in starts]), tuple(point.scene for point in points),
+            np.array([tree_starts[0] for tree_starts in starts]), tuple(point.scene for point in points),
             np.repeat(np.arange(len(trees)), list(map(sum, sizes))),
             np.concatenate([np.repeat(np.arange(len(s)), s) for s in sizes]), child, edge, tuple(edges),
-            {driver: np.array([place[p.drivers[driver]] for p in points]) for driver in points[0].drivers},
+            {name: np.array([action_index[p.drivers[name]] for p in points]) for name in points[0].drivers},
         )  # fmt: skip
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """Decision points by id."""
+        """The indices of the decision points, by id."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
     def cleared_s(self) -> Floats:
-        """When an edge ends at the goal, (edges,); inf where it ends otherwise or leads on."""
+        """When each edge reaches the goal, (edges,); inf if it ends otherwise or leads on."""
         return np.array([
             edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf for edge in self.edges
         ])  # fmt: skip
 
     @cached_property
     def earliest_s(self) -> Floats:
-        """When the goal can be reached at the earliest after each action, (N, A); inf for never."""
+        """The earliest time at which the goal can be reached after each action, (N, A); inf for never."""
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
             leads = self.child[rows] >= 0
@@ -109,7 +109,7 @@ class Forest:
 
     @cached_property
     def then_full_view(self) -> Ints:
-        """The last edge of the course after each action if the full-view driver takes the rest, (N, A)."""
+        """The last edge after each action if the full-view driver decides from there, (N, A)."""
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -126,7 +126,7 @@ class Forest:
 
     @cached_property
     def limit_s(self) -> Floats:
-        """The latest time of a success, (E,); inf where the full-view driver fails."""
+        """The latest time of a success, (E,); inf if the full-view driver fails."""
         return self.reference_s + self.allowance_s + ROUNDING_S
 
     @cached_property
@@ -136,35 +136,35 @@ class Forest:
 
     @cached_property
     def value(self) -> Bools:
-        """Whether success is possible at each decision point, (N,): what the best policy reaches."""
+        """Whether success is possible at each decision point, (N,): whether the best policy succeeds."""
         return np.asarray(self.safe.any(axis=-1))
 
     @cached_property
     def delay_s(self) -> Floats:
-        """Seconds by which a safe action puts off the earliest success, (N, A); NaN where it is not safe."""
+        """The seconds by which a safe action puts off the earliest success, (N, A); NaN if it is not safe."""
         with np.errstate(invalid="ignore"):
             return np.where(self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan)
 
     def last_edge(self, chosen: Ints) -> Ints:
-        """The edge at which each episode ends, (E,), if action `chosen` (N,) is taken at each point."""
+        """Return the edge at which each episode ends, (E,), if `chosen` (N,) is taken at each point."""
         at, last = self.root.copy(), np.full(len(self.root), -1)
-        while (going := at >= 0).any():
-            action = chosen[at[going]]
-            last[going] = self.edge[at[going], action]
-            at[going] = self.child[at[going], action]
+        while (undecided := at >= 0).any():
+            action = chosen[at[undecided]]
+            last[undecided] = self.edge[at[undecided], action]
+            at[undecided] = self.child[at[undecided], action]
         return last
 
     def visited(self, chosen: Ints) -> Ints:
-        """The decision points that the episodes come to, in order, if action `chosen` (N,) is taken."""
-        met, at = [], self.root
+        """Return the decision points that the episodes visit, ascending, if `chosen` (N,) is taken."""
+        visited, at = [], self.root
         while len(at):
-            met.append(at)
+            visited.append(at)
             at = self.child[at, chosen[at]]
             at = at[at >= 0]
-        return np.sort(np.concatenate(met))
+        return np.sort(np.concatenate(visited))
 
     def succeeds(self, edge: Ints, tree: Ints) -> Bools:
-        """Whether ending at an edge (...) is a success in its tree (...)."""
+        """Return whether ending at an edge (...) is a success in its tree (...)."""
         return self._in_time(self.cleared_s[edge], self.limit_s[tree])
 
     @staticmethod
@@ -172,11 +172,11 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """How an episode that ends at this edge ends."""
+        """Return how an episode ends at this edge."""
         end = self.edges[edge].end
         assert end is not None
         return end
 
     def driver_success(self, driver: str) -> Bools:
-        """Whether a reference driver succeeds in each episode, (E,)."""
+        """Return whether a reference driver succeeds in each episode, (E,)."""
         return self.succeeds(self.last_edge(self.drivers[driver]), np.arange(len(self.root)))

@@ -1,4 +1,4 @@
-"""Reading a frozen dataset: what has not the digest and the form that were stated for it is not used."""
+"""Read a frozen dataset; a part without its stated digest or form is refused."""
 
 import os
 import re
@@ -35,9 +35,9 @@ from harness.dataset.verify import (
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
 
-# Of a dataset, the last that were read stay: some 120 and 100 MB.
+# How many of a dataset's scenes and trees stay in memory, the last ones read: some 120 and 100 MB.
 SCENES_KEPT, TREES_KEPT = 4096, 512
-TREES_AT_ONCE = 256  # whose arrays are made where every tree is asked something
+TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over all trees
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Scene:
     """One decision point, frozen.
 
     Attributes:
-        record: what the dataset has of it.
-        notes: what was worked out from it, by name, and need not be again.
+        record: its record in the dataset.
+        notes: results computed from it, by name, kept so that they are computed once.
     """
 
     record: dict[str, Any]
@@ -59,7 +59,7 @@ class Scene:
 
     @cached_property
     def state(self) -> WorldState:
-        """Everything that is there."""
+        """The whole state."""
         return WorldState.from_dict(self.record["state"])
 
     @property
@@ -76,10 +76,10 @@ class Scene:
 
 
 class Trees(Sequence[Tree]):
-    """The decision trees of some episodes by place; each is read when it is asked for."""
+    """The decision trees of some episodes, by index; each is read on use."""
 
     def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
-        """The trees of these episodes; `read` gives an episode's."""
+        """Take the trees of these episodes; `read` returns the tree of an episode."""
         self.numbers, self.read = tuple(numbers), read
 
     def __len__(self) -> int:
@@ -100,7 +100,7 @@ class Trees(Sequence[Tree]):
         return frozenset(self.numbers)
 
     def of_episode(self, number: int) -> Tree:
-        """An episode's. Raises KeyError if it is none of these."""
+        """Return an episode's tree. Raises KeyError if the episode is not among these."""
         if number not in self._numbers:
             raise KeyError(number)
         return self.read(number)
@@ -108,14 +108,14 @@ class Trees(Sequence[Tree]):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A verified dataset. Its trees and scenes are read, and verified, when they are asked for.
+    """A verified dataset; its trees and scenes are read and verified on use.
 
     Attributes:
-        path: its folder.
+        path: the dataset's folder.
         manifest: its manifest.
         sha256: digest of the manifest, which pins every file.
-        trees: the decision trees of its layouts, in order of episode.
-        trusted: it is a released one, whose scenes are known by their digests.
+        trees: the decision trees of its layouts, in the order of the episodes.
+        trusted: whether it is a released dataset, whose digests vouch for its scenes.
     """
 
     path: Path
@@ -128,12 +128,12 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """Name in the manifest."""
+        """The name in the manifest."""
         return self.manifest.name
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What was frozen, with the parameters that it was frozen with."""
+        """The frozen scenario, with the parameters that it had then."""
         return scenario_of(self.manifest)
 
     @property
@@ -143,17 +143,17 @@ class Dataset:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Numbers of the episodes."""
+        """The episodes' numbers."""
         return self.trees.numbers
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Layout seeds of the episodes."""
+        """The layout seeds of the episodes."""
         return tuple(self.manifest.seed + number for number in self.episodes)
 
     @cached_property
     def nodes(self) -> int:
-        """How many decision points the trees have."""
+        """The number of decision points in the trees."""
         if len(self.trees) == self.manifest.episodes:
             return self.manifest.nodes
         return sum(len(level) for tree in self.trees for level in tree.levels)
@@ -164,29 +164,29 @@ class Dataset:
         return Forest.of(tuple(self.trees), self.actions, self.scenario.parameters.delay_allowance_s)
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """The same with these episodes only."""
+        """Return the dataset with only these episodes."""
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
         return replace(self, trees=trees)
 
     def driver_success(self) -> dict[str, Bools]:
-        """Whether each reference driver succeeds in each episode, (E,)."""
-        some = [
-            replace(self, trees=self.trees[at : at + TREES_AT_ONCE]).forest
-            for at in range(0, len(self.trees), TREES_AT_ONCE)
+        """Return whether each reference driver succeeds in each episode, (E,)."""
+        forests = [
+            replace(self, trees=self.trees[start : start + TREES_AT_ONCE]).forest
+            for start in range(0, len(self.trees), TREES_AT_ONCE)
         ]
-        drivers = some[0].drivers
-        return {name: np.concatenate([forest.driver_success(name) for forest in some]) for name in drivers}
+        drivers = forests[0].drivers
+        return {name: np.concatenate([forest.driver_success(name) for forest in forests]) for name in drivers}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
-        """The scenes of decision points. Raises UserError for a damaged one, KeyError for an unknown one."""
-        wanted: dict[tuple[int, int], list[int]] = {}  # places in each level of each tree
+        """Return decision points' scenes. Raises UserError for a damaged one, KeyError for an unknown id."""
+        missing: dict[tuple[int, int], list[int]] = {}  # indices within each level of each tree
         for name in ids:
             if name not in self._scenes:
                 *level, place = self._place(name)
-                wanted.setdefault((level[0], level[1]), []).append(place)
-        if wanted:
+                missing.setdefault((level[0], level[1]), []).append(place)
+        if missing:
             with opened(self.path) as file:
-                for (number, step), places in wanted.items():
+                for (number, step), places in missing.items():
                     for record in self._records(file, self.trees.read(number), step, places):
                         self._scenes[record["scene"]] = Scene(record)
         scenes = [self._scenes[name] for name in ids]
@@ -203,9 +203,9 @@ class Dataset:
         return True
 
     def _place(self, name: str) -> tuple[int, int, int]:
-        """A decision point's episode, step and place in that level. Raises KeyError for an unknown one."""
-        if begins := re.match("([0-9]{5})-([0-9])", name):
-            episode, step = map(int, begins.groups())
+        """Return a point's episode, step and index in that level. Raises KeyError for an unknown id."""
+        if match := re.match("([0-9]{5})-([0-9])", name):
+            episode, step = map(int, match.groups())
             for at, level in enumerate(self.trees.of_episode(episode).levels):
                 for place, point in enumerate(level if at == step else ()):
                     if point.scene == name:
@@ -221,7 +221,7 @@ class Dataset:
             raise unusable(self.path, str(damage)) from None
         for place in places:
             name = tree.levels[step][place].scene
-            if self.trusted or name in self._checked:  # the level's digest is the same
+            if self.trusted or name in self._checked:  # the level's digest vouches for it
                 yield msgspec.json.decode(lines[place])
                 continue
             record, problems = decoded(lines[place], self.manifest, name)
@@ -231,54 +231,54 @@ class Dataset:
             yield record
 
     def scene(self, scene_id: str) -> Scene:
-        """The scene of that id, or of the one id that begins so."""
+        """Return the scene with this id, or with the only id that begins like this."""
         ids = self.forest.ids
-        begin_so = [name for name in ids if name.startswith(scene_id)] if scene_id else []
-        if len(begin_so) != 1:
-            shown = (begin_so or ids)[:12]
-            raise unknown("scene", scene_id, shown, " … (first dozen)" if len(begin_so or ids) > 12 else "")
-        return self.scenes(begin_so)[0]
+        matches = [name for name in ids if name.startswith(scene_id)] if scene_id else []
+        if len(matches) != 1:
+            shown = (matches or ids)[:12]
+            raise unknown("scene", scene_id, shown, " … (first dozen)" if len(matches or ids) > 12 else "")
+        return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
-        """Ids of the decision points that the reference drivers come to."""
+        """Return the ids of the decision points that the reference drivers visit."""
         forest = self.forest
-        met = [forest.visited(chosen) for chosen in forest.drivers.values()]
-        return tuple(forest.ids[n] for n in np.unique(np.concatenate(met)).tolist())
+        visited = [forest.visited(chosen) for chosen in forest.drivers.values()]
+        return tuple(forest.ids[n] for n in np.unique(np.concatenate(visited)).tolist())
 
 
 def find(name: str) -> Path:
-    """Folder of a dataset given by path, or by the name of a shipped one or of the project's."""
+    """Return the folder of a dataset, given by its path, or by its name if it is shipped or the project's."""
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         return Path(name)
-    known = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
-    if name in known:
+    names = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
+    if name in names:
         return beside("datasets", name)
-    raise unknown("dataset", name, known, "; or give a folder made by `harness dataset build`")
+    raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 
 
 def argument(path: Path) -> str:
-    """What finds a dataset again: its name, else its path, from the current folder where it lies below."""
+    """Return what finds a dataset again: its name, else its path, relative if below the current folder."""
     try:
         if find(path.name).resolve() == path.resolve():
             return path.name
     except UserError:  # nothing of that name, or two
         pass
-    whole, here = path.resolve(), Path.cwd().resolve()
-    return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
+    target, here = path.resolve(), Path.cwd().resolve()
+    return str(target.relative_to(here) if target.is_relative_to(here) else target)
 
 
 def released_digests() -> set[str]:
-    """Digests of the manifests of released datasets, `datasets/released.toml`."""
+    """Return the manifests' digests of released datasets, from `datasets/released.toml`."""
     pins = folder("datasets") / "released.toml"
     return set(tomllib.loads(pins.read_text()).values()) if pins.is_file() else set()
 
 
 @uncollected()
 def load(path: Path, limit: int | None = None) -> Dataset:
-    """Read a dataset; with `limit`, its first episodes only.
+    """Read a dataset; with `limit`, only its first episodes.
 
-    Every file has the digest its manifest states, and so has every tree, which pins its scenes. What a
-    released dataset holds is then what it was when its manifest was pinned; any other's is checked.
+    Every file and every tree must have the digest in the manifest, and a tree pins its scenes. For a released
+    dataset, whose manifest is pinned, this is enough; the content of any other dataset is checked as well.
 
     Raises:
         UserError: a file is missing, changed or broken.
@@ -295,7 +295,7 @@ def load(path: Path, limit: int | None = None) -> Dataset:
 
 @dataclass(frozen=True)
 class _Folder:
-    """Gives an episode's tree from a dataset's folder. Raises UserError where that is damaged."""
+    """Reads an episode's tree from a dataset's folder. Raises UserError if the dataset is damaged."""
 
     path: Path
     manifest: Manifest

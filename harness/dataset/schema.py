@@ -1,6 +1,7 @@
-"""The form of a frozen dataset: what its manifest and its decision points hold, and the JSON Schemas of both.
+"""The schema of a frozen dataset: the types of its manifest, trees and decision points.
 
-What is typed here is enforced when a dataset is built and read, and published beside it as JSON Schema.
+The types are enforced when a dataset is built and read. They are published beside it as JSON Schema, their
+docstrings included, and released datasets pin those files: a docstring here is part of the format.
 """
 
 import re
@@ -16,11 +17,11 @@ from harness.core.seeds import Purpose
 from harness.world.scenario import Scenario
 from harness.world.state import Kind, Part, indicator
 
-FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # of a dataset and of its files: never a path
+FILE_NAME = "^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"  # names of a dataset and its files; never a path
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 LAYOUTS = "layouts.zip"
 
-# No metre, second or share comes near these bounds; infinity and thousand-digit integers do not pass them.
+# No metre, second or share comes near these bounds, and infinity and huge integers do not pass them.
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 Episode = Annotated[int, Meta(ge=0, le=LAST_EPISODE)]
@@ -306,7 +307,7 @@ class Manifest(Closed, frozen=True):
 
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
-    """`Record` with the approaches, routes, sectors and facts of the scenario's road."""
+    """Return `Record` narrowed to the approaches, routes, sectors and facts of the scenario's road."""
     road = scenario.road()
     approach = _choice(approach for approach, _ in road.paths)
     route = _choice(route for _, route in road.paths)
@@ -342,22 +343,22 @@ def _list(kind: Any) -> Any:
 
 
 def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
-    """The kind, some of whose members are of a narrower type."""
+    """Return a type with narrower types for some of its members."""
     return msgspec.defstruct(kind.__name__, fields.items(), bases=(kind,), frozen=True)
 
 
 def record_schema(scenario: Scenario) -> dict[str, Any]:
-    """JSON Schema of one line of an `<episode>/<step>.jsonl`."""
+    """Return the JSON Schema of one line of an `<episode>/<step>.jsonl`."""
     return _published(record_type(scenario), "decision point")
 
 
 def tree_schema() -> dict[str, Any]:
-    """JSON Schema of a `tree.json`."""
+    """Return the JSON Schema of a `tree.json`."""
     return _published(Tree, "decision tree of a layout")
 
 
 def manifest_schema() -> dict[str, Any]:
-    """JSON Schema of `manifest.json`."""
+    """Return the JSON Schema of `manifest.json`."""
     return _published(Manifest, "dataset manifest")
 
 

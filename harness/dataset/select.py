@@ -1,4 +1,4 @@
-"""Which episodes of a dataset are evaluated."""
+"""Select the episodes of a dataset that are evaluated."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -7,19 +7,19 @@ from harness.core import noise
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Dataset
 
-NONE = "none"  # of `danger`: layouts without one
+NONE = "none"  # the `danger` of layouts without one
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Episodes that are in all of these; without any, all of them.
+    """Conditions that an episode must all meet; without any, all episodes are selected.
 
     Attributes:
-        limit: the first so many of the others.
-        only: numbers and ranges, `3,10:20`, each without its end.
-        danger: sector that the hidden danger comes from, or `none`.
-        sample: how many to draw; a larger sample of the same seed has the smaller one in it.
-        sample_seed: of the draw.
+        limit: keeps the first so many of those that the other conditions leave.
+        only: numbers and ranges such as `3,10:20`; a range leaves out its end.
+        danger: the sector that the hidden danger comes from, or `none`.
+        sample: how many to draw; a larger sample with the same seed contains the smaller one.
+        sample_seed: seed of the draw.
     """
 
     limit: int | None = None
@@ -34,24 +34,26 @@ class Selection:
 
     @property
     def given(self) -> dict[str, int | str]:
-        """What is given besides `limit`, by name."""
-        others = {key: value for key, value in asdict(self).items() if key != "limit" and value is not None}
+        """The conditions that are set, except `limit`, by name."""
+        conditions = {
+            key: value for key, value in asdict(self).items() if key != "limit" and value is not None
+        }
         if self.sample is None:
-            del others["sample_seed"]
-        return others
+            del conditions["sample_seed"]
+        return conditions
 
     def of(self, dataset: Dataset) -> Dataset:
-        """The dataset with these episodes only. Raises UserError if there is none, or no such danger."""
+        """Return the dataset with only these episodes. Raises UserError for none, or an unknown danger."""
         numbers = list(dataset.episodes)
         if self.only is not None:
-            wanted = _numbers(self.only, max(numbers) + 1)
-            numbers = [n for n in numbers if n in wanted]
+            chosen = _numbers(self.only, max(numbers) + 1)
+            numbers = [n for n in numbers if n in chosen]
         if self.danger is not None:
             sectors = tuple(dataset.scenario.road().sectors)
             if self.danger not in (*sectors, NONE):
                 raise unknown("--danger", self.danger, (*sectors, NONE))
-            of = {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
-            numbers = [n for n in numbers if of[n] == self.danger]
+            danger_of = {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
+            numbers = [n for n in numbers if danger_of[n] == self.danger]
         if self.sample is not None:
             numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
         if not numbers:
@@ -64,7 +66,7 @@ ALL = Selection()
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
-    """Some of the episodes' numbers, all of which are below `end`. Raises UserError if there are too few."""
+    """Draw some of the episodes' numbers, all below `end`. Raises UserError if there are too few."""
     if not 1 <= sample <= len(numbers):
         raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")
     order = noise.generator("sample of episodes", seed).random(end)
@@ -72,18 +74,18 @@ def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]
 
 
 def _numbers(text: str, end: int) -> set[int]:
-    """The numbers below `end` that `3,10:20` names. Raises UserError for another text, or one beyond it."""
-    found: set[int] = set()
+    """Parse a text such as `3,10:20`. Raises UserError for any other text, or for numbers from `end` on."""
+    numbers: set[int] = set()
     for part in text.split(","):
         first, colon, last = part.partition(":")
         try:
-            at = range(int(first), int(last)) if colon else range(int(first), int(first) + 1)
+            span = range(int(first), int(last)) if colon else range(int(first), int(first) + 1)
         except ValueError:
-            at = range(0)
-        if not at or at.start < 0 or at.stop > end:
+            span = range(0)
+        if not span or span.start < 0 or span.stop > end:
             raise UserError(
                 f"--only {printable(text)}: give episodes from 0 to {end - 1}, such as 3,10:20, which is "
                 "3 and 10 to 19"
             )
-        found.update(at)
-    return found
+        numbers.update(span)
+    return numbers

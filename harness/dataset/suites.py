@@ -1,6 +1,6 @@
-"""Suites: datasets that are evaluated together, one of each family of scenes (a scenario).
+"""Read suites: datasets that are evaluated together, one for each family of scenes (a scenario).
 
-`datasets/suites.toml` has a table a suite: its description and the names of its datasets.
+`datasets/suites.toml` has one table for each suite: its description and the names of its datasets.
 """
 
 from collections.abc import Mapping
@@ -13,16 +13,16 @@ from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.resources import entries
 
-PREFIX = "suite:"  # of a suite's name, where a dataset's is expected
+PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
 
 class Suite(Struct, frozen=True, forbid_unknown_fields=True):
     """One suite.
 
     Attributes:
-        name: how it is called.
-        description: what it is for.
-        datasets: names of its datasets, in the order of tables.
+        name: the suite's name.
+        description: its purpose.
+        datasets: the names of its datasets, in the order of tables.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Suite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def named(text: str) -> Suite | None:
-    """The suite that `suite:NAME` names, shipped or the project's; None for any other text.
+    """Return the suite that `suite:NAME` names, shipped or the project's; None for any other text.
 
     Raises:
         UserError: there is no such suite, or two, or its table is wrong.
@@ -42,14 +42,14 @@ def named(text: str) -> Suite | None:
         return None
     name, files = text.removeprefix(PREFIX), entries("datasets", "suites.toml")
     tables = [(file, key, table) for file in files for key, table in _tables(file).items()]
-    found = [(file, table) for file, key, table in tables if key == name]
-    if not found:
+    matches = [(file, table) for file, key, table in tables if key == name]
+    if not matches:
         raise unknown("suite", name, {key for _, key, _ in tables})
-    if len(found) > 1:
+    if len(matches) > 1:
         raise UserError(
             f"suite {printable(name)} is in this project and ships with the harness; give yours another name"
         )
-    [(file, table)] = found
+    [(file, table)] = matches
     where = f"suite {printable(name)} in {printable(file)}"
     if not isinstance(table, Mapping):
         raise UserError(f"{where} is no table; give it a description and datasets")

@@ -1,4 +1,4 @@
-"""Whether a dataset is what it says: its files by digest, each tree and decision point by form and sense."""
+"""Verify a dataset: its files by digest, and each tree and decision point by type and consistency."""
 
 import os
 import zipfile
@@ -30,7 +30,7 @@ LARGEST_ENTRY = 1 << 28  # bytes
 
 
 def read_manifest(path: Path) -> tuple[Manifest, str]:
-    """The manifest and its digest."""
+    """Read a dataset's manifest and its digest. Raises UserError if it is missing or wrong."""
     file = path / "manifest.json"
     try:
         data = file.read_bytes()
@@ -56,7 +56,7 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
 
 
 def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
-    """What is wrong with a manifest that no type can state."""
+    """Yield what is wrong with a manifest that no type can state."""
     if len(set(manifest.actions)) < len(manifest.actions):
         yield "[actions]: an action stands there twice"
     if len(manifest.trees_sha256) != manifest.episodes:
@@ -77,19 +77,19 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 
 
 def scenario_of(manifest: Manifest) -> Scenario:
-    """The scenario of a manifest, with the manifest's parameters."""
+    """Return the scenario of a manifest, with the manifest's parameters."""
     return scenarios.stated(manifest.scenario, manifest.parameters)
 
 
 def check(path: Path) -> list[str]:
-    """Everything that is wrong with a dataset, one line each. Empty if sound."""
+    """Return everything that is wrong with a dataset, one line each; empty if it is sound."""
     manifest, _ = read_manifest(path)
     problems, nodes = list(file_problems(path, manifest)), 0
     try:
         with opened(path) as file:
             for episode in range(manifest.episodes):
-                of_tree, points = _check_tree(file, manifest, episode)
-                problems += of_tree
+                tree_problems, points = _check_tree(file, manifest, episode)
+                problems += tree_problems
                 nodes += points
     except UserError as error:
         return [*problems, str(error)]
@@ -99,7 +99,7 @@ def check(path: Path) -> list[str]:
 
 
 def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[str], int]:
-    """What is wrong with a layout's tree and scenes, and how many decision points it has."""
+    """Return what is wrong with a layout's tree and scenes, and the number of its decision points."""
     try:
         tree = read_tree(file, manifest, episode)
         problems = []
@@ -112,7 +112,7 @@ def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[s
 
 
 def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
-    """Which files of the manifest are missing or changed, a line each."""
+    """Yield a line for each file of the manifest that is missing or changed."""
     for name, expected in manifest.files.items():
         if not (path / name).is_file():
             yield f"{name}: missing"
@@ -121,12 +121,12 @@ def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
 
 
 class Damaged(Exception):
-    """Part of a dataset that is not what was pinned, in words."""
+    """A part of a dataset is not what was pinned; the message says how."""
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
-    """A dataset's layouts. Digests pin what is in them: how a machine compresses it is its own."""
+    """Open a dataset's layouts. Digests pin the content; the compressed bytes may differ by machine."""
     file = path / LAYOUTS
     try:
         now = file.stat()
@@ -137,15 +137,16 @@ def opened(path: Path) -> Iterator[ZipFile]:
 
 @lru_cache(maxsize=2)
 def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
-    """A file that stays open, since to list what is in a large one takes long.
+    """Open a file and keep it open, since listing the content of a large one takes long.
 
-    A `state` of it is read by one `process`: a forked one would move its parent's place in the file.
+    A changed `state` opens it anew. So does another `process`, since a forked one shares its parent's
+    position in the file.
     """
     return ZipFile(file)
 
 
 def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
-    """A file in `layouts.zip`. Raises Damaged if it is not the one that was pinned."""
+    """Read a file in `layouts.zip`. Raises Damaged if it does not have the digest that was pinned."""
     try:
         if file.getinfo(name).file_size > LARGEST_ENTRY:
             raise Damaged(f"{LAYOUTS} {name}: too large")
@@ -158,7 +159,7 @@ def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
 
 
 def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = False) -> Tree:
-    """The tree of an episode. Raises Damaged if it is not the manifest's, or is broken."""
+    """Read an episode's tree. Raises Damaged if it is not the manifest's, or is broken."""
     name = tree_name(episode)
     data = _entry(file, name, manifest.trees_sha256[episode])
     try:
@@ -173,7 +174,7 @@ def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = F
 
 
 def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
-    """The scenes of one level of a tree, a line each, in the level's order. Raises Damaged."""
+    """Read the scenes of one level of a tree, one line each, in the level's order. Raises Damaged."""
     name = level_name(tree.episode, step)
     lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
     if len(lines) != len(tree.levels[step]):
@@ -182,20 +183,20 @@ def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
 
 
 def tree_name(episode: int) -> str:
-    """Name of a tree in `layouts.zip`."""
+    """Return the name of a tree in `layouts.zip`."""
     return f"{episode:05d}/tree.json"
 
 
 def level_name(episode: int, step: int) -> str:
-    """Name of a level's scenes in `layouts.zip`."""
+    """Return the name of a level's scenes in `layouts.zip`."""
     return f"{episode:05d}/{step}.jsonl"
 
 
 def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str]:
-    """Where one part of a tree speaks against another or the manifest, which no type can state."""
+    """Return where a tree contradicts itself or the manifest in ways that no type can state."""
     actions, points = Counter(manifest.actions), [point for level in tree.levels for point in level]
     edges = [edge for point in points for edge in point.edges]
-    leads = [
+    continuing = [
         (edge.to, len(following))
         for level, following in zip(tree.levels, [*tree.levels[1:], []], strict=True)
         for point in level
@@ -204,7 +205,7 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
     ]
     ids = [point.scene for point in points]
     chosen = {action for point in points for action in point.drivers.values()}
-    holds = {
+    conditions = {
         "its number is not that of its folder": tree.episode == number,
         "its seed is not the manifest's, counted on": tree.episode_seed == manifest.seed + number,
         "the first level is not the start alone": len(tree.levels[0]) == 1,
@@ -222,13 +223,13 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
         "an edge leads nowhere, or goes on after the end": all(
             (edge.to is None) != (edge.end is None) for edge in edges
         ),
-        "an edge leads to a decision point that is not there": all(to < n for to, n in leads),
+        "an edge leads to a decision point that is not there": all(to < n for to, n in continuing),
     }  # fmt: skip
-    return [what for what, true in holds.items() if not true]
+    return [problem for problem, holds in conditions.items() if not holds]
 
 
 def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[dict[str, Any], list[str]]:
-    """A scene's record, and what is wrong with it; it is good for use only if nothing is."""
+    """Return a scene's record and what is wrong with it; the record is usable only if nothing is."""
     scenario = scenarios.get(manifest.scenario)
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:
@@ -242,37 +243,37 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[dict[str, Any],
 
 
 def unusable(path: Path, problem: str) -> UserError:
-    """What a reader of a dataset is told of a problem."""
+    """Return the error for a dataset with a problem."""
     return UserError(
         f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or rebuild it"
     )
 
 
 def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
-    """What of a JSON text does not fit a type, in one line."""
+    """Return in one line what in a JSON text does not fit a type."""
     try:
         if isinstance(table := _JSON.decode(text), dict):
             convert(table, kind, what)
     except UserError as mistake:
         return str(mistake)
-    except (ValueError, RecursionError):  # of a part that the typed reading did not come to
+    except (ValueError, RecursionError):  # an error in a part that the typed reading did not reach
         pass
     return printable(error)
 
 
 def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name: str) -> list[str]:
-    """Where one part of a record speaks against another or the manifest, which no type can state."""
+    """Return where a record contradicts itself or the manifest in ways that no type can state."""
     state, graphs = record.state, record.graphs
     ids = [v.id for v in state.vehicles]
     viewers = {v.id for v in state.vehicles if v.part != "other"}
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
     speeds, road, snapshot = manifest.parameters["target_speeds_mps"], scenario.road(), record.snapshot
-    ours = None if isinstance(snapshot, Taken) else snapshot
-    holds = {
+    own_snapshot = None if isinstance(snapshot, Taken) else snapshot
+    conditions = {
         "it is the scene of another decision point": record.scene == name,
         "there is no target speed of that index": isinstance(speeds, list)
-        and (not ours or ours.speed_index < len(speeds)),
+        and (not own_snapshot or own_snapshot.speed_index < len(speeds)),
         "scene is not <episode>-<step>-<digest>": record.scene.startswith(
             f"{record.episode:05d}-{record.step}-"
         ),
@@ -291,6 +292,6 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
-        "sections are not one a vehicle": not ours or len(ours.sections) == len(ids),
+        "sections are not one a vehicle": not own_snapshot or len(own_snapshot.sections) == len(ids),
     }
-    return [what for what, true in holds.items() if not true]
+    return [problem for problem, holds in conditions.items() if not holds]

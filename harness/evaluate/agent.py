@@ -1,4 +1,4 @@
-"""An agent: the model that answers for a vehicle, and how it is asked."""
+"""Describe an agent: the model that answers for a vehicle, and how it is asked."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,15 +17,15 @@ ImageMode = Literal["own", "blank", "another", "none"]
 
 @dataclass(frozen=True)
 class Agent:
-    """Who answers for a vehicle.
+    """Answers for a vehicle: a model, its prompt and how it answers.
 
     Attributes:
         card: the model.
         prompt: the prompt version.
-        answer: how the model answers: free `json`, `constrained` to the schema, or the `readout` of letters.
-        thinking: whether the model thinks first.
-        image: which picture an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
-            scene, or `none`, which leaves its text alone.
+        answer: how the model answers: free `json`, `constrained` to the schema, or a `readout` of letters.
+        thinking: whether the model thinks before it answers.
+        image: the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
+            scene, or `none`, which leaves only the text.
     """
 
     card: Card
@@ -39,7 +39,7 @@ class Agent:
         thinks = self.can.thinks == "always" or (self.can.thinks == "card" and self.card.thinking != "none")
         if self.thinking and not thinks:
             raise UserError(f"--thinking: {name} cannot think; leave it out")
-        if self.card.thinking == "always":  # its answers hold a thought, asked for or not
+        if self.card.thinking == "always":  # its answers hold a thought even if none was asked for
             object.__setattr__(self, "thinking", True)
         if self.image not in get_args(ImageMode):
             raise unknown("image", self.image, get_args(ImageMode))
@@ -66,17 +66,17 @@ class Agent:
 
     @property
     def can(self) -> Capabilities:
-        """What its engine can do."""
+        """The capabilities of its engine."""
         return capabilities(self.card.engine)
 
     @property
     def sees(self) -> bool:
-        """Whether its questions show a picture."""
+        """Whether its prompts show a picture."""
         return bool(self.prompt.image and self.card.vision) and self.image != "none"
 
     @property
     def samples(self) -> bool:
-        """Whether a temperature draws its answers: a read-out is a distribution already."""
+        """Whether its answers are sampled at a temperature; a read-out is a distribution already."""
         return self.can.samples and self.answer != "readout"
 
     @property
@@ -85,14 +85,14 @@ class Agent:
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"
 
     def most_tokens(self, role: Role) -> int:
-        """Most tokens that an answer may have, its thought included if the model thinks first."""
+        """Return the most tokens that an answer may have, the thought included if the model thinks first."""
         answer = self.card.max_new_tokens or self.prompt.max_answer_tokens[role]
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def messages(
         self, graph: Mapping[str, Any], actions: tuple[str, ...], words: Mapping[str, str]
     ) -> tuple[Mapping[str, str], ...]:
-        """The chat messages about a scene graph."""
+        """Return the chat about a scene graph, in the agent's answer mode."""
         rendered = self.rendered(graph, actions, (), words)
         return in_mode(self.answer, self.prompt, rendered, graph["role"], actions)
 
@@ -100,11 +100,11 @@ class Agent:
         self, graph: Mapping[str, Any], actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
-        """The chat messages about a scene graph and messages, as they are free of an answer mode."""
+        """Return the chat about a scene graph and the messages heard, before the answer mode changes it."""
         return shown(self.image, self.prompt.render(graph, actions, heard, words))
 
     def settings(self) -> dict[str, Any]:
-        """All that decides its answers, as plain values."""
+        """Return everything that decides its answers, as plain values."""
         return {
             "model": asdict(self.card),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
@@ -115,7 +115,7 @@ class Agent:
 
 
 def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
-    """A prompt's chat in an image mode: without its picture where that is `none`."""
+    """Return a prompt's chat in an image mode; `none` removes the picture."""
     if image != "none":
         return tuple(messages)
     return tuple({key: text for key, text in m.items() if key != "image"} for m in messages)
@@ -124,26 +124,26 @@ def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[st
 def in_mode(
     answer: str, prompt: Prompt, messages: Sequence[Mapping[str, str]], role: str, actions: Sequence[str]
 ) -> tuple[Mapping[str, str], ...]:
-    """A prompt's chat as an answer mode asks it: in a read-out the examples answer by a letter, too."""
+    """Return a prompt's chat in an answer mode; in a read-out, the examples answer by a letter, too."""
     if answer != "readout":
         return tuple(messages)
     return readout.asked(messages, actions, example_actions(prompt, role, actions))
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """The action that each example of a role is likeliest to take.
+    """Return the likeliest action of each of a role's examples.
 
     Raises:
-        UserError: the parser would have to mend an example's answer.
+        UserError: an example's answer does not parse without repairs.
     """
-    found = []
+    likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
         first = role in prompt.reasons_first
-        said = parse(example.answer, role=role, actions=actions, reasons_first=first)
-        if said.status is not Status.STRICT or said.intent is None:
+        parsed = parse(example.answer, role=role, actions=actions, reasons_first=first)
+        if parsed.status is not Status.STRICT or parsed.intent is None:
             raise UserError(
                 f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "
-                f"model should state it ({said.status}: {said.detail}); fix it"
+                f"model should state it ({parsed.status}: {parsed.detail}); fix it"
             )
-        found.append(actions[said.intent.index(max(said.intent))])
-    return found
+        likeliest.append(actions[parsed.intent.index(max(parsed.intent))])
+    return likeliest

@@ -1,4 +1,4 @@
-"""Answers: one for each viewer at each decision point, kept as they come, so that a killed run resumes."""
+"""Ask the agents: one answer for each viewer at each decision point, kept so that a run can resume."""
 
 import math
 import os
@@ -30,26 +30,26 @@ from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
 from harness.runs.records import Role as RecordedRole
 from harness.world.perception.graph import blinded, truth_graph
 
-CHUNK = 64  # requests that are asked for, and kept, at a time, at least
+CHUNK = 64  # fewest requests that are asked, and kept, together
 
 
 def requests(spec: Spec, scenes: Sequence[Scene], blind: bool = False) -> Iterator[Request]:
-    """The requests, scene by scene, the ego first; of `blind` helpers alone, who are shown nothing."""
+    """Yield the requests of scenes, the ego's first; with `blind` only those of blind helpers."""
     for scene in scenes:
         truth = None
         if any(agent.card.privileged for agent in spec.agents):
             truth = truth_graph(spec.scenario, scene.state)
         for place, viewer in enumerate(spec.viewers(scene)):
-            graph, who = scene.record["graphs"][viewer], spec.agent(place)
-            agent, name = spec.agents[who], _id(scene, viewer, blind)
+            graph, index = scene.record["graphs"][viewer], spec.agent(place)
+            agent, name = spec.agents[index], _id(scene, viewer, blind)
             if blind:
                 if not place:
                     continue
                 graph = blinded(graph)
             yield _request(
-                spec, who, name, graph["role"],
+                spec, index, name, graph["role"],
                 agent.messages(graph, spec.actions, spec.scenario.prompt_words),
-                image=picture(spec, who, scene, viewer, blind), view=graph,
+                image=picture(spec, index, scene, viewer, blind), view=graph,
                 truth=truth if agent.card.privileged else None, scenario=spec.scenario,
             )  # fmt: skip
 
@@ -59,22 +59,22 @@ def _id(scene: Scene, viewer: str, blind: bool) -> str:
 
 
 def _request(
-    spec: Spec, who: int, name: str, role: Role, messages: tuple[Mapping[str, str], ...], **more: Any
+    spec: Spec, index: int, name: str, role: Role, messages: tuple[Mapping[str, str], ...], **more: Any
 ) -> Request:
-    agent = spec.agents[who]
+    agent = spec.agents[index]
     if agent.samples:
         more |= {"temperature": spec.temperature, "sample": spec.sampling_seed}
     return Request(
         id=name, role=role, messages=messages, actions=spec.actions, max_tokens=agent.most_tokens(role),
         form=agent.prompt.helper_answer, answer=agent.answer, thinking=agent.thinking,
-        reasons_first=role in agent.prompt.reasons_first, agent=who, **more,
+        reasons_first=role in agent.prompt.reasons_first, agent=index, **more,
     )  # fmt: skip
 
 
 def fusion_request(
     spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str]
 ) -> Request:
-    """The fusion call with these helpers' messages; `answers` by key, as `senders` has them."""
+    """Return the fusion call with these senders' messages; `answers` has the same keys as `senders`."""
     graph, heard = scene.record["graphs"][scene.viewers[0]], messages_of(answers, senders, spec.actions)
     messages = spec.ego.rendered(graph, spec.actions, heard, spec.scenario.prompt_words)
     image = picture(spec, 0, scene, scene.viewers[0])
@@ -86,14 +86,14 @@ def _fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """The answer that a completion holds."""
-    # A lone surrogate cannot be written to a file; nothing else of the text is touched.
+    """Parse a completion into an answer."""
+    # A lone surrogate cannot be written to a file. The rest of the text stays as it is.
     raw = completion.text.encode("utf-8", "replace").decode("utf-8")
     scene, _, viewers = request.id.partition("/")
     viewer, *heard = viewers.split("+")
     role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
-    said = parse(
-        # A read-out is a bare distribution, a helper's too.
+    parsed = parse(
+        # A read-out is a bare distribution, even a helper's.
         raw, role="ego" if request.answer == "readout" else request.role, actions=request.actions,
         thinking=request.thinking, reasons_first=request.reasons_first,
         finish_reason=completion.finish_reason, error=completion.error,
@@ -107,18 +107,18 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         first_token_s=completion.first_token_s, token_s=completion.token_s,
         prompt_sha256=digest(request.messages),
         image_sha256=request.image_sha256 or UNSET,
-        status=str(said.status), verdict=said.verdict,
-        repairs=tuple(map(str, said.repairs)), intent=said.intent, mass=said.mass, message=said.message,
-        detail=said.detail,
+        status=str(parsed.status), verdict=parsed.verdict,
+        repairs=tuple(map(str, parsed.repairs)), intent=parsed.intent, mass=parsed.mass,
+        message=parsed.message, detail=parsed.detail,
     )  # fmt: skip
 
 
 class Asker:
-    """Gets the answers that are missing, and turns answers into arrays of intents.
+    """Asks for the answers that are missing, and turns answers into arrays of intents.
 
     Attributes:
         spec: the evaluation.
-        answers: by request id, in the order of the requests.
+        answers: answers by request id, in the order of the requests.
         latency: how long inference takes.
     """
 
@@ -132,15 +132,15 @@ class Asker:
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
     ) -> None:
-        """An asker.
+        """Create an asker.
 
         Args:
             spec: the evaluation.
             backend: opens the backend, at the first request.
             latency: how long inference takes.
-            kept: JSON Lines file of answers so far; may be torn at its end by a kill.
-            answers: further answers that are there already, by request id.
-            progress: called with the number of new answers, those kept from before included.
+            kept: JSON Lines file of the answers so far; its last line may be torn if a run was killed.
+            answers: further answers that need not be asked for, by request id.
+            progress: called with the number of new answers, those kept by a stopped run included.
             more: called with the number of requests before they are made.
         """
         self.spec, self._backend, self._kept = spec, backend, kept
@@ -150,134 +150,140 @@ class Asker:
         self.answers = {**(read_kept(kept) if kept else {}), **(answers or {})}
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Get the answers that are missing, and keep each at once."""
+        """Ask for the missing answers, and keep each chunk as soon as it is answered."""
         if all(request.id in self.answers for request in asked):
             self._progress(len(asked))
             return
-        # Chunks begin at the same places in a resumed run, and a torn one is repeated whole: an answer may
-        # depend on the other requests in its batch.
+        # An answer may depend on the other requests in its batch. So the chunks of a resumed run begin at the
+        # same places, and a chunk with an answer missing is asked again as a whole.
         backend, batch = self._backend(), self.spec.batch_size
         size = batch * math.ceil(CHUNK / batch)
         chunks = [asked[start : start + size] for start in range(0, len(asked), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
-            chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # whose batches are whole, as the others' are
-        owed = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
-        if len(owed) < len(chunks):
-            self._progress(len(asked) - sum(map(len, owed)))
-        found: dict[str, Answer] = {}
-        for answers in _each(partial(self._answered, backend), owed, 1 + math.ceil(window(backend) / size)):
-            found |= {answer.id: answer for answer in answers}
+            chunks[-2:] = [asked[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
+        incomplete = [chunk for chunk in chunks if any(request.id not in self.answers for request in chunk)]
+        if len(incomplete) < len(chunks):
+            self._progress(len(asked) - sum(map(len, incomplete)))
+        new_answers: dict[str, Answer] = {}
+        for answers in _answer_chunks(
+            partial(self._answered, backend), incomplete, 1 + math.ceil(window(backend) / size)
+        ):
+            new_answers |= {answer.id: answer for answer in answers}
             if self._kept:
                 _keep(self._kept, answers)
             self._progress(len(answers))
-        self.answers |= {request.id: found[request.id] for chunk in owed for request in chunk}
+        self.answers |= {request.id: new_answers[request.id] for chunk in incomplete for request in chunk}
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> list[Answer]:
-        """An answer each, those that cannot be read after a repair turn if the prompt has one."""
+        """Answer each request; one whose answer cannot be parsed gets a repair turn if its prompt has one."""
         words = self.spec.scenario.prompt_words
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
-        owed = {}
+        repairs = {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
             prompt = self.spec.agents[request.agent].prompt
             if repair.wanted(request, answer, prompt):
-                owed[place] = repair.asked(request, answer, prompt, words)
-        completions = backend.complete(list(owed.values())) if owed else []
-        for place, completion in zip(owed, completions, strict=True):
+                repairs[place] = repair.asked(request, answer, prompt, words)
+        completions = backend.complete(list(repairs.values())) if repairs else []
+        for place, completion in zip(repairs, completions, strict=True):
             answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
         return answers
 
     def __call__(self, moments: Sequence[Scene]) -> Intents:
-        """What every viewer intends; NaN for one without a request, or whose answer failed."""
+        """Return what every viewer intends; NaN if it has no request or its answer failed."""
         if any(self.lacks(moments)):
             self.answer(list(requests(self.spec, self._not_given(moments))))
         return self.laid_out(moments)
 
     def blind(self, moments: Sequence[Scene], at: Ints) -> Intents:
-        """The same where helpers are shown nothing; NaN for those of other moments than these."""
-        wanted = [moments[n] for n in at.tolist()]
-        if any(self.lacks(wanted, blind=True)):
-            self.answer(list(requests(self.spec, self._not_given(wanted, blind=True), blind=True)))
+        """Return intents where helpers are shown nothing; NaN for those of moments not in `at`."""
+        blind_moments = [moments[n] for n in at.tolist()]
+        if any(self.lacks(blind_moments, blind=True)):
+            self.answer(list(requests(self.spec, self._not_given(blind_moments, blind=True), blind=True)))
         return self.laid_out(moments, blind=True)
 
     def lacks(self, moments: Sequence[Scene], blind: bool = False) -> list[bool]:
-        """Whether some viewer's answer is missing, of each; some helper's who is shown nothing."""
+        """For each moment, whether a viewer's answer is missing; with `blind`, a blind helper's."""
         return self._lacking(moments, self.answers, blind)
 
     def _not_given(self, moments: Sequence[Scene], blind: bool = False) -> list[Scene]:
-        """Those with more to ask than `answer` leaves out: no prompt of the rest has to be written."""
+        """Return the moments whose answers were not all given; only their prompts are rendered."""
         lacks = self._lacking(moments, self._given, blind)
         return [scene for scene, lacking in zip(moments, lacks, strict=True) if lacking]
 
-    def _lacking(self, moments: Sequence[Scene], there: Container[str], blind: bool) -> list[bool]:
-        return [any(_id(s, v, blind) not in there for v in self.spec.viewers(s)[blind:]) for s in moments]
+    def _lacking(self, moments: Sequence[Scene], available: Container[str], blind: bool) -> list[bool]:
+        return [any(_id(s, v, blind) not in available for v in self.spec.viewers(s)[blind:]) for s in moments]
 
     def laid_out(self, moments: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
-        """The answers that are there as arrays, with `width` vehicles or more; NaN for one that failed."""
+        """Return the answers so far as arrays of at least `width` vehicles; NaN without an intent."""
         answers = [
             [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in moments
         ]
         width, actions = max(width, *map(len, answers)), len(self.spec.actions)
         p = np.full((len(moments), width, actions), np.nan)
-        distance, reach = np.full((len(moments), width), np.nan), np.full((len(moments), width - 1), np.nan)
+        distance_m = np.full((len(moments), width), np.nan)
+        range_m = np.full((len(moments), width - 1), np.nan)
         bits = np.zeros((len(moments), width - 1))
         for i, (scene, row) in enumerate(zip(moments, answers, strict=True)):
-            at = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
+            positions = {v["id"]: (v["x_m"], v["y_m"]) for v in scene.record["state"]["vehicles"]}
             for j, (viewer, answer) in enumerate(zip(scene.viewers, row, strict=True)):
-                distance[i, j] = scene.record["distance_m"][viewer]
+                distance_m[i, j] = scene.record["distance_m"][viewer]
                 if answer and answer.intent is not None:
                     p[i, j] = answer.intent
                 if j:
-                    reach[i, j - 1] = scene.record["range_m"][viewer]
-                    bits[i, j - 1] = payload_bits(at[viewer], answer) if answer else 0
+                    range_m[i, j - 1] = scene.record["range_m"][viewer]
+                    bits[i, j - 1] = payload_bits(positions[viewer], answer) if answer else 0
             row += [None] * (width - len(row))
         valid = ~np.isnan(p[:, 1:]).any(axis=-1)
-        times = inference_s(self.latency, answers)
-        return Intents(p[:, 0], p[:, 1:], valid, distance, reach, bits, times)
+        seconds = inference_s(self.latency, answers)
+        return Intents(p[:, 0], p[:, 1:], valid, distance_m, range_m, bits, seconds)
 
     def fusion_call(self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """The ego's answers to these sets of messages, shown so."""
-        ids = [_fusion_id(*each) for each in _heard(moments, codes, rewrites)]
+        """Return the ego's answers to these sets of messages, rewritten as `rewrites` says."""
+        ids = [_fusion_id(*each) for each in _heard_sets(moments, codes, rewrites)]
         if not self.answers.keys() >= set(ids):
             self.answer(self.fusion_requests(moments, codes, rewrites))
         answers = [self.answers[name] for name in ids]
-        nothing = [np.nan] * len(self.spec.actions)
-        intents = np.array([a.intent or nothing for a in answers]).reshape(len(ids), len(nothing))
+        unknown = [np.nan] * len(self.spec.actions)
+        intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
         return FusionAnswers(codes, intents, fusion_s(self.latency, answers)).at
 
     def fusion_requests(
         self, moments: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
-        """The requests of the fusion calls with these sets of messages."""
-        asked = []
-        for scene, senders in _heard(moments, codes, rewrites):
+        """Return the requests of the fusion calls with these sets of messages."""
+        calls = []
+        for scene, senders in _heard_sets(moments, codes, rewrites):
             keys = (key.partition(REWRITTEN)[0] for key in senders)
             sent = {key: a for key in keys if (a := self.answers.get(f"{scene.id}/{key}"))}
-            asked.append(fusion_request(self.spec, scene, sent, senders))
-        return asked
+            calls.append(fusion_request(self.spec, scene, sent, senders))
+        return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
-        """Announce the requests and ask what is not there, but for answers that were given."""
-        # Those kept from before a kill are among them, so that chunks begin where they did.
+        """Announce the requests whose answers were not given, and ask for what is missing."""
+        # Requests whose answers were kept stay, so that the chunks begin at the same places as before.
         asked = [request for request in requests if request.id not in self._given]
         self._more(len(asked))
         self.ask(asked)
 
 
-def _each(
+def _answer_chunks(
     work: Callable[[Sequence[Request]], list[Answer]], chunks: Sequence[Sequence[Request]], calls: int
 ) -> Iterator[list[Answer]]:
-    """The answers to each chunk as they come; so many are at work, so that none waits for another's last."""
+    """Yield the answers of each chunk as they come; up to `calls` chunks are asked at the same time.
+
+    With several at work, no chunk waits for the last answer of another.
+    """
     if calls == 1 or len(chunks) == 1:
         yield from map(work, chunks)
         return
-    with ThreadPool(min(calls, len(chunks))) as pool:  # whose threads end with the program
+    with ThreadPool(min(calls, len(chunks))) as pool:  # its threads end with the program
         yield from pool.imap_unordered(work, chunks)
 
 
-def _heard(
+def _heard_sets(
     moments: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:  # fmt: skip
-    """The scene of each set of messages, and the keys of its senders."""
+    """Yield the scene of each set of messages and the keys of its senders."""
     helpers = max(len(scene.viewers) for scene in moments) - 1
     for code in codes.tolist():
         moment, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
@@ -286,7 +292,7 @@ def _heard(
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Size of the message a helper sends: its id, position, intent, evidence and risk, as compact JSON."""
+    """Return the bits of a helper's message: id, position, intent, evidence and risk, as compact JSON."""
     message = {
         "from": answer.viewer,
         "xy_m": [round(x, 1) for x in xy_m],
@@ -297,7 +303,7 @@ def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
 
 
 def read_kept(kept: Path) -> dict[str, Answer]:
-    """Answers kept so far, by request id. A torn last line is dropped."""
+    """Read the answers kept so far, by request id, and cut a torn last line from the file."""
     if not kept.is_file():
         return {}
     data = kept.read_bytes()

@@ -1,7 +1,7 @@
-"""Who attacks under a condition, and what the ego then hears.
+"""Draw the attackers of a condition, and return what the ego then hears.
 
-Attackers are drawn once for a seed of the channel and a layout, so every rule, prompt and model faces the
-same, in frozen scenes, sweeps and the closed loop.
+Attackers are drawn once for each seed of the channel and layout. So every rule, prompt and model faces the
+same ones, in frozen scenes, sweeps and the closed loop.
 """
 
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ from harness.radio.fading import Trips
 
 @dataclass(frozen=True)
 class Said:
-    """What reaches the channel in decisions (n,), of H voices.
+    """What H voices say to the channel in decisions (n,).
 
     Attributes:
-        intents: what is intended and claimed.
-        draws: of the channel, a voice each.
-        attackers: whose voice is an attacker's, (n, H).
+        intents: the intents and claims of each voice.
+        draws: the channel's draws for each voice.
+        attackers: which voices are an attacker's, (n, H).
     """
 
     intents: Intents
@@ -36,12 +36,12 @@ class Said:
     attackers: Bools
 
     def take(self, at: Any) -> "Said":
-        """What is said in the decisions at these places."""
+        """Return what is said in the decisions at these indices."""
         return Said(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 
 class Attackers:
-    """The attackers under one condition. They remember what helpers intended, each episode and seed apart."""
+    """The attackers under one condition; they remember what helpers intended in each episode and seed."""
 
     def __init__(self, point: OperatingPoint) -> None:
         self._attacks = attacks_of(point.attack)
@@ -49,56 +49,59 @@ class Attackers:
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
     def said(self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]) -> Said:
-        """What is said where `truth` (n, H) is intended.
+        """Return what is said in decisions (n,), given what the vehicles intend.
 
         Args:
-            truth: what every vehicle intends.
-            draws: of the channel.
+            truth: what every vehicle intends, of H helpers.
+            draws: the channel's draws.
             episodes: number and seed of each decision's episode.
+
+        Raises:
+            UserError: the world has no layouts to draw attackers for.
         """
-        nobody = np.zeros(truth.valid.shape, dtype=bool)
+        none_attack = np.zeros(truth.valid.shape, dtype=bool)
         if not self._attacks:
-            return Said(truth, draws, nobody)
+            return Said(truth, draws, none_attack)
         if draws.trips is None:
             raise UserError("attacks need layouts, and the paper's study has none; leave attack out")
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         first, past = self._remembered(truth, episodes)
-        there, said, by = np.isfinite(truth.range_m), truth, nobody
+        present, said, attacking = np.isfinite(truth.range_m), truth, none_attack
         for attack in self._attacks:
-            of_this = attackers(attack.share, there, uniforms[..., 0])
-            said = attack.act(said, Turn(truth, of_this, first, past, uniforms[..., 1]))
-            by |= of_this
+            drawn = attackers(attack.share, present, uniforms[..., 0])
+            said = attack.act(said, Turn(truth, drawn, first, past, uniforms[..., 1]))
+            attacking |= drawn
         for intents, episode in zip(truth.helpers, episodes, strict=True):
-            steps = self._intended.setdefault(episode, [])
-            steps.append(intents)
-            del steps[1 : -self._steps or None]  # but the first and those that an attack looks at
+            intended = self._intended.setdefault(episode, [])
+            intended.append(intents)
+            del intended[1 : -self._steps or None]  # keep the first step and those that an attack looks at
         if said.voice_of is None:
-            return Said(said, draws, by)
-        voices = np.take_along_axis(by, said.voice_of, axis=-1)
+            return Said(said, draws, attacking)
+        voices = np.take_along_axis(attacking, said.voice_of, axis=-1)
         return Said(said, draws.of_helpers(said.voice_of), voices)
 
     def _remembered(self, truth: Intents, episodes: Sequence[tuple[int, int]]) -> tuple[Floats, Floats]:
-        """The first intents (n, H, A) and those of past steps (n, K, H, A); NaN where there was no step."""
+        """Return the first intents (n, H, A) and those of K past steps (n, K, H, A); NaN without a step."""
         first = truth.helpers.copy()
         past = np.full((len(first), self._steps, *first.shape[1:]), np.nan)
-        for row, episode in enumerate(episodes):
+        for decision, episode in enumerate(episodes):
             steps = self._intended.get(episode, [])
-            for place, intents in enumerate(steps[: -self._steps - 1 : -1]):
-                past[row, place, : len(intents)] = intents[: past.shape[2]]
+            for past_step, intents in enumerate(steps[: -self._steps - 1 : -1]):
+                past[decision, past_step, : len(intents)] = intents[: past.shape[2]]
             if steps:
-                first[row, : len(steps[0])] = steps[0][: first.shape[1]]
+                first[decision, : len(steps[0])] = steps[0][: first.shape[1]]
         return first, past
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:
-    """For each helper a draw of the episode and one of the step, (n, H, 2)."""
+    """Return two draws for each helper, one of the episode and one of the step, (n, H, 2)."""
     keys = zip(trips.seed.tolist(), trips.layout_seed.tolist(), strict=True)
-    drawn = np.array([_drawn(seed, layout, trips.steps, helpers) for seed, layout in keys])
-    of_step = drawn[np.arange(len(drawn)), :, 1 + trips.step]
-    return np.stack([drawn[..., 0], of_step], axis=-1)
+    uniforms = np.array([_helper_uniforms(seed, layout, trips.steps, helpers) for seed, layout in keys])
+    of_step = uniforms[np.arange(len(uniforms)), :, 1 + trips.step]
+    return np.stack([uniforms[..., 0], of_step], axis=-1)
 
 
-# Each helper's draws come after the last one's, so that a batch with more helpers changes nobody's.
+# The draws of one helper follow those of another, so more helpers in a batch change no earlier draw.
 @lru_cache(maxsize=1 << 14)
-def _drawn(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
+def _helper_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
     return noise.uniforms((helpers, 1 + steps), "attackers", seed, layout_seed)

@@ -1,8 +1,8 @@
-"""An episode of the closed loop, and the world it shares with those that have acted alike so far.
+"""Share one world among the closed-loop episodes that have acted alike so far, and branch it when they part.
 
-Episodes of one layout differ in condition and seed alone. Until one takes another action than the rest, or
-takes it in another frame, they are in one world, which is simulated and observed once. Then the world
-branches. A branch continues exactly as the whole would, to the last bit.
+Episodes of one layout differ only in condition and seed. They are in one world, which is simulated and
+observed once, until one of them takes another action than the rest, or takes it in another frame. Then the
+world branches. A branch continues exactly as the undivided world would, to the last bit.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ class Decision:
 
     Attributes:
         action: the meta-action.
-        frame: when it acts.
-        acted: whether it has.
+        frame: the frame in which it acts.
+        acted: whether it has acted.
     """
 
     action: str
@@ -36,8 +36,8 @@ class Course:
     Attributes:
         point: the condition.
         seed: seed of the channel's draws.
-        open: the decision that does not act yet; the ego keeps to the action before.
-        skipped: decisions that did not begin, since one was still open when they were due.
+        open: the decision that has not acted yet; until it does, the ego keeps to its last action.
+        skipped: how many decisions did not begin, since one was still open when they were due.
     """
 
     point: OperatingPoint
@@ -48,12 +48,12 @@ class Course:
 
 @dataclass
 class Trajectory:
-    """A world, and the courses that have it in common so far.
+    """A world, and the courses that share it so far.
 
     Attributes:
         number: the episode's number.
         world: the world.
-        courses: of the episode, under conditions and seeds.
+        courses: the episode under each condition and seed.
     """
 
     number: int
@@ -61,44 +61,48 @@ class Trajectory:
     courses: list[Course]
 
     def act(self) -> list["Trajectory"]:
-        """Let what is ready act; one trajectory for each target that the egos have then."""
-        now = self.world.target
-        worlds, parted = {now: self.world}, {now: list[Course]()}
-        after: dict[str, Target] = {}
+        """Let the decisions that are ready act; return one trajectory for each target the egos then have."""
+        target_now = self.world.target
+        worlds, courses = {target_now: self.world}, {target_now: list[Course]()}
+        target_of: dict[str, Target] = {}
         for course in self.courses:
             ready = course.open
             if ready is None or ready.frame > self.world.frame:
-                parted[now].append(course)
+                courses[target_now].append(course)
                 continue
-            if ready.action not in after:
-                after[ready.action] = self.world.target_after(ready.action)
-            parted.setdefault(after[ready.action], []).append(course)
+            if ready.action not in target_of:
+                target_of[ready.action] = self.world.target_after(ready.action)
+            courses.setdefault(target_of[ready.action], []).append(course)
             ready.acted = True
             course.open = None
-        new = {target: action for action, target in after.items() if target != now}
+        new = {target: action for action, target in target_of.items() if target != target_now}
         for n, (target, action) in enumerate(new.items(), 1):
-            nobody_stays = n == len(new) and not parted[now]
+            nobody_stays = n == len(new) and not courses[target_now]
             worlds[target] = self.world if nobody_stays else self.world.branch()
             worlds[target].take(action)
-        return [Trajectory(self.number, worlds[target], some) for target, some in parted.items() if some]
+        return [
+            Trajectory(self.number, worlds[target], parted) for target, parted in courses.items() if parted
+        ]
 
 
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
-    """Simulate up to a frame or the end of each episode; decisions act meanwhile.
+    """Simulate up to a frame or the end of each episode; decisions act when they are ready.
 
     Returns:
-        One trajectory for each way in which episodes continue, those of one after those of the one before it.
+        One trajectory for each way in which an episode continues, in the order of the trajectories given.
     """
-    going: list[tuple[tuple[int, ...], Trajectory]] = [((n,), t) for n, t in enumerate(trajectories)]
+    running: list[tuple[tuple[int, ...], Trajectory]] = [((n,), t) for n, t in enumerate(trajectories)]
     arrived = []
-    while going:
-        frames = [min((c.open.frame for c in t.courses if c.open), default=until_frame + 1) for _, t in going]
-        lockstep.advance([t.world for _, t in going], [min(frame, until_frame) for frame in frames])
-        parted = []
-        for (place, trajectory), frame in zip(going, frames, strict=True):
+    while running:
+        frames = [
+            min((c.open.frame for c in t.courses if c.open), default=until_frame + 1) for _, t in running
+        ]
+        lockstep.advance([t.world for _, t in running], [min(frame, until_frame) for frame in frames])
+        branched = []
+        for (order, trajectory), frame in zip(running, frames, strict=True):
             if trajectory.world.outcome.ended or frame > until_frame:
-                arrived.append((place, trajectory))
+                arrived.append((order, trajectory))
             else:
-                parted += [((*place, -n), part) for n, part in enumerate(trajectory.act())]
-        going = parted
+                branched += [((*order, -n), part) for n, part in enumerate(trajectory.act())]
+        running = branched
     return [trajectory for _, trajectory in sorted(arrived, key=itemgetter(0))]

@@ -1,7 +1,7 @@
-"""What answers take on a declared computer, by their own tokens: seconds, and joules of each decision.
+"""Compute what answers cost on a declared computer, from their own tokens: seconds, and joules of a decision.
 
-Who is in time follows from the seconds, never from how fast this machine is. A beginning that two prompts
-share is read anew each time.
+Which helpers are in time follows from these seconds, never from the speed of this machine. A prefix that two
+prompts share is counted as read each time.
 """
 
 import math
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 
 def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> list[DeviceRow]:
-    """The row of a device profile by which each agent is timed: `model`'s, or its own card's.
+    """Return the row of a device profile that times each agent: `model`'s, or that of its own card.
 
     Raises:
-        UserError: an agent counts no tokens, or the profile has no row for it, or no rates.
+        UserError: an agent counts no tokens, or the profile has no row or no rates for it.
     """
-    found, flag = [], f"--device-profile {printable(device.name)}"
+    rows, flag = [], f"--device-profile {printable(device.name)}"
     for agent in agents:
         name = printable(agent.card.name)
         if not agent.can.language_model:
@@ -42,62 +42,62 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
                     f"{flag} states no {rate} of {printable(row.model)}, so it cannot time answers; "
                     "give another device, or another --device-model"
                 )
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> Latency:
-    """Each answer's own time on a declared computer; arguments as in `rows_of`."""
-    rows, said = rows_of(device, model, agents), []
+    """Return the latency of answers timed by their own tokens on a device; arguments as in `rows_of`."""
+    rows, descriptions = rows_of(device, model, agents), []
     for agent, row in zip(agents, rows, strict=True):
-        own = agent.card.name.partition(":")[0] == row.model
-        whose = agent.card.name + ("" if own else f"'s answers at the speed of {row.model}")
+        own_row = agent.card.name.partition(":")[0] == row.model
+        answerer = agent.card.name + ("" if own_row else f"'s answers at the speed of {row.model}")
         rates = [cast("Constant", getattr(row, rate)) for rate in devices.RATES]
-        origin = "; ".join(dict.fromkeys(f"{each.status}: {each.source}" for each in rates))
+        origin = "; ".join(dict.fromkeys(f"{rate.status}: {rate.source}" for rate in rates))
         joules = {c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES}
-        said.append(
-            f"{whose} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
+        descriptions.append(
+            f"{answerer} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
             f"{' and '.join(sorted(joules)) or 'unknown'}; rates {origin})"
         )
     speeds = tuple(devices.speed(device, row) for row in rows)
-    return Latency("device", "; ".join(dict.fromkeys(said)), speeds=speeds)
+    return Latency("device", "; ".join(dict.fromkeys(descriptions)), speeds=speeds)
 
 
 def answer_s(speed: Speed, answer: Answer) -> float:
-    """Seconds of one answer by its own tokens, those of a repair turn included; NaN where the engine failed.
+    """Return the seconds of one answer by its tokens, its repair turn included; NaN if the engine failed.
 
     Raises:
-        UserError: nobody counted its tokens.
+        UserError: the answer has no token counts.
     """
     return devices.seconds(speed, *tokens(answer)) + answer.slow_s
 
 
 def answer_j(speed: Speed, answer: Answer) -> float:
-    """Joules of one answer, as `answer_s` has its seconds."""
+    """Return the joules of one answer; NaN and errors as in `answer_s`."""
     return devices.joules(speed, *tokens(answer))
 
 
 def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]) -> Floats:
-    """Joules of each vehicle's own answer, (n, 1+H), the ego first; NaN where it has none.
+    """Return the joules of each vehicle's own answer, (n, 1+H), the ego first; NaN without an answer.
 
     Args:
-        latency: of a run with a device profile.
+        latency: the latency of a run with a device profile.
         scenes: decision points.
-        answers: by request id.
+        answers: answers by request id.
     """
-    taken = np.full((len(scenes), max(len(scene.viewers) for scene in scenes)), np.nan)
+    joules = np.full((len(scenes), max(len(scene.viewers) for scene in scenes)), np.nan)
     for n, scene in enumerate(scenes):
         for place, viewer in enumerate(scene.viewers):
             if answer := answers.get(f"{scene.id}/{viewer}"):
-                taken[n, place] = answer_j(latency.speed(place), answer)
-    return taken
+                joules[n, place] = answer_j(latency.speed(place), answer)
+    return joules
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
-    """Tokens in and out, of both turns where there were two; NaN where the engine failed.
+    """Return an answer's tokens in and out, of both turns if there were two; NaN if the engine failed.
 
     Raises:
-        UserError: nobody counted them.
+        UserError: the answer has no token counts.
     """
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
         return answer.prompt_tokens, answer.completion_tokens
@@ -113,21 +113,21 @@ def energy(
     device: Device, latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions,
     answers: Iterable[Answer],
 ) -> dict[str, Floats]:  # fmt: skip
-    """What each decision takes, columns (n,) by name; NaN where a number of it is not known.
+    """Return the energy of each decision as columns (n,) by name; NaN where a part of it is unknown.
 
     Args:
-        device: what every vehicle has.
-        latency: of the run.
-        points: its conditions.
-        decisions: its decisions.
-        answers: all of its answers.
+        device: the computer that every vehicle has.
+        latency: the run's latency.
+        points: the run's conditions.
+        decisions: the run's decisions.
+        answers: all answers of the run.
 
     Returns:
-        `inference_j`, of the ego, the helpers asked, and a fusion call; `helpers_j`, the helpers' part of it;
-        `radio_mj`, to send the request and the replies; `waiting_j`, of the ego's computer while it waits for
-        messages and does not infer.
+        `inference_j`, joules of the ego, the helpers asked, and a fusion call; `helpers_j`, the helpers' part
+        of it; `radio_mj`, millijoules to send the request and the replies; `waiting_j`, joules of the ego's
+        computer while it waits for messages and does not infer.
     """
-    ego_j, ego_s, helpers_j, call_j = _inferred(latency, points, decisions, answers)
+    ego_j, ego_s, helpers_j, call_j = _inference(latency, points, decisions, answers)
     watts, idle_watts = np.full(len(decisions), np.nan), np.nan
     condition = decisions.codes("condition", [point.name for point in points])
     for place, point in enumerate(points):
@@ -146,39 +146,41 @@ def energy(
 
 
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
-    """What a radio draws while it sends, by the channel's power or else the profile's; NaN if unknown."""
+    """Return the watts of a sending radio, by the channel's power or else the profile's; NaN if unknown."""
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
     dbm = float(getattr(innermost(point.channel), "power_dbm", device.transmit_dbm.value))
     return 10 ** ((dbm - 30) / 10) / device.amplifier_efficiency.value
 
 
-def _inferred(
+def _inference(
     latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions, answers: Iterable[Answer]
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Joules and seconds of the ego's inference, joules of the helpers' and of fusion calls, each (n,)."""
+    """Return the ego's joules and seconds, the helpers' joules and those of fusion calls, (n,) each."""
     by_id = {answer.id: answer for answer in answers}
     egos = {answer.scene: answer for answer in by_id.values() if answer.role == "ego"}
     calls = {(a.scene, a.heard): a for a in by_id.values() if a.role == "merge"}
     n, condition = len(decisions), decisions.codes("condition", [point.name for point in points])
     fusing = {place: point.rewrites for place, point in enumerate(points) if point.asks_again}
     senders = [decisions.labels(f"helper_{place}") for place in range(1, decisions.helpers + 1)]
-    on_time, attacks = (decisions.of_messages(name) == 1.0 for name in ("on_time", "attacker"))
+    on_time, attackers = (decisions.of_messages(name) == 1.0 for name in ("on_time", "attacker"))
     ego_j, ego_s, helpers_j, call_j = np.zeros((4, n))
     for scene, rows in decisions.scenes.items():
         ego_j[rows.start : rows.stop] = answer_j(latency.speeds[0], egos[scene])
         ego_s[rows.start : rows.stop] = answer_s(latency.speeds[0], egos[scene])
-        of_helpers: dict[str, float] = {}
+        joules_of: dict[str, float] = {}
         for row in rows:
-            asked = [(place, who) for place, column in enumerate(senders) if (who := column[row])]
-            for place, who in asked:
-                if who not in of_helpers:  # a further voice of an attacker thinks nothing of its own
-                    answer = by_id.get(f"{scene}/{who}")
-                    of_helpers[who] = answer_j(latency.speed(1 + place), answer) if answer else 0.0
-                helpers_j[row] += of_helpers[who]
+            asked = [(place, helper) for place, column in enumerate(senders) if (helper := column[row])]
+            for place, helper in asked:
+                if helper not in joules_of:  # an attacker's further voices run no model
+                    answer = by_id.get(f"{scene}/{helper}")
+                    joules_of[helper] = answer_j(latency.speed(1 + place), answer) if answer else 0.0
+                helpers_j[row] += joules_of[helper]
             if rewrites := fusing.get(int(condition[row])):
                 heard = tuple(
-                    key_of(who, rewrites, attacks[row, at]) for at, who in asked if on_time[row, at]
+                    key_of(helper, rewrites, attackers[row, index])
+                    for index, helper in asked
+                    if on_time[row, index]
                 )
                 call_j[row] = answer_j(latency.speeds[0], calls[scene, heard]) if heard else 0.0
     return ego_j, ego_s, helpers_j, call_j

@@ -1,4 +1,4 @@
-"""The frozen world: an episode is a walk through its layout's decision tree."""
+"""Walk frozen scenes: an episode is a walk through the decision tree of its layout."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,12 @@ from harness.world.scenario import Scenario, frames
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """A dataset, which has only the selected episodes already."""
+    """A dataset that is walked.
+
+    Attributes:
+        dataset: the dataset, cut to the selected episodes.
+        selection: how they were selected.
+    """
 
     dataset: Dataset
     selection: Selection = ALL
@@ -43,11 +48,11 @@ class FrozenSource:
 
     @property
     def layout_seeds(self) -> Sequence[int]:
-        """Of the selected episodes."""
+        """The layout seeds of the selected episodes."""
         return self.dataset.seeds
 
     def record(self) -> FrozenScenes:
-        """The dataset, pinned by its digest."""
+        """Return the dataset's record, with the digest that pins it."""
         p = self.scenario.parameters
         return FrozenScenes(
             name=self.dataset.name, sha256=self.dataset.sha256, nodes=self.dataset.nodes,
@@ -57,19 +62,19 @@ class FrozenSource:
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
-        """The dataset's folder, and which episodes of it."""
-        given = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
-        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *given]
+        """Return the options for the dataset's folder and the selection of its episodes."""
+        selection = [(f"--{key.replace('_', '-')}", value) for key, value in self.selection.given.items()]
+        return [("--dataset", argument(self.dataset.path)), ("--limit", self.selection.limit), *selection]
 
 
 class _Walks:
-    """The walks under one condition, arrays (S, E).
+    """The walks under one condition, as arrays (S, E) of seeds and episodes.
 
     Attributes:
-        at: the decision point of each, among the forest's; -1 once the episode is decided.
+        at: the index of each walk's decision point in the forest; -1 once the episode is decided.
         last: the edge taken last.
-        edges: those taken, an array a step; -1 where the episode was decided.
-        dropped: walks that are left out.
+        edges: the edges taken, one array a step; -1 where the episode was already decided.
+        dropped: whether the walk is left out.
     """
 
     def __init__(self, seeds: int, root: Ints) -> None:
@@ -80,9 +85,9 @@ class _Walks:
 
 
 class FrozenWorld(Placed):
-    """Every episode of a dataset, under all conditions and seeds.
+    """Walks every episode of a dataset under all conditions and seeds.
 
-    A decision acts the dataset's lag after its moment, however long it took.
+    An action always takes effect one lag of the dataset after its moment, however long the decision took.
     """
 
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
@@ -100,42 +105,42 @@ class FrozenWorld(Placed):
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
-        """Each walk of the condition that is not at its end."""
+        """Return a decision for each walk of the condition that is not at its end."""
         walks, forest = self._walks[point.name], self._forest
-        of_seed, tree = np.nonzero(walks.at >= 0)
-        at = np.searchsorted(self._moments, walks.at[of_seed, tree])
+        seed_index, tree = np.nonzero(walks.at >= 0)
+        at = np.searchsorted(self._moments, walks.at[seed_index, tree])
         p = self.scenario.parameters
-        seed, step = self._seeds[of_seed], forest.step[self._moments[at]]
+        seed, step = self._seeds[seed_index], forest.step[self._moments[at]]
         draws = channel_draws(seed, forest.seeds[tree], step, p.decisions, self._helpers)
         return Due(at, forest.episodes[tree], seed, draws)
 
     def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
-        """End the walks that have come to these of the moments just shown, and count them no longer."""
+        """End the walks that are at these of the moments just shown, and leave them out of the results."""
         walks = self._walks[point.name]
-        there = walks.at >= 0
-        out = np.zeros_like(there)
-        out[there] = moments[np.searchsorted(self._moments, walks.at[there])]
-        walks.dropped |= out
-        walks.at[out] = -1
+        undecided = walks.at >= 0
+        ended = np.zeros_like(undecided)
+        ended[undecided] = moments[np.searchsorted(self._moments, walks.at[undecided])]
+        walks.dropped |= ended
+        walks.at[ended] = -1
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Take the edge of each action."""
+        """Follow the edge of each action."""
         for part in decided:
             walks, action = self._walks[part.point.name], part.result.action
-            going = walks.at >= 0
-            at = walks.at[going]
-            taken = np.full_like(walks.at, -1)
-            taken[going] = self._forest.edge[at, action]
-            walks.edges.append(taken)
-            walks.last[going] = taken[going]
-            walks.at[going] = self._forest.child[at, action]
+            undecided = walks.at >= 0
+            at = walks.at[undecided]
+            edge = np.full_like(walks.at, -1)
+            edge[undecided] = self._forest.edge[at, action]
+            walks.edges.append(edge)
+            walks.last[undecided] = edge[undecided]
+            walks.at[undecided] = self._forest.child[at, action]
             self._decided.append((at, action, part.result.latency_s))
 
     def columns(self) -> dict[str, Any]:
-        """What each decision was worth, and every other action, in the order of decisions."""
+        """Return as columns what each decision and every other action was worth, in decision order."""
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
-        off_lag = [frames(each, p.simulation_hz) != p.lag_frames for each in np.nan_to_num(latency_s)]
+        off_lag = [frames(seconds, p.simulation_hz) != p.lag_frames for seconds in np.nan_to_num(latency_s)]
         return {
             "value": forest.value[at], "safe": forest.safe[at, action],
             "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
@@ -147,11 +152,11 @@ class FrozenWorld(Placed):
 
     @property
     def numbers(self) -> Ints:
-        """Of the episodes, (E,)."""
+        """The episodes' numbers, (E,)."""
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
-        """Success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
+        """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
         walks, trees = self._walks[point.name], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
@@ -159,17 +164,17 @@ class FrozenWorld(Placed):
         return {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
 
     def episodes(self) -> list[Episode]:
-        """How each episode ended under each condition and seed."""
+        """Return how each episode ended under each condition and seed."""
         return [
             self._episode(condition, walks, place)
             for condition, walks in self._walks.items()
             for place in np.ndindex(*walks.at.shape)
         ]
 
-    def _episode(self, condition: str, walks: _Walks, place: tuple[int, ...]) -> Episode:
-        seed, tree = place
-        forest, last = self._forest, int(walks.last[place])
-        edges = [forest.edges[taken[place]] for taken in walks.edges if taken[place] >= 0]
+    def _episode(self, condition: str, walks: _Walks, index: tuple[int, ...]) -> Episode:
+        seed, tree = index
+        forest, last = self._forest, int(walks.last[index])
+        edges = [forest.edges[taken[index]] for taken in walks.edges if taken[index] >= 0]
         end, reference_s = forest.end(last), float(forest.reference_s[tree])
         cleared = end.result == "cleared"
         success = bool(forest.succeeds(np.array(last), np.array(tree)))

@@ -1,7 +1,7 @@
-"""Inference times that decide who is heard: the paper's, a card's, the user's, a device's, or measured ones.
+"""Choose the inference times that decide which helpers are heard in time.
 
-They are fixed before a run, so that its own speed changes none of its rows. What its answers took is shown
-beside them.
+They come from the paper, a card, the user or a device profile, or are measured. They are fixed before a run,
+so that its own speed changes none of its rows. The times that its answers took are recorded beside them.
 """
 
 import math
@@ -28,21 +28,21 @@ EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 
 def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]) -> Latency | None:
-    """The latency that `--latency` chooses; None where it is to be measured.
+    """Return the latency that `--latency` chooses; None if it has to be measured.
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
 
     Args:
-        choice: what was chosen, if anything.
-        agents: the ego's, then the helpers' where they are others.
-        backends: of each.
+        choice: the option's value, or None.
+        agents: the ego's agent, then those of the helpers if they have their own.
+        backends: the backend of each agent.
     """
     if choice not in (None, *NAMES):
         return declared(choice)
     if choice == MEASURED:
         return None
-    each = [_of_agent(choice, agent, backend) for agent, backend in zip(agents, backends, strict=True)]
-    return mixed(each[0], each[1:])
+    latencies = [_of_agent(choice, agent, backend) for agent, backend in zip(agents, backends, strict=True)]
+    return mixed(latencies[0], latencies[1:])
 
 
 def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
@@ -55,7 +55,7 @@ def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
 
 
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
-    """The ego's times, and those of helpers that are others."""
+    """Combine the ego's times with those of the helpers' own agents, if there are any."""
     if not helpers:
         return ego
     if any(each.speeds for each in (ego, *helpers)):
@@ -72,12 +72,12 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
 
 
 def declared(text: str) -> Latency:
-    """The seconds in a text such as `ego=0.171,helper=0.164,fusion=0.2`; one left out is the ego's.
+    """Parse a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds; a role left out has the ego's.
 
-    Several helper models have a time each: `helper=0.164:0.2`.
+    Several helper models have one time each: `helper=0.164:0.2`.
 
     Raises:
-        UserError: the text is nothing that `--latency` takes.
+        UserError: the text is not a valid `--latency`.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     try:
@@ -97,15 +97,15 @@ def declared(text: str) -> Latency:
 
 
 def as_declared(latency: Latency) -> str:
-    """A latency as a text that `declared` reads."""
+    """Return a latency as a text that `declared` parses."""
     helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))
     return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
 
 def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) -> Floats:
-    """Seconds of inference, (n, 1+H): the ego first. NaN where nobody was asked.
+    """Return the seconds of inference, (n, 1+H), the ego first; NaN without an answer.
 
-    A repair turn is one more. What an answer is declared to be slower than its card comes on top.
+    A repair turn takes the time of one more answer. An answer's own declared delay (`slow_s`) is added.
     """
     if latency.speeds:
         return np.array([
@@ -119,34 +119,37 @@ def inference_s(latency: Latency, answers: Sequence[Sequence[Answer | None]]) ->
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer]) -> Floats:
-    """Seconds of each fusion call, (K,), as `inference_s` has those of the first answers."""
+    """Return the seconds of each fusion call, (K,), counted as in `inference_s`."""
     if latency.speeds:
         return np.array([answer_s(latency.speeds[0], a) for a in answers])
     return np.array([cast("float", latency.fusion_s) * a.turns + a.slow_s for a in answers])
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """How long answers took that were asked alone and came at the first attempt, by role."""
+    """Return, by role, how long answers took; only those that were timed and came at the first attempt."""
     by_role: dict[str, list[Answer | AnswerFacts]] = {}
     for answer in answers:
         if answer.seconds is not None and answer.error is None and not answer.retries:
             by_role.setdefault(answer.role, []).append(answer)
-    found = {}
-    for role, each in by_role.items():
-        parts = {"first_token": _times(each, "first_token_s"), "token": _times(each, "token_s")}
-        found[role] = replace(cast("Times", _times(each, "seconds")), **parts)
-    return found
+    times_of_role = {}
+    for role, role_answers in by_role.items():
+        details = {
+            "first_token": _times(role_answers, "first_token_s"),
+            "token": _times(role_answers, "token_s"),
+        }
+        times_of_role[role] = replace(cast("Times", _times(role_answers, "seconds")), **details)
+    return times_of_role
 
 
 def _times(answers: Sequence[Answer | AnswerFacts], which: str) -> Times | None:
-    """Percentiles of one of their times; None where no answer has it."""
-    known = [(s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None]
-    if not known:
+    """Return percentiles of the answers' time in the field `which`; None if no answer has it."""
+    timed = [(s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None]
+    if not timed:
         return None
-    values, episodes = np.array([s for s, _ in known]), [episode for _, episode in known]
-    ends = {
+    values, episodes = np.array([s for s, _ in timed]), [episode for _, episode in timed]
+    intervals = {
         percent: None if math.isnan(low) else (round(low, 6), round(high, 6))
         for percent, (low, high) in percentiles.intervals(values, episodes).items()
     }
-    half, low, high = np.percentile(values, (50, 5, 95)).round(6).tolist()
-    return Times(len(known), half, low, high, ends[50], ends[95])
+    median, low, high = np.percentile(values, (50, 5, 95)).round(6).tolist()
+    return Times(len(timed), median, low, high, intervals[50], intervals[95])

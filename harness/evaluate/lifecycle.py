@@ -1,4 +1,4 @@
-"""The life of a run's folder: begun, stopped, resumed by the same command, finished."""
+"""Begin, resume and finish a run in its folder; a stopped run resumes with the same command."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,15 +19,15 @@ from harness.runs.records import Latency, Manifest, Score
 
 
 class Begun(work.Begun, frozen=True, kw_only=True):
-    """What a run began with, and keeps when it resumes.
+    """The record that a run begins with, and keeps when it resumes.
 
     Attributes:
-        created: when it began, UTC, ISO 8601.
-        command: words of the command that repeats it.
-        identity: of the models.
-        tags: of the user.
-        latency: of its decisions.
-        versions: of the packages and the code that it may depend on.
+        created: when the run began, UTC, ISO 8601.
+        command: words of the command that repeats the run.
+        identity: identity of the models.
+        tags: the user's tags.
+        latency: how long the run's answers take.
+        versions: versions of the packages and of the code that the run may depend on.
     """
 
     created: str
@@ -38,8 +38,8 @@ class Begun(work.Begun, frozen=True, kw_only=True):
     versions: dict[str, str]
 
     def facts(self) -> dict[str, Any]:
-        """What has to be the same for all shards of a run."""
-        versions = {f"version of {name}": of for name, of in self.versions.items() if name != "platform"}
+        """Return what must be the same in all shards of a run, by the name that an error gives it."""
+        versions = {f"version of {name}": v for name, v in self.versions.items() if name != "platform"}
         latency = msgspec.to_builtins(self.latency)
         return {**_comparable(self.settings), "model": self.identity, "latency": latency, **versions}
 
@@ -56,7 +56,7 @@ class Evaluated:
 def begin(
     spec: Spec, out: Path, begun: Begun | None, identity: dict[str, Any], latency: Latency, shard: str = ""
 ) -> Begun:
-    """What a run began with: `begun`, or a new record. Raises UserError if it began with another model."""
+    """Return `begun`, or a new record. Raises UserError if the run began with another model."""
     if begun is None:
         return Begun(
             settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -71,15 +71,15 @@ def begin(
 
 
 def another_model(spec: Spec) -> str:
-    """Words for a model that is not the one a run began with, for an error."""
+    """Return the words of an error for a model that is not the one a run began with."""
     names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
 def as_finished(spec: Spec, begun: Begun) -> Begun:
-    """What a run began with, updated when it finishes: tags of both commands, where its dataset is."""
+    """Return the record of a run that finishes: tags of both commands, and where its dataset is now."""
     spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
-    if spec.latency == latencies.MEASURED:  # measured again, the times and so the rows would be others
+    if spec.latency == latencies.MEASURED:  # a repeat must not measure: other times would make other rows
         spec = replace(spec, latency=latencies.as_declared(begun.latency))
     return msgspec.structs.replace(
         begun, settings=spec.settings(), tags=spec.tags, command=spec.words(), versions=versions()
@@ -87,7 +87,7 @@ def as_finished(spec: Spec, begun: Begun) -> Begun:
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
-    """What a stopped run in a folder began with, if there is one. Raises UserError if it is another run."""
+    """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
     begun = work.begun(out, Begun)
     if begun:
         now = {**_comparable(spec.settings()), "shard": shard}
@@ -96,7 +96,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> Begun | None:
 
 
 def resumable(spec: Spec, out: Path) -> bool:
-    """Whether this run was stopped in a folder, and no process is at work there."""
+    """Whether this run was stopped in a folder and no process is working there."""
     try:
         return unfinished(spec, out) is not None and not work.held(out)
     except UserError:
@@ -104,7 +104,7 @@ def resumable(spec: Spec, out: Path) -> bool:
 
 
 def refuse_finished(out: Path) -> None:
-    """Raise UserError where a folder holds a finished run."""
+    """Raise UserError if a folder holds a finished run."""
     if (out / "run.json").exists():
         raise UserError(
             f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
@@ -112,12 +112,12 @@ def refuse_finished(out: Path) -> None:
 
 
 def finished(spec: Spec, out: Path) -> Evaluated:
-    """The finished run in a folder. Raises UserError if it is another run, or damaged."""
+    """Return the finished run in a folder. Raises UserError if it is another run, or damaged."""
     return finished_with(spec.settings(), out)
 
 
 def finished_with(settings: Mapping[str, Any], out: Path) -> Evaluated:
-    """The same, of a run's settings."""
+    """Return the finished run in a folder, checked against settings. Raises UserError as `finished`."""
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))
     work.same(out, _comparable(settings), _comparable({key: stored[key] for key in settings}))
@@ -125,6 +125,9 @@ def finished_with(settings: Mapping[str, Any], out: Path) -> Evaluated:
 
 
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by the names that an error gives them; a dataset's folder may change between two commands."""
+    """Return settings by the names that an error gives them.
+
+    The dataset's path is left out, since its folder may move between two commands.
+    """
     world = {f"{key} of the world": value for key, value in settings["world"].items() if key != "path"}
     return {**{key: value for key, value in settings.items() if key != "world"}, **world}

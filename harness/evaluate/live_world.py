@@ -1,8 +1,8 @@
-"""The closed loop: each decision is made from what vehicles see when it is due, and acts when it is ready.
+"""Drive the closed loop: a decision is made from what vehicles see when it is due, and acts when it is ready.
 
-Decision k is due at k decision periods. The model answers from what each vehicle sees then; the action is
-taken in the first frame that begins after the decision's latency, and until then the ego keeps to its last
-action. A decision that is still open when the next is due continues, and the next one is skipped.
+Decision k is due at k decision periods. The model answers from what each vehicle sees then. The action is
+taken in the first frame that begins after the decision's latency; until then the ego keeps to its last one. A
+decision that is still open when the next one is due continues, and the next one is skipped.
 """
 
 import math
@@ -33,9 +33,9 @@ from harness.world.world import World
 
 @dataclass(frozen=True)
 class LiveSource:
-    """Layouts of a scenario that are driven: episode e has layout seed `first_seed` + e.
+    """The layouts of a scenario that are driven; episode e has layout seed `first_seed` + e.
 
-    With a `sample` only so many of the episodes are: the same as `harness eval` draws of as many.
+    With a `sample`, only that many of the episodes are driven: those that `harness eval` draws from as many.
     """
 
     first_seed: int
@@ -49,27 +49,29 @@ class LiveSource:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What is driven."""
+        """The scenario that is driven."""
         return scenarios.get(self.scenario_name)
 
     @cached_property
     def numbers(self) -> Sequence[int]:
-        """Of the episodes that are driven. Raises UserError if there are fewer than the sample."""
-        every = range(self.episodes)
-        return every if self.sample is None else drawn(every, self.sample, self.sample_seed, self.episodes)
+        """Numbers of the episodes that are driven. Raises UserError if there are fewer than the sample."""
+        numbers = range(self.episodes)
+        if self.sample is None:
+            return numbers
+        return drawn(numbers, self.sample, self.sample_seed, self.episodes)
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The scenario's."""
+        """The scenario's actions."""
         return self.scenario.actions
 
     @property
     def layout_seeds(self) -> Sequence[int]:
-        """Of the episodes that are driven."""
+        """The layout seeds of the episodes that are driven."""
         return [self.first_seed + number for number in self.numbers]
 
     def record(self) -> ClosedLoop:
-        """The scenario, and which of its layouts."""
+        """Return the record of the scenario and the layouts that are driven."""
         parameters = self.scenario.parameters.stated()
         return ClosedLoop(
             scenario={"name": self.scenario_name, "parameters": parameters}, first_seed=self.first_seed,
@@ -80,7 +82,7 @@ class LiveSource:
         )  # fmt: skip
 
     def options(self) -> list[tuple[str, object]]:
-        """Which layouts of which scenario."""
+        """Return the options for the scenario and its layouts."""
         return [
             ("--scenario", self.scenario_name),
             ("--episodes", self.episodes),
@@ -90,7 +92,7 @@ class LiveSource:
         ]
 
     def trial(self, most: int, ego_alone: bool) -> list[Scene]:
-        """One decision point of each of some episodes, a while after its start."""
+        """Return one decision point of each of up to `most` episodes, at different times."""
         scenes, p = [], self.scenario.parameters
         for number in self.numbers[:most]:
             trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
@@ -100,27 +102,27 @@ class LiveSource:
 
 
 class LiveWorld(Placed):
-    """Some episodes of a scenario under all conditions and seeds, which share worlds until they part."""
+    """Drives episodes under all conditions and seeds; those that act alike share a world."""
 
     def __init__(
         self, scenario: Scenario, first_seed: int, numbers: Sequence[int],
         points: Sequence[OperatingPoint], seeds: Sequence[int], ego_alone: bool,
     ) -> None:  # fmt: skip
-        """The first moments.
+        """Start the episodes.
 
         Args:
-            scenario: what is driven.
+            scenario: the scenario that is driven.
             first_seed: layout seed of episode 0.
-            numbers: of the episodes.
+            numbers: the episodes' numbers.
             points: the conditions.
-            seeds: of the channel's draws.
-            ego_alone: whether helpers are not asked, so need not look.
+            seeds: seeds of the channel's draws.
+            ego_alone: whether helpers are never asked, so that no scene graphs of theirs are needed.
         """
         self.scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone
-        ways = list(product(points, seeds))
+        runs = list(product(points, seeds))
         self._going = [
-            Trajectory(n, World.start(scenario, first_seed + n), [Course(*way) for way in ways])
+            Trajectory(n, World.start(scenario, first_seed + n), [Course(*run) for run in runs])
             for n in numbers
         ]
         self._ended: list[Trajectory] = []
@@ -128,7 +130,7 @@ class LiveWorld(Placed):
         self._step = 0
 
     def observe(self) -> Sequence[Scene]:
-        """Every moment in which some episode has no open decision, once."""
+        """Return each distinct moment in which some episode has no open decision."""
         while self._going and self._step < self._p.decisions:
             for trajectory in self._going:
                 for course in trajectory.courses:
@@ -141,7 +143,7 @@ class LiveWorld(Placed):
         return ()
 
     def due(self, point: OperatingPoint) -> Due:
-        """Each episode of the condition that has no open decision."""
+        """Return a decision for each episode of the condition that has no open one."""
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
@@ -152,9 +154,9 @@ class LiveWorld(Placed):
         return Due(at, episode, seed, draws)
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
-        """Open every decision, and simulate until the next are due."""
+        """Open every decision, and simulate until the next ones are due."""
         actions, hz = self.scenario.actions, self._p.simulation_hz
-        begun = self._p.due_frame(self._step)
+        due_frame = self._p.due_frame(self._step)
         for part in decided:
             latencies_s, chosen = part.result.latency_s.tolist(), part.result.action.tolist()
             for (_, course), latency_s, action in zip(
@@ -165,7 +167,7 @@ class LiveWorld(Placed):
                         "an answer of the ego is an error of its engine, and no device profile says how long "
                         "that takes; fix the engine, or use --latency"
                     )
-                course.open = Decision(actions[action], begun + frames(latency_s, hz))
+                course.open = Decision(actions[action], due_frame + frames(latency_s, hz))
                 self._decisions.append(course.open)
         self._advance()
 
@@ -177,20 +179,19 @@ class LiveWorld(Placed):
 
     def _advance(self) -> None:
         self._step += 1
-        until = self._p.due_frame(self._step)
-        parts = branches.advance(self._going, until)
+        parts = branches.advance(self._going, self._p.due_frame(self._step))
         self._ended += [part for part in parts if part.world.outcome.ended]
         self._going = [part for part in parts if not part.world.outcome.ended]
 
     def columns(self) -> dict[str, Any]:
-        """When each decision acts, and whether it has, in the order of decisions."""
+        """Return when each decision acts and whether it did, in the order of decisions."""
         return {
             "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
             "acted": np.array([d.acted for d in self._decisions]),
         }
 
     def episodes(self) -> list[Episode]:
-        """How each episode ended; late against a full-view driver whose decisions act after the lag."""
+        """Return how each ended; late is against a full-view driver whose decisions act after the lag."""
         numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
         worlds = [World.start(self.scenario, self._first_seed + number) for number in numbers]
         outcomes = reference.finish(worlds, [PRIVILEGED] * len(numbers))
@@ -199,21 +200,21 @@ class LiveWorld(Placed):
 
 
 def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
-    """The decision point of a trajectory now."""
+    """Return a trajectory's decision point at this frame."""
     world = trajectory.world
     state = replace(world.state(), step=step)
     viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
     return Scene(moment(world, state, trajectory.number, viewers))
 
 
-def _episode(trajectory: Trajectory, course: Course, against: Outcome | None) -> Episode:
-    """How an episode ended; it is `late` if it cleared too long after the reference."""
+def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:
+    """Return how an episode ended; it is `late` if it cleared too long after the full-view driver."""
     world = trajectory.world
     ended = world.outcome
-    outcome = ended.judged(against, world.scenario.parameters) if against else ended
+    outcome = ended.judged(full_view, world.scenario.parameters) if full_view else ended
     delay_s = None
-    if against and against.time_s is not None and against.success and ended.success:
-        delay_s = round((ended.time_s or 0.0) - against.time_s, 3)
+    if full_view and full_view.time_s is not None and full_view.success and ended.success:
+        delay_s = round((ended.time_s or 0.0) - full_view.time_s, 3)
     return Episode(
         condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
         danger=world.layout.danger or "none", success=outcome.success,

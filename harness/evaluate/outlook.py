@@ -1,4 +1,4 @@
-"""What an ego sees of the regions, and what it can tell that its helpers see, before it asks anybody."""
+"""Compute what an ego sees of the regions, and what it can infer about its helpers' views before it asks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,34 +14,34 @@ from harness.world.perception.rays import blocked_by
 from harness.world.road import Road
 from harness.world.state import VehicleState, WorldState
 
-MOVING_MPS = 0.1  # slower than that is a standstill
+MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(road: Road, moments: Sequence[Scene]) -> Outlook:
-    """The outlook of each moment, (n, ...)."""
+    """Return the outlook of each moment, (n, ...)."""
     n, helpers = len(moments), max((len(scene.viewers) for scene in moments), default=1) - 1
     unseen, to_zone_s = np.zeros((n, len(road.sectors))), np.zeros(n)
     added = np.full((n, helpers, len(road.sectors)), np.nan)
     for i, scene in enumerate(moments):
-        of = _outlook(road, scene)
-        unseen[i], added[i, : len(of.added)], to_zone_s[i] = of.unseen, of.added, of.to_zone_s
+        seen = _outlook(road, scene)
+        unseen[i], added[i, : len(seen.added)], to_zone_s[i] = seen.unseen, seen.added, seen.to_zone_s
     return Outlook(unseen, added, to_zone_s)
 
 
 def _outlook(road: Road, scene: Scene) -> Outlook:
-    """A moment's outlook; kept with the scene, which never changes."""
+    """Return a moment's outlook; kept with the immutable scene."""
     if (kept := scene.notes.get("outlook")) is None:
         graph, state = scene.record["graphs"][scene.viewers[0]], scene.state
         helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]
-        there = _as_known(state, graph["nodes"], helpers)
-        # What hides a point from the ego it sees for itself; where that stands it has to measure.
+        as_known = _as_known(state, graph["nodes"], helpers)
+        # What the ego sees is decided by where occluders truly are, and not by where it measures them.
         reported = {state.ego.id, *(node["id"] for node in graph["nodes"])}
         in_sight = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
         unseen = _unseen(road, in_sight, state.ego)
-        added = [_by_region(road, unseen & ~_unseen(road, there, helper)) for helper in helpers]
-        itself = graph["ego"]
-        left_m, speed_mps = max(itself["zone_m"], 0.0), itself["speed_mps"]
-        to_zone_s = left_m / speed_mps if speed_mps > MOVING_MPS else np.inf if left_m else 0.0
+        added = [_by_region(road, unseen & ~_unseen(road, as_known, helper)) for helper in helpers]
+        ego = graph["ego"]
+        distance_m, speed_mps = max(ego["zone_m"], 0.0), ego["speed_mps"]
+        to_zone_s = distance_m / speed_mps if speed_mps > MOVING_MPS else np.inf if distance_m else 0.0
         regions = len(road.sectors)
         kept = Outlook(_by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s))
         scene.notes["outlook"] = kept
@@ -51,7 +51,7 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
 def _as_known(
     state: WorldState, nodes: Sequence[Mapping[str, Any]], helpers: Sequence[VehicleState]
 ) -> WorldState:
-    """The state with nobody but those that the ego's sensors report or its radio hears, where these say."""
+    """Return the state as the ego knows it: vehicles as its sensors and its radio report them."""
     ego, by_beacon = state.ego, {helper.id: helper for helper in helpers}
     cos, sin = np.cos(ego.heading_rad), np.sin(ego.heading_rad)
     vehicles = [ego, *helpers]
@@ -65,12 +65,12 @@ def _as_known(
 
 
 def _unseen(road: Road, state: WorldState, viewer: VehicleState) -> Bools:
-    """Which of the points to be watched something hides from a viewer."""
+    """Return which of the points that must be watched are hidden from a viewer."""
     points = road.watched if road.sectors else np.empty((0, 2))
     return np.array([by is not None for by in blocked_by(state, viewer, points)], dtype=bool)
 
 
 def _by_region(road: Road, points: Bools) -> Floats:
-    """Share of each region's points, (R,)."""
-    ends = np.cumsum([len(of) for of in road.sectors.values()])[:-1]
+    """Return the share of each region's points, (R,)."""
+    ends = np.cumsum([len(sector) for sector in road.sectors.values()])[:-1]
     return np.array([part.mean() for part in np.split(points, ends)] if road.sectors else [], dtype=float)

@@ -1,4 +1,4 @@
-"""Which picture stands in a prompt: what the viewer's cameras see, or a test of whether a model looks."""
+"""Choose the picture of a prompt: what the viewer sees, or a control that tests whether a model looks."""
 
 from functools import lru_cache
 
@@ -15,20 +15,20 @@ from harness.world.perception.camera import Sight
 GREY = 127
 
 
-def picture(spec: Spec, who: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
-    """The picture that a viewer's agent is shown; None where its questions have none.
+def picture(spec: Spec, index: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
+    """Return the picture that a viewer's agent is shown; None if its prompts show none.
 
     Args:
         spec: the evaluation.
-        who: which of its agents answers.
+        index: which of its agents answers.
         scene: the decision point.
         viewer: id of the vehicle that answers.
-        blind: whether it is shown nothing, and so a blank one.
+        blind: whether the viewer is shown nothing, so that its picture is blank.
 
     Raises:
-        UserError: there is no other scene to take one from.
+        UserError: there is no other scene to take a picture from.
     """
-    agent = spec.agents[who]
+    agent = spec.agents[index]
     vision = agent.card.vision
     if not agent.sees or vision is None:
         return None
@@ -43,22 +43,22 @@ def picture(spec: Spec, who: int, scene: Scene, viewer: str, blind: bool = False
 
 @lru_cache(maxsize=4)
 def blank(size_px: tuple[int, int]) -> Image:
-    """A picture of one grey."""
+    """Return a picture that is grey all over."""
     width, height = size_px
     return Image(np.full((height, width, 3), GREY, dtype=np.uint8))
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """A decision point of the same step in another episode, drawn by the scene's id."""
-    assert isinstance(spec.source, FrozenSource), "a closed loop is refused before"
+    """Return a decision point of the same step in another episode, drawn with the scene's id as the key."""
+    assert isinstance(spec.source, FrozenSource), "Spec refuses another scene in the closed loop"
     dataset = spec.source.dataset
     forest = dataset.forest
     n = forest.place[scene.id]
-    others = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
-    if not len(others):
+    candidates = np.flatnonzero((forest.step == forest.step[n]) & (forest.tree != forest.tree[n]))
+    if not len(candidates):
         raise UserError(
             f"--image another: no other episode of {dataset.name} has a decision point at step "
             f"{int(forest.step[n])}; give a greater --limit"
         )
-    drawn = int(noise.uniforms((1,), "another picture", scene.id)[0] * len(others))
-    return dataset.scenes([forest.ids[others[drawn]]])[0]
+    index = int(noise.uniforms((1,), "another picture", scene.id)[0] * len(candidates))
+    return dataset.scenes([forest.ids[candidates[index]]])[0]

@@ -1,4 +1,4 @@
-"""The repair turn: who gave an answer that cannot be read is asked once more, and told what was wrong."""
+"""Ask once more for an answer that cannot be parsed, and say what was wrong with it: the repair turn."""
 
 import re
 from collections.abc import Mapping
@@ -12,13 +12,14 @@ from harness.prompts.densest import ERROR_CHARS
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer, FirstTurn
 
-QUOTED = 400  # characters of an answer that are quoted, at most
-# What begins a token of some chat template: <|im_end|>, </s>, <think>, [INST]; full-width forms of it too.
+QUOTED = 400  # most characters of an answer that are quoted
+# The beginning of a special token of a chat template, such as <|im_end|>, </s>, <think> or [INST], and its
+# full-width forms.
 _CONTROL = re.compile(r"[<＜](?=\S)|[\[［](?=/?[A-Za-z])")
 
 
 def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
-    """Whether an answer is asked for again: a model wrote it freely, and no intent can be read in it."""
+    """Whether to ask again: a model wrote the answer as free text, and no intent can be parsed from it."""
     return (
         request.answer == "json"
         and request.role in prompt.repair_turn
@@ -28,27 +29,27 @@ def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
 
 
 def asked(request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]) -> Request:
-    """The second question: the chat so far, the answer, and what the prompt says of it."""
-    said = prompt.repair(request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words)
-    turns = ({"role": "assistant", "content": quoted(answer.raw)}, {"role": "user", "content": said})
+    """Return the second request: the chat so far, the answer, and the prompt's words about its error."""
+    correction = prompt.repair(request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words)
+    turns = ({"role": "assistant", "content": quoted(answer.raw)}, {"role": "user", "content": correction})
     return replace(request, id=request.id + AGAIN, messages=(*request.messages, *turns))
 
 
 def quoted(raw: str) -> str:
-    """An answer as it stands in a chat: without its thought, as text, cut to `QUOTED` characters."""
+    """Return an answer as a chat quotes it: without its thought, as text, cut to `QUOTED` characters."""
     text = as_text(raw.rpartition("</think>")[2].strip())
     return text if len(text) <= QUOTED else text[: QUOTED - 1] + "…"
 
 
 def as_text(text: str) -> str:
-    """The same with a space in all that a chat template may read as a token of its own."""
+    """Return a text with a space inside whatever a chat template may read as a special token."""
     return _CONTROL.sub(lambda begins: f"{begins[0]} ", text)
 
 
 def together(first: Answer, second: Answer) -> Answer:
-    """The second turn's answer, with the first's text, and with what both took.
+    """Return the second turn's answer with the first turn's text and the tokens, time and retries of both.
 
-    Times to and between tokens are of one question, and so of neither.
+    The times to the first and between tokens describe one request, so they are left out.
     """
     turn = FirstTurn(**{name: getattr(first, name) for name in FirstTurn.__struct_fields__})
     return structs.replace(
@@ -62,5 +63,5 @@ def together(first: Answer, second: Answer) -> Answer:
 
 
 def _sum(a: float | None, b: float | None) -> float | None:
-    """Both; None where one is not known."""
+    """Return the sum; None if either is unknown."""
     return None if a is None or b is None else a + b

@@ -1,4 +1,4 @@
-"""A closed-loop episode, replayed from its record: equal actions in equal frames give an equal world."""
+"""Replay a closed-loop episode from its record: equal actions in equal frames give an equal world."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from harness.world.scenario import Parameters, Scenario
 from harness.world.state import WorldState
 from harness.world.world import World
 
-STILLS_HZ = 10  # where no decision is open
+STILLS_HZ = 10  # while no decision is open
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Played:
     """One episode of a finished closed-loop run.
 
     Attributes:
-        manifest: the run's.
-        condition: the operating point.
+        manifest: the run's manifest.
+        condition: name of the condition.
         seed: seed of the channel's draws.
-        episode: its number.
-        layout_seed: of its layout.
-        decisions: by step.
+        episode: the episode's number.
+        layout_seed: seed of its layout.
+        decisions: its decisions, by step.
     """
 
     manifest: Manifest
@@ -44,10 +44,10 @@ class Played:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What was driven, with the parameters of then."""
+        """The scenario that was driven, with the parameters that it had then."""
         assert isinstance(self.manifest.world, ClosedLoop)
-        of = self.manifest.world.scenario
-        return scenarios.stated(of["name"], of["parameters"])
+        record = self.manifest.world.scenario
+        return scenarios.stated(record["name"], record["parameters"])
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class Still:
     """One picture of an episode.
 
     Attributes:
-        state: what is where.
-        seen: what was there when the last decision began.
+        state: the state of the world.
+        seen: the state when the last decision began.
         decision: that decision, open or taken.
-        since_s: how long ago it began.
-        open: whether it does not act yet.
-        outcome: how the episode ended; empty until then.
+        since_s: seconds since it began.
+        open: whether it has not acted yet.
+        outcome: how the episode ended; empty until it has.
         danger: id of the dangerous vehicle, or None.
     """
 
@@ -74,10 +74,10 @@ class Still:
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> Played:
-    """An episode of a run folder; the last condition and the first seed unless others are given.
+    """Return an episode of a run folder; by default of the last condition and the first seed.
 
     Raises:
-        UserError: the folder is no closed-loop run, or has no such episode, condition or seed.
+        UserError: the folder holds no closed-loop run, or has no such episode, condition or seed.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):
@@ -97,74 +97,74 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> P
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> Played:
-    """An episode that the run has."""
-    world, d = run.manifest.world, run.decisions
+    """Return an episode of a run that is known to have it."""
+    world, table = run.manifest.world, run.decisions
     assert isinstance(world, ClosedLoop)
-    here = (d.whole("episode") == episode) & (d.whole("seed") == seed)
-    here &= d.codes("condition", run.conditions) == run.conditions.index(condition)
-    mine = d.take(np.flatnonzero(here))
-    decisions = sorted(mine.records(0, len(mine)), key=lambda decision: decision.step)
+    is_episode = (table.whole("episode") == episode) & (table.whole("seed") == seed)
+    is_episode &= table.codes("condition", run.conditions) == run.conditions.index(condition)
+    rows = table.take(np.flatnonzero(is_episode))
+    decisions = sorted(rows.records(0, len(rows)), key=lambda decision: decision.step)
     return Played(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
 
 
 def scene_of(run: Run, name: str) -> Scene:
-    """A decision point's scene, by replaying one of the episodes that reach it.
+    """Return a decision point's scene, by replaying one of the episodes that reach it.
 
-    Its id is the decision point's only if this simulator does what the run's did.
+    The scene's id equals the decision point's only if this simulator behaves as the run's did.
     """
     rows = run.decisions.scenes[name]
-    [mine] = run.decisions.records(rows.start, rows.start + 1)
-    episode = played(run, mine.episode, mine.condition, mine.seed)
-    begins = _begins(mine, episode.scenario.parameters)
+    [decision] = run.decisions.records(rows.start, rows.start + 1)
+    episode = played(run, decision.episode, decision.condition, decision.seed)
+    due_frame = _due_frame(decision, episode.scenario.parameters)
     world = World.start(episode.scenario, episode.layout_seed)
-    for frame, action in _acts(episode).items():
-        if frame <= begins:
+    for frame, action in _actions_by_frame(episode).items():
+        if frame <= due_frame:
             world.advance(frame)
             world.take(action)
-    world.advance(begins)
+    world.advance(due_frame)
     alone = not capabilities(run.manifest.model["engine"]).asks_helpers
-    return look(Trajectory(mine.episode, world, []), mine.step, alone)
+    return look(Trajectory(decision.episode, world, []), decision.step, alone)
 
 
-def _begins(decision: Decision, p: Parameters) -> int:
+def _due_frame(decision: Decision, p: Parameters) -> int:
     return round(decision.step * p.decision_period_s * p.simulation_hz)
 
 
-def _acts(played: Played) -> dict[int, str]:
-    """Actions by the frame in which they were taken."""
+def _actions_by_frame(played: Played) -> dict[int, str]:
+    """Return the actions by the frame in which they were taken."""
     p = played.scenario.parameters
-    return {_acts_in(d, p): d.action for d in played.decisions if d.acted}
+    return {_acting_frame(d, p): d.action for d in played.decisions if d.acted}
 
 
-def _acts_in(decision: Decision, p: Parameters) -> int:
+def _acting_frame(decision: Decision, p: Parameters) -> int:
     return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
 def stills(played: Played, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
-    """The episode, ten stills a second, and one a frame while a decision is open."""
+    """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
-    begins = [_begins(decision, p) for decision in played.decisions]
-    acts = _acts(played)
-    place, seen = 0, world.state()
+    due_frames = [_due_frame(decision, p) for decision in played.decisions]
+    actions = _actions_by_frame(played)
+    index, seen = 0, world.state()
     while True:
-        if place + 1 < len(begins) and begins[place + 1] <= world.frame:
-            place += 1
+        if index + 1 < len(due_frames) and due_frames[index + 1] <= world.frame:
+            index += 1
             seen = world.state()
-        decision = played.decisions[place]
-        thinking = world.frame < _acts_in(decision, p)
+        decision = played.decisions[index]
+        deciding = world.frame < _acting_frame(decision, p)
         outcome = world.outcome
         ending = "" if not outcome.ended else f"{outcome.result.replace('_', ' ')} at {outcome.time_s:.1f} s"
         ending += f" with {outcome.partner}" if outcome.partner else ""
-        since_s = (world.frame - begins[place]) / p.simulation_hz
+        since_s = (world.frame - due_frames[index]) / p.simulation_hz
         progress(1)
-        is_open = thinking and not outcome.ended
+        is_open = deciding and not outcome.ended
         yield Still(world.state(), seen, decision, since_s, is_open, ending, world.layout.danger_id)
         if outcome.ended:
             return
-        until = world.frame + (1 if thinking else max(1, round(p.simulation_hz / STILLS_HZ)))
-        for frame in sorted(f for f in {*acts, *begins} if world.frame < f < until):
-            until = min(until, frame)
-        world.advance(until)
-        if world.frame in acts and not world.outcome.ended:
-            world.take(acts[world.frame])
+        next_frame = world.frame + (1 if deciding else max(1, round(p.simulation_hz / STILLS_HZ)))
+        for frame in sorted(f for f in {*actions, *due_frames} if world.frame < f < next_frame):
+            next_frame = min(next_frame, frame)
+        world.advance(next_frame)
+        if world.frame in actions and not world.outcome.ended:
+            world.take(actions[world.frame])

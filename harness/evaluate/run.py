@@ -1,4 +1,4 @@
-"""`harness eval` and `harness drive`: walk a world in chunks, keep each, score and write the run."""
+"""Run an evaluation, for `harness eval` and `harness drive`: walk its chunks, score them, write the run."""
 
 import math
 import shlex
@@ -51,9 +51,9 @@ if TYPE_CHECKING:  # only driving loads the simulator
 
 Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
-EPISODES_AT_ONCE = 16  # of the closed loop that are driven in step and kept together, at least
-TREES_AT_ONCE = 256  # of frozen scenes that are walked and kept together
-LEAST_VIEWERS = 4  # asked at once for each of them, the ego and three helpers
+EPISODES_AT_ONCE = 16  # fewest episodes of a closed-loop chunk
+TREES_AT_ONCE = 256  # decision trees of a chunk of frozen scenes
+LEAST_VIEWERS = 4  # requests at once for each closed-loop episode: the ego and three helpers
 
 
 def evaluate(
@@ -66,24 +66,26 @@ def evaluate(
     opens: Opens | None = None,
     given: Mapping[str, Answer] = NOTHING,
 ) -> Evaluated:
-    """Evaluate a model with a prompt and write the run's folder; the same for any workers.
+    """Evaluate a model with a prompt and write the run's folder, whose bytes do not depend on the workers.
 
-    A run that was stopped there resumes. The working folder stays until the caller, which may add to the run,
-    calls `work.tidy`.
+    A stopped run in that folder resumes. The working folder stays until the caller calls `work.tidy`; until
+    then the caller may add files to the run.
 
     Args:
         spec: what is evaluated.
         out: the run's folder.
-        progress: called with the number of new answers, or of episodes just driven, kept ones included.
-        cache: file of completions kept between runs, for language models; None for no cache.
-        more: called with the number of answers that are owed next, where scenes are frozen.
-        workers: processes or a cluster, each worker with a backend of its own: for the closed loop, and for
-            frozen scenes that rules answer. A language model answers frozen scenes in this process.
-        opens: replaces `open_backend` where scenes are frozen; the backend may be open already.
-        given: answers by request id that need no asking, where scenes are frozen.
+        progress: called with the number of new answers (frozen scenes) or of episodes just driven (closed
+            loop); what an earlier, stopped run kept is included.
+        cache: completion cache for language models, a file; None for no cache.
+        more: called with the number of answers that are due next; frozen scenes only.
+        workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules answer;
+            each worker opens its own backend. A language model answers frozen scenes in this process.
+        opens: replaces `open_backend` for frozen scenes; it may return a backend that is open already.
+        given: answers by request id that need not be asked for; frozen scenes only.
 
     Raises:
-        UserError: the folder holds something else, or the model is not available. Nothing is written then.
+        UserError: the folder holds another run or something else, or the model is not available. Nothing is
+            written then.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
@@ -98,70 +100,70 @@ def evaluate(
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         _drive(spec, begun, chunks, place, progress, cache, workers)
-        return _gathered(out, as_finished(spec, begun), chunks, place)
+        return _gather(out, as_finished(spec, begun), chunks, place)
 
 
 def evaluate_shard(
     spec: Spec, out: Path, shard: Shard, progress: Callable[[int], None], more: Callable[[int], None],
     workers: Workers = 1,
 ) -> int:  # fmt: skip
-    """Drive a shard's part of a closed-loop run, for `harness merge`; a stopped shard resumes.
+    """Drive one shard of a closed-loop run, which `harness merge` combines; a stopped shard resumes.
 
     Args:
         spec: the whole run.
         out: the shard's folder.
-        shard: which part.
-        progress: called with the number of episodes just driven, kept ones included.
+        shard: the part of the run.
+        progress: called with the number of episodes just driven, those kept by a stopped shard included.
         more: called with the number of episodes that the shard has.
         workers: processes or a cluster.
 
     Returns:
-        How many episodes the shard has.
+        The number of episodes of the shard.
 
     Raises:
-        UserError: as of `evaluate`, or the latency is to be measured.
+        UserError: as in `evaluate`, or the latency is to be measured.
     """
     refuse_finished(out)
     begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
-    mine = shard.part(chunks)
-    more(sum(map(len, mine)))
+    own_chunks = shard.part(chunks)
+    more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
-        _drive(spec, begun, mine, place, progress, None, workers)
-    return sum(map(len, mine))
+        _drive(spec, begun, own_chunks, place, progress, None, workers)
+    return sum(map(len, own_chunks))
 
 
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
-    """Make one closed-loop run of its shards: the bytes of a run that was not split (see `evaluate`).
+    """Combine the shards of a closed-loop run into the run that `evaluate` would have written, byte for byte.
 
     Raises:
-        UserError: these are not all shards of one run, finished and of the same bytes, or `out` holds
-            something else.
+        UserError: the folders are not all the shards of one run, a shard is unfinished, two hold different
+            bytes for the same part, or `out` holds something else.
     """
     begun = shards.read(folders, Begun)
     chunks = _chunks_of(begun[0].settings)
-    of = {_part_of(chunk): chunk for chunk in chunks}
-    parts = shards.owners(folders, begun, list(of), lambda part: _named(of[part]))
+    chunk_by_folder = {_folder_name(chunk): chunk for chunk in chunks}
+    parts = shards.owners(folders, begun, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part]))
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished_with(begun[0].settings, out)
     refuse_finished(out)
     tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
     created = min(each.created for each in begun)
     whole = msgspec.structs.replace(begun[0], shard="", tags=tags, created=created)
-    if there := work.begun(out, Begun):
-        work.same(out, {**whole.facts(), "shard": ""}, {**there.facts(), "shard": there.shard})
-    with work.working(out, there or whole, "run.json") as place:
+    if stopped := work.begun(out, Begun):
+        work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
+    with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
-        return _gathered(out, whole, chunks, place)
+        return _gather(out, whole, chunks, place)
 
 
-def _part(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[str, bytes]:
-    """Walk a world; returns the files of that part of the run by name."""
+def _walk_world(spec: Spec, world: "FrozenWorld | LiveWorld", asker: Asker) -> dict[str, bytes]:
+    """Walk a world to its end and return the files of this part of the run, by name."""
     decided = list(chain.from_iterable(walk(world, spec.points, asker)))
     decisions = table(decided, world.columns(), spec.actions)
     if spec.device_profile:
         answers = asker.answers.values()
-        taken = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
-        decisions = decisions.replace(**taken)
+        joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
+        decisions = decisions.replace(**joules)
     return folder.part_files(decisions.rounded(), world.episodes(), asker.answers.values())
 
 
@@ -176,72 +178,72 @@ def _frozen(
     identity = together(spec.cards, models).identity()
     latency = _latency(spec, begun, models, lambda: timing.spread_over(dataset.scenes(dataset.courses())))
     begun = begin(spec, out, begun, identity, latency)
-    chunks = _chunked(dataset.episodes, TREES_AT_ONCE)
+    chunks = _split(dataset.episodes, TREES_AT_ONCE)
     with work.working(out, begun, "run.json") as place:
-        asked, kept = together(spec.cards, models, cache), place / "answers.jsonl"
-        todo = [chunk for chunk in chunks if not (place / _part_of(chunk)).is_dir()]
-        apart = len(todo) > 1 and workers != 1 and _exact(spec) and not given
+        backend, answers_path = together(spec.cards, models, cache), place / "answers.jsonl"
+        todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
+        in_workers = len(todo) > 1 and workers != 1 and _reproducible(spec) and not given
 
-        def here(chunk: Sequence[int]) -> dict[str, bytes]:
-            asker = Asker(spec, lambda: asked, latency, kept, given, progress, more)
-            return _part(spec, _world(spec, chunk), asker)
+        def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
+            asker = Asker(spec, lambda: backend, latency, answers_path, given, progress, more)
+            return _walk_world(spec, _world_of(spec, chunk), asker)
 
-        def count(chunk: Sequence[int]) -> None:
-            n = folder.answers_in(place / _part_of(chunk))
-            more(n)
-            progress(n)
+        def report_kept(chunk: Sequence[int]) -> None:
+            n_answers = folder.answers_in(place / _folder_name(chunk))
+            more(n_answers)
+            progress(n_answers)
 
-        def took(at: int, files: dict[str, bytes]) -> None:
-            folder.write_part(place / _part_of(todo[at]), files)
-            kept.unlink(missing_ok=True)
-            if apart:
-                count(todo[at])
+        def keep(index: int, files: dict[str, bytes]) -> None:
+            folder.write_part(place / _folder_name(todo[index]), files)
+            answers_path.unlink(missing_ok=True)
+            if in_workers:
+                report_kept(todo[index])
 
         for chunk in chunks:
             if chunk not in todo:
-                count(chunk)
-        walked = partial(_walked, spec, begun, None) if apart else here
-        each(walked, todo, workers if apart else 1, took, _named)
-        return _gathered(out, as_finished(spec, begun), chunks, place)
+                report_kept(chunk)
+        walk_chunk = partial(_walk_chunk, spec, begun, None) if in_workers else walk_here
+        each(walk_chunk, todo, workers if in_workers else 1, keep, _label)
+        return _gather(out, as_finished(spec, begun), chunks, place)
 
 
 def _begin_driving(
     spec: Spec, out: Path, begun: Begun | None, workers: Workers, shard: str = ""
 ) -> tuple[Begun, list[Sequence[int]]]:
-    """What a closed-loop run begins with, and the chunks of its episodes."""
+    """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
     if spec.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
             f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; measure on "
             "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
-    # Engines are opened where they answer: a forked process has none of their threads.
-    model = partial(_model, begun=begun)
+    # Each process opens its own engine: a forked process does not inherit an engine's threads.
+    load, exact = partial(_identity_and_latency, begun=begun), _reproducible(spec)
     [(identity, latency)] = spread(
-        model, [spec], workers, lambda done: None, lambda of: f"the model {of.ego.card.name}", _exact(spec)
+        load, [spec], workers, lambda done: None, lambda each: f"the model {each.ego.card.name}", exact
     )
     return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
 
 
 def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
-    """Numbers of the episodes that are driven in step and kept together, of a closed-loop run's settings."""
+    """Split a closed-loop run into chunks: the numbers of the episodes that are driven in step."""
     world = msgspec.convert(settings["world"], ClosedLoop)
     numbers: Sequence[int] = range(world.episodes)
-    if drawn_of := world.selection:
-        numbers = drawn(range(drawn_of["of"]), drawn_of["sample"], drawn_of["sample_seed"], drawn_of["of"])
-    return _chunked(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
+    if sample := world.selection:
+        numbers = drawn(range(sample["of"]), sample["sample"], sample["sample_seed"], sample["of"])
+    return _split(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
 
 
-def _chunked(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
+def _split(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
     return [numbers[at : at + size] for at in range(0, len(numbers), size)]
 
 
-def _part_of(chunk: Sequence[int]) -> str:
-    """Name of the folder that keeps a chunk."""
+def _folder_name(chunk: Sequence[int]) -> str:
+    """Return the name of a chunk's folder in the working folder."""
     return f"episodes-{chunk[0]:06d}-{chunk[-1]:06d}"
 
 
-def _named(chunk: Sequence[int]) -> str:
-    """A chunk for people."""
+def _label(chunk: Sequence[int]) -> str:
+    """Return a chunk's name for people."""
     whole = chunk == range(chunk[0], chunk[-1] + 1)
     return f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
 
@@ -250,59 +252,59 @@ def _drive(
     spec: Spec, begun: Begun, chunks: Sequence[Sequence[int]], place: Path,
     progress: Callable[[int], None], cache: Path | None, workers: Workers,
 ) -> None:  # fmt: skip
-    """Drive the chunks that are not kept yet, and keep each as it comes."""
-    todo = [chunk for chunk in chunks if not (place / _part_of(chunk)).is_dir()]
+    """Drive the chunks that are not kept yet, and keep each as soon as it is done."""
+    todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
     progress(sum(map(len, chunks)) - sum(map(len, todo)))
 
-    def took(at: int, files: dict[str, bytes]) -> None:
-        folder.write_part(place / _part_of(todo[at]), files)
-        progress(len(todo[at]))
+    def keep(index: int, files: dict[str, bytes]) -> None:
+        folder.write_part(place / _folder_name(todo[index]), files)
+        progress(len(todo[index]))
 
-    # The cache is a file of one machine.
-    walked = partial(_walked, spec, begun, cache if isinstance(workers, int) else None)
-    each(walked, todo, workers, took, _named, _exact(spec))
+    # The cache is a file of this machine, which the nodes of a cluster cannot share.
+    walk_chunk = partial(_walk_chunk, spec, begun, cache if isinstance(workers, int) else None)
+    each(walk_chunk, todo, workers, keep, _label, _reproducible(spec))
 
 
-def _exact(spec: Spec) -> bool:
-    """Whether the same question gets the same answer anywhere: rules do, and language models need not."""
+def _reproducible(spec: Spec) -> bool:
+    """Whether a question gets the same answer on every machine; that of a language model may differ."""
     return not any(agent.can.language_model for agent in spec.agents)
 
 
-def _walked(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
-    """Walk a chunk in a worker; returns its files by name."""
+def _walk_chunk(spec: Spec, begun: Begun, cache: Path | None, chunk: Sequence[int]) -> dict[str, bytes]:
+    """Walk a chunk in a worker process and return its files by name."""
 
     def backend() -> Backend:
-        asked = together(spec.cards, _opened_all(spec), cache)
-        if digest(asked.identity()) != digest(begun.identity):
+        combined = together(spec.cards, _open_all(spec), cache)
+        if digest(combined.identity()) != digest(begun.identity):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
-        return asked
+        return combined
 
-    return _part(spec, _world(spec, chunk), Asker(spec, backend, begun.latency))
+    return _walk_world(spec, _world_of(spec, chunk), Asker(spec, backend, begun.latency))
 
 
-def _world(spec: Spec, chunk: Sequence[int]) -> "FrozenWorld | LiveWorld":
-    """The world of a chunk of a run's episodes."""
+def _world_of(spec: Spec, chunk: Sequence[int]) -> "FrozenWorld | LiveWorld":
+    """Return the world of a chunk's episodes."""
     if isinstance(spec.source, FrozenSource):
-        some = spec.source.dataset.of_episodes(frozenset(chunk))
-        return FrozenWorld(some, spec.points, spec.seeds)
+        episodes = spec.source.dataset.of_episodes(frozenset(chunk))
+        return FrozenWorld(episodes, spec.points, spec.seeds)
     from harness.evaluate.live_world import LiveWorld
 
     source = cast("LiveSource", spec.source)
     return LiveWorld(spec.scenario, source.first_seed, chunk, spec.points, spec.seeds, spec.ego_alone)
 
 
-def _gathered(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
-    """Score all chunks of a run, which lie in a working folder, and write the run's files."""
-    settings, parts = begun.settings, [place / _part_of(chunk) for chunk in chunks]
+def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Path) -> Evaluated:
+    """Score the chunks in a working folder and write the files of the finished run."""
+    settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
     grid = Grid(names, tuple(settings["seeds"]), tuple(chain.from_iterable(chunks)))
     with uncollected():
-        read = [folder.read_part(part, settings["actions"]) for part in parts]
-        decisions = Decisions.concat([decisions for decisions, _, _ in read])
-        answers = [answer for _, _, answers in read for answer in answers]
-        episodes = counted(grid, decisions, [episode for _, episodes, _ in read for episode in episodes])
+        contents = [folder.read_part(part, settings["actions"]) for part in parts]
+        decisions = Decisions.concat([decisions for decisions, _, _ in contents])
+        answers = [answer for _, _, answers in contents for answer in answers]
+        episodes = counted(grid, decisions, [episode for _, episodes, _ in contents for episode in episodes])
         summary = scores(settings["world"]["kind"], grid, decisions, episodes, answers)
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
@@ -318,9 +320,9 @@ def _gathered(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: P
     return Evaluated(out, manifest, summary)
 
 
-def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
-    """Identity of the models and latency of their decisions in the closed loop."""
-    models, source = _opened_all(spec), cast("LiveSource", spec.source)
+def _identity_and_latency(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
+    """Open a closed-loop run's models; return their identity and the latency of their decisions."""
+    models, source = _open_all(spec), cast("LiveSource", spec.source)
     latency = _latency(spec, begun, models, lambda: source.trial(timing.SCENES, spec.ego_alone))
     return together(spec.cards, models).identity(), latency
 
@@ -328,7 +330,14 @@ def _model(spec: Spec, begun: Begun | None) -> tuple[dict[str, Any], Latency]:
 def _latency(
     spec: Spec, begun: Begun | None, models: Sequence[Backend], trial: Callable[[], Sequence[Scene]]
 ) -> Latency:
-    """What the run began with, or what a new one is to have; `trial` gives scenes to measure it in."""
+    """Return the latency that a resumed run began with, or that of a new run.
+
+    Args:
+        spec: the evaluation.
+        begun: what the run began with; None if it is new.
+        models: the backends of its agents.
+        trial: returns the scenes in which to measure the latency.
+    """
     if begun:
         return begun.latency
     if spec.device_profile:
@@ -337,8 +346,8 @@ def _latency(
     return declared or timing.measured(spec, together(spec.cards, models), trial())
 
 
-def _opened_all(spec: Spec) -> list[Backend]:
-    """This process's backends of a run's agents."""
+def _open_all(spec: Spec) -> list[Backend]:
+    """Return the backends of a run's agents, open in this process."""
     return [opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
 
 
@@ -346,7 +355,7 @@ def read_or_evaluate(
     spec: Spec, out: Path, progress: Callable[[int], None], cache: Path | None, more: Callable[[int], None],
     opens: Opens, given: Mapping[str, Answer] = NOTHING,
 ) -> folder.Run:  # fmt: skip
-    """One of several runs in a study's folder: read where it is there, else evaluated (see `evaluate`)."""
+    """Read the finished run in a folder, or run it with `evaluate` first; for studies of several runs."""
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)
     else:

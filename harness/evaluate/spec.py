@@ -1,4 +1,4 @@
-"""An evaluation's settings, complete: enough to run it again."""
+"""Hold and check the complete settings of an evaluation: enough to run it again."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -26,21 +26,21 @@ HOTTEST = 2.0
 
 
 class Source(Protocol):
-    """Which world is walked."""
+    """Describes the world that is walked."""
 
     @property
     def kind(self) -> World:
-        """Its kind in a run's manifest."""
+        """The world's kind, as a run's manifest has it."""
         ...
 
     @property
     def command(self) -> str:
-        """The command that walks it: `eval` or `drive`."""
+        """The command that walks this world: `eval` or `drive`."""
         ...
 
     @property
     def name(self) -> str:
-        """Its part of the name of a run's folder."""
+        """What stands for this world in the name of a run's folder."""
         ...
 
     @property
@@ -50,20 +50,20 @@ class Source(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of its episodes."""
+        """The scenario of the episodes."""
         ...
 
     @property
     def layout_seeds(self) -> Iterable[int]:
-        """Of the episodes that are walked."""
+        """The layout seeds of the episodes that are walked."""
         ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
-        """Its record in a run's manifest."""
+        """Return the world's record in a run's manifest."""
         ...
 
     def options(self) -> list[tuple[str, object]]:
-        """Options of `command` that name it; None for an option that is not given."""
+        """Return the options of `command` that select this world; None for an option that is not given."""
         ...
 
 
@@ -72,24 +72,24 @@ class Spec:
     """One evaluation.
 
     Attributes:
-        ego: who answers for the ego.
-        source: which world is walked.
-        points: conditions, each an operating point.
-        seeds: of the channel's draws.
-        helpers: who answers for the helpers, who take them in turn in the order they were spawned; empty if
-            the ego's agent does.
-        batch_size: most requests that go through an engine together.
-        servers: base URLs of the served model, in place of its card's; any of them may answer.
-        device: engines' device, or None for their choice.
-        dtype: number format, or None for the cards'.
-        temperature: of the models' answers; 0 takes the likeliest token each time.
-        sampling_seed: of their draws, so that the same question has other answers under another one.
+        ego: the agent that answers for the ego.
+        source: the world that is walked.
+        points: the conditions, each an operating point.
+        seeds: seeds of the channel's draws.
+        helpers: the agents that answer for the helpers. Helpers take them in turn, in the order in which they
+            were spawned. Empty if the ego's agent answers for the helpers, too.
+        batch_size: the most requests that go through an engine together.
+        servers: base URLs of the served model, which replace that of its card; any of them may answer.
+        device: the engines' device; None leaves the choice to them.
+        dtype: number format of the weights; None takes each card's.
+        temperature: sampling temperature; 0 takes the likeliest token each time.
+        sampling_seed: seed of the sampling; under another one, the same question gets other answers.
         latency: where inference times come from: `card`, `paper`, `measured`, or seconds as `declared`
             reads them; None for each card's, else the paper's.
-        device_profile: the computer that every vehicle has, in place of `latency`: each answer takes what its
-            own tokens take there. None for none.
-        device_model: whose row of it times all answers; None for each agent's own.
-        tags: words to find the run by, which change nothing in it.
+        device_profile: the computer that every vehicle has; it replaces `latency`: the time of an answer
+            follows from its own tokens. None for no profile.
+        device_model: the model whose row of the profile times all answers; None for each agent's own row.
+        tags: words by which to find the run; they change nothing in it.
     """
 
     ego: Agent
@@ -127,17 +127,17 @@ class Spec:
         self._check_sampling()
         for agent in self.agents:
             self._check(agent)
-        lone = [agent for agent in self.agents if not agent.can.asks_helpers]
-        if self.helpers and lone:
+        drivers = [agent for agent in self.agents if not agent.can.asks_helpers]
+        if self.helpers and drivers:
             raise UserError(
-                f"--helper-model: {printable(lone[0].card.name)} is a driver, which decides for an ego "
+                f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for an ego "
                 "only; give other models"
             )
         if self.latency not in (None, *NAMES):
-            several = len(declared(self.latency).helpers_s)
-            if several and several != len(self.helpers):
+            times = len(declared(self.latency).helpers_s)
+            if times and times != len(self.helpers):
                 raise UserError(
-                    f"--latency {printable(self.latency)}: {several} times for {len(self.helpers)} helper "
+                    f"--latency {printable(self.latency)}: {times} times for {len(self.helpers)} helper "
                     "models; give one, or one each"
                 )
         self._check_device()
@@ -145,10 +145,12 @@ class Spec:
             self._check_point(point)
         for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
             if value is not None and not any(agent.can.has_weights for agent in self.agents):
-                able = [name for name, engine in registrations().items() if engine.capabilities.has_weights]
+                engines = [
+                    name for name, engine in registrations().items() if engine.capabilities.has_weights
+                ]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "
-                    f"(engines {' and '.join(able)} have); leave it out"
+                    f"(engines {' and '.join(engines)} have); leave it out"
                 )
 
     def _check_device(self) -> None:
@@ -217,12 +219,12 @@ class Spec:
             )
 
     def _check_examples(self, prompt: Prompt) -> None:
-        """Refuse to ask about layouts that the prompt shows, and to show what the parser would not take."""
+        """Raise UserError if an example's layout is evaluated, or if the parser would not take its answer."""
         if prompt.examples is None:
             return
-        if known := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
+        if shown := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
             raise UserError(
-                f"--prompt {prompt.version} has an example of layout seed {known[0]}, which is evaluated; "
+                f"--prompt {prompt.version} has an example of layout seed {shown[0]}, which is evaluated; "
                 "leave that episode out, or draw the examples anew: `harness prompt examples --first-seed`"
             )
         for role in ROLES:
@@ -242,30 +244,30 @@ class Spec:
 
     @property
     def unmergeable(self) -> str | None:
-        """Why the helpers' messages cannot be in the ego's prompt; None if they can."""
+        """Why the ego's prompt cannot hold the helpers' messages; None if it can."""
         if "readout" in [agent.answer for agent in self.agents]:
             return "a readout gives no messages to merge; use --answer json or constrained"
-        mine, wants = self.ego.prompt.version, self.ego.prompt.helper_answer
+        version, form = self.ego.prompt.version, self.ego.prompt.helper_answer
         for prompt in (helper.prompt for helper in self.helpers):
-            if prompt.helper_answer != wants:
+            if prompt.helper_answer != form:
                 return (
-                    f"prompt {mine} merges messages with a {wants}, those of {prompt.version} have a "
+                    f"prompt {version} merges messages with a {form}, those of {prompt.version} have a "
                     f"{prompt.helper_answer}; use another --helper-prompt"
                 )
         return None
 
     @property
     def agents(self) -> tuple[Agent, ...]:
-        """The ego's, then the helpers' where they are others."""
+        """The ego's agent, then those of the helpers if they have their own."""
         return self.ego, *self.helpers
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """Of the agents, as they are opened: the served model at the servers that are given."""
+        """The agents' cards; the served model's has the servers that were given."""
         return tuple(agent.card.at(self.servers) for agent in self.agents)
 
     def agent(self, place: int) -> int:
-        """Which of the agents answers for a scene's viewer at this place; the ego is at 0."""
+        """Return the index of the agent of the viewer at this place of a scene; the ego is at 0."""
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
     @property
@@ -275,20 +277,20 @@ class Spec:
 
     @property
     def scenario(self) -> Scenario:
-        """What is decided in."""
+        """The scenario of the episodes."""
         return self.source.scenario
 
     @property
     def ego_alone(self) -> bool:
-        """Whether the model answers for the ego only, as a driver does."""
+        """Whether the model answers only for the ego, as a driver does."""
         return not self.ego.can.asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
-        """The vehicles of a scene that the model answers for, the ego first."""
+        """Return the vehicles of a scene for which a model answers, the ego first."""
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def settings(self) -> dict[str, Any]:
-        """What a run that goes on must have in common with what it began as, as plain values."""
+        """Return, as plain values, the settings that must not change when a stopped run resumes."""
         return {
             **self.ego.settings(),
             "helpers": [agent.settings() for agent in self.helpers],
@@ -313,7 +315,7 @@ class Spec:
         }
 
     def words(self) -> tuple[str, ...]:
-        """A command line that runs this again, but for `--out`."""
+        """Return the words of a command that runs this evaluation again; without `--out`."""
         first = self.seeds[0]
         seeds = ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}"
         options = [
@@ -330,9 +332,9 @@ class Spec:
         ]  # fmt: skip
         parts = [part for flag, value in options if value is not None for part in (flag, str(value))]
         flags = ["--thinking"] if self.ego.thinking else []
-        asked = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
-        if self.helpers and asked != self.ego.thinking:
-            flags.append("--helper-thinking" if asked else "--no-helper-thinking")
+        helpers_think = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
+        if self.helpers and helpers_think != self.ego.thinking:
+            flags.append("--helper-thinking" if helpers_think else "--no-helper-thinking")
         return ("harness", self.source.command, *parts, *flags)
 
     def _helper_options(self) -> list[tuple[str, object]]:

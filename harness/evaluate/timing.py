@@ -1,4 +1,4 @@
-"""Inference times measured before a run: by name only, and on an idle machine only."""
+"""Measure inference times before a run; only if the user asks for it, and only on an idle machine."""
 
 import os
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ from harness.evaluate.latency import EXAMPLE, MEASURED, times
 from harness.evaluate.spec import Spec
 from harness.runs.records import Latency
 
-SCENES = 5  # that are timed
-IDLE = 0.25  # processes that want a core, a core, at most
+SCENES = 5  # how many scenes are timed
+IDLE = 0.25  # highest load of an idle machine, in processes a core
 
 
 def refuse_busy() -> None:
-    """Raise UserError unless the machine has been idle for a minute."""
+    """Raise UserError unless the machine was idle for the last minute."""
     load = load_a_core()
     if load is None or load > IDLE:
         reason = (
@@ -31,7 +31,7 @@ def refuse_busy() -> None:
 
 
 def load_a_core() -> float | None:
-    """Processes that wanted a core in the last minute, a core; None where the system does not say."""
+    """Return the load of the last minute, in processes a core; None if the system does not say."""
     try:
         return os.getloadavg()[0] / (os.cpu_count() or 1)
     except (OSError, AttributeError):
@@ -39,31 +39,31 @@ def load_a_core() -> float | None:
 
 
 def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
-    """So many scenes as are timed, evenly spread."""
+    """Return `SCENES` scenes or fewer, evenly spread."""
     return scenes[:: max(1, len(scenes) // SCENES)][:SCENES]
 
 
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
-    """The median time of an agent's answers in a role in these scenes, each asked alone.
+    """Return the median time of the answers in each role, over these scenes; each request is sent alone.
 
-    Where no answer can be timed it is the ego's time.
+    A role in which no answer can be timed gets the ego's time.
 
     Args:
         spec: the evaluation.
-        backend: the model itself: a cache answers in no time.
-        scenes: what is asked about.
+        backend: the model itself; a cache would answer in no time.
+        scenes: the scenes that the model is asked about.
 
     Raises:
         UserError: no answer of the ego can be timed.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
-    backend.complete(first[:1])  # the first answer of a process pays for warming up
+    backend.complete(first[:1])  # the first request of a process includes the warm-up
     answers = {r.id: answer_of(r, backend.complete([r])[0]) for r in first}
     fusion = []
     for scene in scenes if spec.unmergeable is None else ():
-        said = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
-        if heard := [viewer for viewer in scene.viewers[1:] if said[viewer].intent]:
-            fusion.append(replace(fusion_request(spec, scene, said, heard), timed=True))
+        by_viewer = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
+        if heard := [viewer for viewer in scene.viewers[1:] if by_viewer[viewer].intent]:
+            fusion.append(replace(fusion_request(spec, scene, by_viewer, heard), timed=True))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
         name = printable(spec.ego.card.name)
@@ -72,11 +72,11 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
             f"`harness model check` says, or declare times such as {EXAMPLE}"
         )
     ego, helper, merge = (sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge"))
-    several = len(spec.helpers) > 1
-    of_helpers = tuple(
-        times(answers[r.id] for r in first if r.agent == who).get("helper", sample["ego"]).median_s
-        for who in range(1, len(spec.agents)) if several
+    several_helpers = len(spec.helpers) > 1
+    helper_times = tuple(
+        times(answers[r.id] for r in first if r.agent == agent).get("helper", sample["ego"]).median_s
+        for agent in range(1, len(spec.agents)) if several_helpers
     )  # fmt: skip
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
-    helper = of_helpers[0] if of_helpers else helper
-    return Latency("measured", basis, ego, helper, merge, sample, of_helpers)
+    helper = helper_times[0] if helper_times else helper
+    return Latency("measured", basis, ego, helper, merge, sample, helper_times)

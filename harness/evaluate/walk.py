@@ -1,7 +1,7 @@
-"""The one loop: observe the world, get intents, coordinate under every condition and seed, act.
+"""The one loop over decision points: observe the world, get intents, coordinate under every condition, act.
 
-Frozen scenes, the closed loop and the calibrated proxy of the paper's study are worlds. They differ in where
-their moments come from and in where an action leads, and in nothing else. A moment is one decision point.
+There are three kinds of world: frozen scenes, the closed loop, and the calibrated proxy of the paper's study.
+They differ only in where their moments come from and where an action leads. A moment is one decision point.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -37,12 +37,12 @@ AskedMoment = TypeVar("AskedMoment", contravariant=True)
 
 @dataclass(frozen=True)
 class Due:
-    """Decisions that are to be made now under one condition.
+    """The decisions that are due now under one condition.
 
     Attributes:
-        at: the moment of each, a position among those the world shows, (n,).
-        episode: number of the episode of each, (n,).
-        seed: seed of the channel's draws of each, (n,).
+        at: the moment of each decision, as an index into the moments that the world shows, (n,).
+        episode: the episode's number of each, (n,).
+        seed: the seed of the channel's draws for each, (n,).
         draws: those draws, (n, ...).
     """
 
@@ -53,7 +53,7 @@ class Due:
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
-        """Number and seed of each."""
+        """Number and seed of each decision's episode."""
         return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
 
 
@@ -63,10 +63,10 @@ class Decided(Generic[Moment]):
 
     Attributes:
         point: the condition.
-        moments: those the world showed.
-        due: what was to be decided.
-        result: what was, (n, ...).
-        said: what reached the channel for it.
+        moments: the moments that the world showed.
+        due: the decisions that were due.
+        result: what was decided, (n, ...).
+        said: what vehicles said to the channel, as the attacks leave it.
     """
 
     point: OperatingPoint
@@ -80,23 +80,23 @@ class World(Protocol[Moment]):
     """Where decision points come from, and where actions lead."""
 
     def observe(self) -> Sequence[Moment]:
-        """Every distinct moment in which some episode is to decide now; none if all episodes are decided."""
+        """Return each distinct moment in which some episode decides now; none if all episodes are decided."""
         ...
 
     def due(self, point: OperatingPoint) -> Due:
-        """The decisions of a condition that are due in the moments just shown."""
+        """Return the decisions of a condition that are due in the moments just shown."""
         ...
 
     def site(self, units: Collection[Unit]) -> Site | None:
-        """Where vehicles and units are in the moments just shown, (n, ...); None without places."""
+        """Return where vehicles and units are in the moments just shown, (n, ...); None without places."""
         ...
 
     def outlook(self) -> Outlook | None:
-        """What egos see in the moments just shown, (n, ...); None in a world without places."""
+        """Return what egos see in the moments just shown, (n, ...); None in a world without places."""
         ...
 
     def claims(self) -> Claims | None:
-        """What helpers say of themselves in the moments just shown, (n, ...); None as above."""
+        """Return what helpers claim in the moments just shown, (n, ...); None in a world without places."""
         ...
 
     def step(self, decided: Sequence[Decided[Moment]]) -> None:
@@ -108,81 +108,83 @@ class Placed:
     """A world whose moments are scenes.
 
     Attributes:
-        scenario: of the scenes.
-        scenes: those just shown.
+        scenario: the scenario of the scenes.
+        scenes: the scenes just shown.
     """
 
     scenario: Scenario
     scenes: Sequence[Scene]
 
     def site(self, units: Collection[Unit]) -> Site:
-        """Where the vehicles of each scene are, and these units."""
+        """Return where the vehicles of each scene and these roadside units are."""
         moments = [(scene.state, scene.viewers) for scene in self.scenes]
         return site(moments, units, self.scenario.road().zone_m)
 
     def outlook(self) -> Outlook:
-        """What the ego of each scene sees."""
+        """Return what the ego of each scene sees."""
         return outlook(self.scenario.road(), self.scenes)
 
     def claims(self) -> Claims:
-        """What the helpers of each scene say of themselves."""
+        """Return what the helpers of each scene claim about themselves."""
         return claims(self.scenario, self.scenes)
 
 
 class Fuses(Protocol):
-    """Fusion calls that have been answered."""
+    """The answered fusion calls of some moments."""
 
     def __call__(self, moments: Ints, attackers: Bools | None = None, /) -> FusionCall:
-        """The call of decisions at moments (n,), with the attackers (n, H) if messages show them."""
+        """Return the call for decisions at moments (n,), with the attackers (n, H) if messages show them."""
         ...
 
 
 class Ask(Protocol[AskedMoment]):
-    """Where intents come from."""
+    """The source of intents: it asks the agents."""
 
     def __call__(self, moments: Sequence[AskedMoment]) -> Intents:
-        """What every vehicle intends in these moments, (n, ...)."""
+        """Return what every vehicle intends in these moments, (n, ...)."""
         ...
 
     def blind(self, moments: Sequence[AskedMoment], at: Ints) -> Intents:
-        """The same where helpers are shown nothing, (n, ...); it has to be known at these places alone."""
+        """Return the same where helpers are shown nothing, (n, ...); only the moments `at` need values."""
         ...
 
     def fusion_call(self, moments: Sequence[AskedMoment], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """The ego's answers to these sets of messages (`codes_of`), shown so."""
+        """Return the ego's answers to these sets of messages (`codes_of`), rewritten as `rewrites` says."""
         ...
 
 
 def walk(
     world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
 ) -> Iterator[Sequence[Decided[Moment]]]:
-    """Walk a world under some conditions until every episode is decided; yields each step's decisions."""
+    """Walk a world under some conditions until every episode is decided; yield the decisions of each step."""
     memories: dict[str, Memory] = {point.name: Memory() for point in points}
     attackers = {point.name: Attackers(point) for point in points}
     while moments := world.observe():
         intents = ask(moments)
-        due = {point: each for point in points if len((each := world.due(point)).at)}
+        due = {point: of_point for point in points if len((of_point := world.due(point)).at)}
         if any(isinstance(point.channel, Physical) for point in due):
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         if any(point.needs("outlook") for point in due):
             intents = replace(intents, outlook=world.outlook())
         if any(point.needs("claims") for point in due):
             intents = replace(intents, claims=world.claims())
-        places = [each.at for point, each in due.items() if point.asks_blind]
-        blind = ask.blind(moments, np.unique(np.concatenate(places))) if places else None
+        asked_blind = [of_point.at for point, of_point in due.items() if point.asks_blind]
+        blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         said = {
-            point: attackers[point.name].said(heard(point, intents, blind, each), each.draws, each.episodes)
-            for point, each in due.items()
+            point: attackers[point.name].said(
+                heard(point, intents, blind, of_point), of_point.draws, of_point.episodes
+            )
+            for point, of_point in due.items()
         }
-        sent = {point: exchange(point, of.intents, of.draws) for point, of in said.items()}
+        sent = {point: exchange(point, of_point.intents, of_point.draws) for point, of_point in said.items()}
         calls = _fusion_calls(due, said, sent, moments, ask)
         decided = []
-        for point, each in due.items():
-            of = said[point]
-            call = calls[point.rewrites](each.at, shown(point, of)) if point.asks_again else None
-            fusion = Fusion(call, memories[point.name].recall(each))
-            result = fuse(point, sent[point], of.intents, fusion)
-            decided.append(Decided(point, moments, each, result, of))
+        for point, due_here in due.items():
+            said_here = said[point]
+            call = calls[point.rewrites](due_here.at, shown(point, said_here)) if point.asks_again else None
+            fusion = Fusion(call, memories[point.name].recall(due_here))
+            result = fuse(point, sent[point], said_here.intents, fusion)
+            decided.append(Decided(point, moments, due_here, result, said_here))
         for part in decided:
             memories[part.point.name].keep(part.due, part.result.state)
         yield decided
@@ -190,11 +192,11 @@ def walk(
 
 
 def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
-    """What the vehicles of each decision intend; in a control, its helpers say something else.
+    """Return the intents that each decision works with; a control replaces those of the helpers.
 
-    `blind`, what they say who are shown nothing. `shuffled`, what those of another layout do: the next layout
-    in which the same seed has a decision at this step; an ego without one hears nobody. Who is asked, how far
-    it is and how long it takes stay.
+    With `messages=blind` they are the intents of helpers that are shown nothing. With `messages=shuffled`
+    they come from another layout: the next one in which the same seed has a decision at this step. If there
+    is none, the ego hears nobody. Who is asked, the distances and the times stay the same.
     """
     own = intents.take(due.at)
     if point.asks_blind:
@@ -221,11 +223,11 @@ class Memory:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """The state of each decision's episode, (n, K); None at the first step."""
+        """Return the state of each decision's episode, (n, K); None at the first step."""
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
-        """The state for the next step, (n, K), if the rule has any."""
+        """Store the state for the next step, (n, K), if the rule has one."""
         if state.shape[-1]:
             self._state |= dict(zip(due.episodes, state, strict=True))
 
@@ -234,10 +236,13 @@ def _fusion_calls(
     due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
     sent: Mapping[OperatingPoint, Exchange], moments: Sequence[Moment], ask: Ask[Moment],
 ) -> dict[Rewrites, Fuses]:  # fmt: skip
-    """One fusion call for each set of messages that any condition hears; who is heard depends on none."""
+    """Make one fusion call for each set of messages that any condition hears, and return them by rewrites.
+
+    This can happen before any decision, since who is heard does not depend on the fusion.
+    """
     calls = {}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.asks_again):
-        alike = {point: each for point, each in due.items() if point.rewrites == rewrites}
+        alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
         calls[rewrites] = ask.fusion_call(moments, heard_codes(alike, said, sent), rewrites)
     return calls
 
@@ -246,52 +251,54 @@ def heard_codes(
     due: Mapping[OperatingPoint, Due], said: Mapping[OperatingPoint, Said],
     sent: Mapping[OperatingPoint, Exchange],
 ) -> Ints:  # fmt: skip
-    """The sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
+    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending."""
     codes = [np.empty(0, dtype=int)]
-    for point, each in due.items():
+    for point, due_here in due.items():
         if point.asks_again:
             on_time = sent[point].on_time
-            codes.append(codes_of(on_time, each.at, shown(point, said[point]))[on_time.any(axis=1)])
+            codes.append(codes_of(on_time, due_here.at, shown(point, said[point]))[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
 
 def shown(point: OperatingPoint, said: Said) -> Bools | None:
-    """Who attacks, (n, H), where a fusion call shows it; else None."""
+    """Return who attacks, (n, H), if the text of a fusion call depends on it; else None."""
     return said.attackers if point.rewrites.attack else None
 
 
 @lru_cache(maxsize=1 << 16)
-def _channel(seed: int, layout_seed: int, steps: int, helpers: int) -> NDArray[np.float64]:
+def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> NDArray[np.float64]:
     return noise.uniforms((2 + steps, helpers), "channel", seed, layout_seed)
 
 
 def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
-    """The channel's draws of decisions (n,): a link is up or down for an episode, jitter is a decision's own.
+    """Return the channel's draws for decisions (n,).
 
-    The key is the seed and the episode's layout, so every condition, prompt and model, frozen and in the
-    closed loop, has the same.
+    A link is up or down for a whole episode; jitter is drawn for each decision. The key is the seed and the
+    episode's layout, so every condition, prompt and model has the same draws, frozen and in the closed loop.
     """
-    seeds, of_seed = np.unique(seed, return_inverse=True)
-    layouts, of_layout = np.unique(layout_seed, return_inverse=True)
-    # By a number each: rows take several times as long to tell apart.
-    pairs, place = np.unique(of_seed * len(layouts) + of_layout, return_inverse=True)
-    which = np.divmod(pairs, max(len(layouts), 1))
-    drawn = zip(seeds[which[0]].tolist(), layouts[which[1]].tolist(), strict=True)
-    of_pairs = np.array([_channel(s, layout, steps, helpers) for s, layout in drawn])
-    of_pairs = of_pairs.reshape(len(pairs), 2 + steps, helpers)
+    seeds, seed_index = np.unique(seed, return_inverse=True)
+    layouts, layout_index = np.unique(layout_seed, return_inverse=True)
+    # One number for each pair: `np.unique` of rows takes several times as long.
+    pairs, pair_of_decision = np.unique(seed_index * len(layouts) + layout_index, return_inverse=True)
+    pair_index = np.divmod(pairs, max(len(layouts), 1))
+    keys = zip(seeds[pair_index[0]].tolist(), layouts[pair_index[1]].tolist(), strict=True)
+    uniforms = np.array([_channel_uniforms(s, layout, steps, helpers) for s, layout in keys])
+    uniforms = uniforms.reshape(len(pairs), 2 + steps, helpers)
     trips = Trips(seed, layout_seed, step, steps)
-    return Draws(of_pairs[place, :2].transpose(0, 2, 1), of_pairs[place, 2 + step], trips)
+    return Draws(
+        uniforms[pair_of_decision, :2].transpose(0, 2, 1), uniforms[pair_of_decision, 2 + step], trips
+    )
 
 
 @lru_cache(maxsize=64)
 def busy_ratio(point: OperatingPoint) -> float:
-    """Channel busy ratio under the background load; NaN where the channel does not know."""
+    """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
     channel = point.channel
     return channel.busy_ratio() if isinstance(channel, Physical) else float("nan")
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:
-    """Numbers of decisions (n,) by name, NaN where unknown."""
+    """Return the numeric columns of decisions (n,) by name; NaN where unknown."""
     c, point = decided.result, decided.point
     anybody = c.on_time.any(axis=-1)
     return {
@@ -309,19 +316,19 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
 
 
 def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
-    """The table of decisions, in the order of episode, step, moment, condition and seed.
+    """Return the table of decisions, sorted by episode, step, moment, condition and seed.
 
     Args:
-        decided: in any order.
+        decided: the decisions, in any order.
         more: further columns (n,), in the order of `decided`.
         actions: meta-actions.
     """
-    first = {id(part.moments): part.moments for part in decided}
-    starts = np.cumsum([0, *map(len, first.values())]).tolist()
-    start = dict(zip(first, starts, strict=False))
-    scenes = [scene for moments in first.values() for scene in moments]
-    places = max(len(scene.viewers) for scene in scenes) - 1
-    helpers = max(places, *(part.said.attackers.shape[1] for part in decided))
+    moments_by_id = {id(part.moments): part.moments for part in decided}
+    starts = np.cumsum([0, *map(len, moments_by_id.values())]).tolist()
+    start = dict(zip(moments_by_id, starts, strict=False))
+    scenes = [scene for moments in moments_by_id.values() for scene in moments]
+    vehicles = max(len(scene.viewers) for scene in scenes) - 1
+    helpers = max(vehicles, *(part.said.attackers.shape[1] for part in decided))
     at = np.concatenate([start[id(part.moments)] + part.due.at for part in decided])
     n_each = [len(part.due.at) for part in decided]
     points = list(dict.fromkeys(part.point.name for part in decided))
@@ -331,7 +338,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         return np.array(list(values))[at]
 
     def widened(arrays: Iterable[Any]) -> Any:
-        return np.concatenate([np.pad(each, ((0, 0), (0, helpers - each.shape[1]))) for each in arrays])
+        return np.concatenate([np.pad(array, ((0, 0), (0, helpers - array.shape[1]))) for array in arrays])
 
     def of_messages(name: str) -> Any:
         return widened(getattr(part.result, name) for part in decided)
@@ -344,20 +351,22 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         "weight": widened([part.result.weights[:, 1:] for part in decided]),
         "trust": of_messages("trust"), "attacker": widened([part.said.attackers for part in decided]),
     }  # fmt: skip
-    voices = [f"voice-{n + 1}" for n in range(helpers - places)]  # of a helper that has several
-    senders = [[*scene.viewers[1:], *[None] * (places + 1 - len(scene.viewers)), *voices] for scene in scenes]
+    voices = [f"voice-{n + 1}" for n in range(helpers - vehicles)]  # an attacker may have several voices
+    senders = [
+        [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices] for scene in scenes
+    ]
     episode, step = (of_scenes(scene.record[name] for scene in scenes) for name in ("episode", "step"))
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]
     order = np.lexsort((point, rank[at], step, episode))
     values = {
-        **{name: np.concatenate([each[name] for each in numbers]) for name in numbers[0]},
+        **{name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]},
         **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
         **more,
         **{
             column: array
-            for name, each in sent.items()
-            for column, array in by_message(name, np.where(asked, each, np.nan)).items()
+            for name, messages in sent.items()
+            for column, array in by_message(name, np.where(asked, messages, np.nan)).items()
         },
         "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
     }  # fmt: skip
@@ -372,7 +381,7 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 
-def _labels(of_scenes: Sequence[str | None], at: Ints, there: Any = True) -> Labels:
+def _labels(of_scenes: Sequence[str | None], at: Ints, mask: Any = True) -> Labels:
     names = list(dict.fromkeys(label for label in of_scenes if label is not None))
     code: dict[str | None, int] = {None: -1, **{name: place for place, name in enumerate(names)}}
-    return Labels(np.where(there, np.array([code[label] for label in of_scenes])[at], -1), names)
+    return Labels(np.where(mask, np.array([code[label] for label in of_scenes])[at], -1), names)

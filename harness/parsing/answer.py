@@ -1,4 +1,4 @@
-"""What an answer-shaped object says in each role: an intent, and a helper's message."""
+"""Read an answer-shaped object in each role: an intent, and a helper's message."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class Answer:
-    """An intent, the sum as stated, a helper's message, and what was mended to read them."""
+    """An intent, its sum as stated, a helper's message, and the repairs that reading them took."""
 
     intent: values.Intent
     mass: float | None
@@ -25,20 +25,20 @@ class Answer:
     repairs: frozenset[Repair]
 
     def mended(self, repair: Repair) -> "Answer":
-        """The same answer with one more repair."""
+        """Return the answer with one more repair."""
         return replace(self, repairs=self.repairs | {repair})
 
 
 def read(members: dict[str, Any], so_far: frozenset[Repair], role: str, actions: Sequence[str]) -> Answer:
-    """What an answer-shaped object means. Raises `Failure` with one of the value statuses."""
+    """Read an answer-shaped object. Raises `Failure` with one of the statuses for values."""
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
     repairs = set(so_far)
     fields, rest = values.sort_fields(members, FIELDS[role], repairs)
-    loose = any(values.match(key, actions) for key in rest)
-    if loose and ("action_distribution" in fields or "recommended_maneuver" in fields):
+    has_loose_actions = any(values.match(key, actions) for key in rest)
+    if has_loose_actions and ("action_distribution" in fields or "recommended_maneuver" in fields):
         raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
-    if loose:
+    if has_loose_actions:
         repairs.add(Repair.UNWRAPPED)
         fields["action_distribution"] = rest
     elif rest:
@@ -60,8 +60,8 @@ def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]
             repairs.add(Repair.BOTH_FORMS)
             maneuver = _maneuver(fields.get("recommended_maneuver", maneuver), actions, repairs)
             if intent[actions.index(maneuver)] < confidence:
-                text = "the recommended maneuver is not the distribution's most probable action"
-                raise Failure(Status.CONFLICTING_ANSWERS, text)
+                detail = "the recommended maneuver is not the distribution's most probable action"
+                raise Failure(Status.CONFLICTING_ANSWERS, detail)
     else:
         for name in ("recommended_maneuver", "confidence"):
             if name not in fields:
@@ -79,7 +79,7 @@ def _helper(fields: dict[str, Any], actions: Sequence[str], repairs: set[Repair]
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
-    """Confidence on the maneuver; what is left is spread evenly over the other actions."""
+    """Return the intent with `confidence` on the maneuver and the rest spread evenly over the others."""
     if len(actions) == 1:
         return (1.0,)
     others = (1 - confidence) / (len(actions) - 1)

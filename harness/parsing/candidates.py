@@ -1,7 +1,7 @@
-"""Every object in a text that could be meant as the answer.
+"""Find every object in a text that could be meant as the answer.
 
-Valid JSON is taken as it stands; only where a brace opens none does the relaxed reader try, and only where
-that finds nothing either, json_repair.
+Valid JSON is taken as it stands. The relaxed reader tries only braces that open no valid JSON, and
+json_repair tries only if neither finds anything.
 """
 
 import html
@@ -15,9 +15,9 @@ from harness.parsing.answer import FIELDS
 from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.values import is_schema, match
 
-_MAX_BROKEN = 200  # braces that open nothing; a text with more is noise, and each costs a try
-_MAX_TRIED = 4_000_000  # characters that these tries may read in all, or a megabyte would take minutes
-_MAX_OBJECTS = 5_000  # no answer has as many
+_MAX_BROKEN = 200  # most braces that open nothing; a text with more is noise, and each costs a try
+_MAX_TRIED = 4_000_000  # most characters that these tries read in total; without it, a megabyte takes minutes
+_MAX_OBJECTS = 5_000  # no answer has so many
 _OPENING = re.compile(r"[{｛]")
 _FENCE = re.compile(r"```[ \t]*[\w+-]*|~~~[ \t]*\w*")
 _STRAY = frozenset("[](){},;:.\"'`*\\")
@@ -25,7 +25,7 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object shaped like an answer, and what it took to read it."""
+    """An object shaped like an answer, and the repairs that reading it took."""
 
     members: dict[str, Any]
     repairs: frozenset[Repair] = frozenset()
@@ -33,15 +33,15 @@ class Candidate:
 
 @dataclass
 class _Objects:
-    """Top-level objects of a text with their spans, and what else was met on the way."""
+    """The top-level objects of a text, by their start, and what could not be read."""
 
     readings: list[tuple[int, relaxed.Reading]] = field(default_factory=list)
-    broken: int | None = None  # first brace that was meant as JSON and cannot be read
+    broken: int | None = None  # the first brace that was meant as JSON and cannot be read
     unfinished: bool = False
 
 
 def whole(text: str, role: str, actions: tuple[str, ...]) -> Candidate | None:
-    """The candidate if the text is one JSON object, shaped like an answer, and nothing else."""
+    """Return the candidate if the text is exactly one JSON object that is shaped like an answer."""
     try:
         value = relaxed.DECODER.decode(text)
     except (ValueError, RecursionError):
@@ -52,17 +52,17 @@ def whole(text: str, role: str, actions: tuple[str, ...]) -> Candidate | None:
 def candidates(
     text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
 ) -> list[Candidate]:
-    """All candidates, in the text's order.
+    """Return all candidates, in the order of the text.
 
     Args:
         text: the answer, without thought and special tokens.
-        role: whose fields to look for.
-        actions: whose names to look for.
-        cut: the engine stopped at its token limit, so an open bracket is never closed here.
-        reasons_first: the prompt asked for reasons before the answer, so prose there is no repair.
+        role: the role whose fields to look for.
+        actions: the actions whose names to look for.
+        cut: whether the engine stopped at its token limit; then an open bracket is never closed.
+        reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
 
     Raises:
-        Failure: no_json, label_only, truncated_json, syntax or, without any candidate, missing_action.
+        Failure: no_json, label_only, truncated_json, syntax, or missing_action if there is no candidate.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)
@@ -73,29 +73,29 @@ def candidates(
         raise Failure(Status.TRUNCATED_JSON, "the text ends inside a JSON value")
 
     shaped: list[Candidate] = []
-    outside, at = [], 0
+    other_text, at = [], 0
     for start, reading in objects.readings:
-        inside = list(_answers(reading.value, role, actions))
-        shaped += [Candidate(members, extra | reading.repairs | escapes) for members, extra in inside]
-        if inside:
-            outside.append(text[at:start])
+        answers = list(_answers(reading.value, role, actions))
+        shaped += [Candidate(members, extra | reading.repairs | escapes) for members, extra in answers]
+        if answers:
+            other_text.append(text[at:start])
             at = reading.end
     if shaped:
-        before, *behind = [*outside, text[at:]]
-        around = _around(before, "\n".join(behind), reasons_first)
-        return [Candidate(one.members, one.repairs | around) for one in shaped]
+        before, *after = [*other_text, text[at:]]
+        around = _repairs_around(before, "\n".join(after), reasons_first)
+        return [Candidate(candidate.members, candidate.repairs | around) for candidate in shaped]
     if objects.broken is not None:
         mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
-        extra = escapes | _around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
-        inside = list(_answers(mended, role, actions))
-        if not inside:
+        extra = escapes | _repairs_around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
+        answers = list(_answers(mended, role, actions))
+        if not answers:
             raise mend.unreadable()
-        return [Candidate(members, nested | extra) for members, nested in inside]
-    raise _nothing(text, bool(objects.readings), actions)
+        return [Candidate(members, nested | extra) for members, nested in answers]
+    raise _no_candidate(text, bool(objects.readings), actions)
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Where in a text the objects stand that `candidates` finds; empty where it takes more than finding."""
+    """Return the spans of a text's candidates; empty if `candidates` must change the text to find any."""
     try:
         objects = _objects(text, cut=False)
     except Failure:
@@ -108,7 +108,7 @@ def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int
 
 
 def _objects(text: str, cut: bool) -> _Objects:
-    """Objects from left to right; a brace that opens none is passed by."""
+    """Read objects from left to right, and skip braces that open none."""
     objects = _Objects()
     at = tries = 0
     most_tries = min(_MAX_BROKEN, _MAX_TRIED // (len(text) + 1))
@@ -133,7 +133,7 @@ def _objects(text: str, cut: bool) -> _Objects:
             if cut or not text.rstrip("` \t\r\n").endswith("}"):
                 objects.unfinished = True
                 return objects
-            at = start + 1  # closed, so not cut off: an opening quote has no partner
+            at = start + 1  # the text ends in a brace, so it is not cut off; a quote has no partner
             objects.broken = start if objects.broken is None else objects.broken
         except relaxed.Broken as error:
             at = start + 1
@@ -152,7 +152,7 @@ def _shaped(value: object, role: str, actions: tuple[str, ...]) -> bool:
 def _answers(
     value: Any, role: str, actions: tuple[str, ...]
 ) -> Iterator[tuple[dict[str, Any], frozenset[Repair]]]:
-    """Answer-shaped objects in a JSON value: itself, or what a wrapper such as a tool call holds."""
+    """Yield answer-shaped objects in a JSON value: the value, or what a wrapper such as a tool call holds."""
     stack = [(value, frozenset[Repair]())]
     while stack:
         node, repairs = stack.pop()
@@ -164,37 +164,37 @@ def _answers(
         if isinstance(node, relaxed.Repeated) or _shaped(node, role, actions) or is_schema(node):
             yield node, repairs
         elif isinstance(node, dict | list):
-            inner = list(node.values()) if isinstance(node, dict) else node
-            stack += [(child, frozenset({Repair.NESTED})) for child in reversed(inner)]
+            children = list(node.values()) if isinstance(node, dict) else node
+            stack += [(child, frozenset({Repair.NESTED})) for child in reversed(children)]
 
 
-def _around(before: str, behind: str, reasons_first: bool) -> frozenset[Repair]:
-    """What the text before the first answer, and all that is behind it and no answer, takes to overlook."""
+def _repairs_around(before: str, after: str, reasons_first: bool) -> frozenset[Repair]:
+    """Return the repairs for the text before the first answer and for the text behind it."""
     if reasons_first:
-        return _outside(behind) | _outside(before) - {Repair.PROSE_AROUND}
-    return _outside(f"{before}\n{behind}")
+        return _repairs_for(after) | _repairs_for(before) - {Repair.PROSE_AROUND}
+    return _repairs_for(f"{before}\n{after}")
 
 
-def _outside(outside: str) -> frozenset[Repair]:
-    bare, fences = _FENCE.subn("", outside)
+def _repairs_for(text: str) -> frozenset[Repair]:
+    unfenced, fences = _FENCE.subn("", text)
     repairs = {Repair.CODE_FENCE} if fences else set()
-    rest = "".join(bare.split())
-    if rest:
-        repairs.add(Repair.STRAY_PUNCTUATION if _STRAY.issuperset(rest) else Repair.PROSE_AROUND)
+    characters = "".join(unfenced.split())
+    if characters:
+        repairs.add(Repair.STRAY_PUNCTUATION if _STRAY.issuperset(characters) else Repair.PROSE_AROUND)
     return frozenset(repairs)
 
 
-def _name(action: str) -> str:
+def _whole_word(action: str) -> str:
     return rf"(?<![A-Za-z0-9_]){re.escape(action)}(?![A-Za-z0-9_])"
 
 
-def _nothing(text: str, objects: bool, actions: tuple[str, ...]) -> Failure:
-    """Why a text without a candidate has none."""
+def _no_candidate(text: str, has_object: bool, actions: tuple[str, ...]) -> Failure:
+    """Return the failure that explains why a text has no candidate."""
     lone = text.strip("".join(_STRAY) + "!?# \t\r\n").casefold()
-    # Where a name stands nowhere, no look at what is around it is needed.
-    named = [a for a in actions if (a in text and re.search(_name(a), text)) or lone == a.casefold()]
+    # A name that is not in the text at all needs no look at what surrounds it.
+    named = [a for a in actions if (a in text and re.search(_whole_word(a), text)) or lone == a.casefold()]
     if len(named) == 1:
         return Failure(Status.LABEL_ONLY, f"only {named[0]} is named, without probabilities")
-    if objects:
+    if has_object:
         return Failure(Status.MISSING_ACTION, "there is a JSON object, but no distribution in it")
     return Failure(Status.NO_JSON, "there is no JSON object in the text")

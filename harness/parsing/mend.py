@@ -1,4 +1,4 @@
-"""The last resort for broken JSON: json_repair, believed only where the text vouches for it."""
+"""Repair broken JSON with json_repair, the last resort; the result counts only if the text confirms it."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from harness.parsing.relaxed import DECODER
 from harness.parsing.status import Failure, Status
 
 _MAX_CHARS = 4000  # json_repair's time grows faster than its input
-# What a repair could take for a number, or drop unseen: operators, comparisons, literals, half a number.
+# What a repair could mistake for a number or drop unseen: operators, comparisons, literals, half a number.
 _AMBIGUOUS = re.compile(
     r"[~≈<>()+*/^=%|]|(?<![\w.])-?(?:true|false|null|none|nan|inf(?:inity)?)\b|\d\s*-|\d\.(?!\d)",
     re.IGNORECASE,
@@ -18,20 +18,20 @@ _NUMBER = re.compile(r"(?<![\w.])-?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?(?![\
 
 
 def unreadable() -> Failure:
-    """The failure of a text that json_repair cannot mend, or mends into something that is no answer."""
+    """Return the failure of a text from which json_repair makes no answer."""
     return Failure(Status.SYNTAX, "a JSON object was begun but cannot be read without guessing")
 
 
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
-    """The broken object that `text` begins with, and the text after it.
+    """Return the broken object at the start of `text`, repaired, and the text after it.
 
-    Believed only if nothing ambiguous stands in it, each name is a key at most once, and the numbers read are
-    the numbers written, in the same order.
+    The object counts only if it holds nothing ambiguous, each name is a key at most once, and the numbers
+    read are the numbers written, in the same order.
 
     Args:
-        text: from the opening brace on.
-        names: keys that count: fields and actions.
-        cut: the engine stopped at its token limit, so nothing is mended.
+        text: the text from the opening brace on.
+        names: the keys that count: fields and actions.
+        cut: whether the engine stopped at its token limit; then nothing is repaired.
 
     Raises:
         Failure: syntax.
@@ -49,13 +49,13 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
             raise unreadable()
     except Failure:
         raise
-    except Exception:  # whatever a third-party reader does with hostile text is a syntax error of the text
+    except Exception:  # any error of a third-party reader is a syntax error of the text
         raise unreadable() from None
     return value, text[len(source) :]
 
 
 def _numbers(value: object) -> list[float]:
-    """Numbers in a JSON value in order, those in keys and texts too, so that none is dropped unseen."""
+    """Return the numbers in a JSON value in order; also those in keys and texts, so that none is lost."""
     if isinstance(value, dict):
         return [number for pair in value.items() for part in pair for number in _numbers(part)]
     if isinstance(value, list):

@@ -1,7 +1,7 @@
-"""From a completion's text to an intent: one status for any text, and nothing mended in silence.
+"""Parse a completion into an intent: any text gets exactly one status, and every repair is recorded.
 
-The order is the rule: the thought is cut off before anything is looked for, valid JSON goes before mended
-JSON, and two answers that differ are no answer.
+The order of the steps is the rule: the thought is cut off before the search for an answer, valid JSON goes
+before repaired JSON, and two answers that differ are no answer.
 """
 
 import re
@@ -20,8 +20,8 @@ from harness.prompts.answer_schema import ROLES
 
 __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
 
-_SAME = 1e-9  # two renderings of one distribution (0.5, 50%) differ by less
-# What all begin with stands first, so that the search passes over all else at once.
+_SAME = 1e-9  # two spellings of one distribution (0.5, 50%) differ by less
+# The class of first characters comes first, so that the search skips everything else at once.
 _SPECIAL = re.compile(
     r"[<\[](?=[|｜/sebpuI])(?:(?<=<)(?:\|im_start\|>assistant|start_of_turn>model"
     r"|\|start_header_id\|>assistant<\|end_header_id\|>|[|｜][^<>{}\n]{1,40}[|｜]>"
@@ -36,16 +36,16 @@ _NO_WIDTHS, _SPACE = re.compile(rf"[{_NO_WIDTH}]+"), re.compile(rf"[{_SPACES}]")
 
 @dataclass(frozen=True)
 class Parsed:
-    """What one completion says.
+    """The result of parsing one completion.
 
     Attributes:
-        status: the one outcome.
-        repairs: what was mended, in the order of `Repair`; empty unless recovered.
+        status: the outcome.
+        repairs: the repairs, in the order of `Repair`; empty unless recovered.
         intent: probabilities in the order of the actions, summing to 1; None if failed.
-        mass: the sum as the model wrote it; None where it wrote none (a recommendation, most failures).
-        message: a helper's evidence, risk, recommended_maneuver and confidence. For a distribution the
+        mass: the sum as the model wrote it; None if it wrote none (a recommendation, most failures).
+        message: a helper's evidence, risk, recommended_maneuver and confidence. For a distribution, the
             maneuver is the most probable action (the first of equals) and the confidence its probability.
-        reasoning: the thought, where there was one; all text if it was never closed.
+        reasoning: the thought, or None; the whole text if the thought was never closed.
         detail: one sentence for people, safe to print.
     """
 
@@ -75,20 +75,19 @@ def parse(
     finish_reason: str = "stop",
     error: str | None = None,
 ) -> Parsed:
-    """Read one completion. Any text gives a `Parsed`; nothing in it can make this raise.
+    """Parse one completion. Any text gives a `Parsed`; no text makes this raise.
 
-    A closed thought is what a thinking model should give, and an empty one is what a template adds, so
-    neither is a repair. A closed thought with content from a model that was not asked to think is one.
+    A closed thought is what a thinking model should write, and an empty one is what a template adds, so
+    neither is a repair. A closed thought with content is one if the model was not asked to think.
 
     Args:
-        text: the completion, untouched.
+        text: the completion as it came.
         role: `ego` or `helper`.
         actions: meta-action names, in the environment's order.
-        thinking: whether the text has to hold a closed thought: the model was asked to think, and the engine
-            did not take the thought out of the text itself.
-        reasons_first: whether the prompt asked for reasons before the answer, in whose prose nothing is
-            then a repair.
-        finish_reason: the engine's; `length` means cut off by the token limit.
+        thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
+            did not take the thought out of the text.
+        reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
+        finish_reason: the engine's finish reason; `length` means that the token limit cut the text off.
         error: the engine's message if it failed.
 
     Raises:
@@ -128,9 +127,9 @@ def parse(
 
 
 def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) -> list[tuple[int, int]]:
-    """Where in a completion its answers stand, for people to see: start and end of each, as `parse` reads it.
+    """Return the start and end of each answer that `parse` finds in a completion, to show them to people.
 
-    Empty where nothing was found, or where the text had to be rewritten before anything was.
+    Empty if there is no answer, or if the text had to be rewritten before one was found.
     """
     try:
         rest = reasoning.split(text, thinking)[1] if text.strip() else ""
@@ -143,7 +142,7 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
 
 
 def _strict(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
-    """The answer if the text is nothing but that and needs no repair."""
+    """Return the answer if the text is nothing else and needs no repair."""
     return fitting(text, role, actions) or _unmended(text, role, actions)
 
 
@@ -160,36 +159,36 @@ def _unmended(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
 
 def _recovered(text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
-    # A narrow space between a number and its unit is good typography in prose, and none of JSON's.
+    # A narrow space between a number and its unit is good typography in prose, so reasons may have one.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
     if zero_width or (reasons_first and _INVISIBLE.search(text)):
         text = _SPACE.sub(" ", _NO_WIDTHS.sub("", text))
     if not text.strip():
         raise Failure(Status.EMPTY, "there is no answer in the text")
-    offered = candidates.candidates(text, role, actions, cut, reasons_first)
-    answer = _choose(offered, role, actions)
+    objects = candidates.candidates(text, role, actions, cut, reasons_first)
+    answer = _choose(objects, role, actions)
     if special:
         answer = answer.mended(Repair.SPECIAL_TOKENS)
     return answer.mended(Repair.INVISIBLE_CHARACTERS) if zero_width else answer
 
 
-def _choose(offered: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
-    """The one answer among the candidates. An echo of the template beside it is no second answer."""
+def _choose(objects: list[Candidate], role: str, actions: tuple[str, ...]) -> Answer:
+    """Return the one answer among the candidates; an echo of the template is not a second answer."""
     answers: list[Answer] = []
     failures: list[Failure] = []
-    for candidate in offered:
+    for candidate in objects:
         try:
             answers.append(read(candidate.members, candidate.repairs, role, actions))
         except Failure as failure:
             failures.append(failure)
     serious = [failure for failure in failures if failure.status is not Status.SCHEMA_ECHO]
     if not answers:
-        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in offered):
-            raise unreadable()  # what is wrong in a guessed object need not be wrong in the text
+        if any(Repair.JSON_REPAIR in candidate.repairs for candidate in objects):
+            raise unreadable()  # an error in a guessed object need not be one of the text
         raise (serious or failures)[-1]
     last = answers[-1]
-    same = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
-    if serious or not same:
+    agree = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
+    if serious or not agree:
         count = len(answers) + len(serious)
         raise Failure(Status.CONFLICTING_ANSWERS, f"{count} answers stand in the text and they differ")
     return last.mended(Repair.REPEATED_ANSWER) if len(answers) > 1 else last

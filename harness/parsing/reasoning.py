@@ -1,8 +1,8 @@
-"""Where the thought ends and the answer begins.
+"""Split a completion into thought and answer.
 
-A draft inside a thought is never an answer, so a thought that is not closed leaves nothing (the rule of
-vLLM's Qwen3 reasoning parser). The names and spellings are those of the Qwen, DeepSeek, Phi, Magistral,
-EXAONE and harmony templates.
+A draft inside a thought is never an answer, so an unclosed thought leaves no answer (the rule of vLLM's Qwen3
+reasoning parser). The names and spellings are those of the Qwen, DeepSeek, Phi, Magistral, EXAONE and harmony
+templates.
 """
 
 import re
@@ -10,8 +10,8 @@ import re
 from harness.parsing.status import Failure, Status
 
 _NAMES = r"(?=[tras])(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analysis|scratchpad)"
-# `<think` may lack its bracket: rather read too much as a thought than too little. What all tags begin with
-# stands first, so that the search passes over all else at once.
+# `<think` may lack its bracket: it is safer to read too much as a thought than too little. The characters
+# that any tag begins with come first, so that the search skips everything else at once.
 _LEFT = r"(?:(?<=[<＜])|(?<=&)lt;)"
 _TAG = re.compile(
     rf"""
@@ -28,17 +28,17 @@ _TAG = re.compile(
 
 
 def split(text: str, thinking: bool) -> tuple[str | None, str]:
-    """The thought, if any, and what is left as the answer.
+    """Return the thought, if any, and the rest as the answer.
 
-    A closing tag without an opening one means that the prompt's template opened the thought: all before
-    it is thought. Text before, between and after closed thoughts is answer.
+    A closing tag without an opening one means that the prompt's template opened the thought: all text before
+    it is thought. Text before, between and after closed thoughts belongs to the answer.
 
     Args:
         text: the completion.
         thinking: whether the model was asked to think; then a text without a closed thought is all thought.
 
     Returns:
-        Thought (None: there was none; empty: an empty block) and answer.
+        The thought (None if there was none, empty for an empty block) and the answer.
 
     Raises:
         Failure: truncated_reasoning.

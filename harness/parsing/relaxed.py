@@ -1,8 +1,8 @@
-"""A reader for almost-JSON that names every liberty it takes and never guesses a value.
+"""Read almost-JSON; every deviation from JSON is recorded as a repair, and no value is guessed.
 
-It reads what small models write by habit: Python dicts, typographic quotes, bare keys, comments, trailing
-commas, percent signs, missing closing brackets. An expression (`1/3`) is kept as text, so that no later
-rule can take it for a number. Numbers and words that touch the end of the text count as cut off.
+It reads what small models often write: Python dicts, typographic quotes, bare keys, comments, trailing
+commas, percent signs, missing closing brackets. An expression (`1/3`) is kept as text, so that no later rule
+takes it for a number. Numbers and words that touch the end of the text count as cut off.
 """
 
 import json
@@ -46,11 +46,11 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f", "\n": ""}
 
 
 class Repeated(dict[str, Any]):
-    """An object that had a key twice; it holds the last value."""
+    """An object in which a key was repeated; it holds the last value."""
 
 
 class Broken(Exception):
-    """The text at this brace cannot be read. `meant` tells broken JSON from a brace in prose."""
+    """The text at this brace cannot be read; `meant` tells broken JSON from a brace in prose."""
 
     def __init__(self, meant: bool) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class Unfinished(Exception):
 
 @dataclass
 class Reading:
-    """A value, where it ends in the text, the liberties taken, and whether the text's end closed it."""
+    """A value, where it ends in the text, the repairs, and whether the end of the text closed it."""
 
     value: Any = None
     end: int = 0
@@ -72,24 +72,24 @@ class Reading:
 
 
 def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """`object_pairs_hook` that does not lose sight of a repeated key."""
+    """An `object_pairs_hook` that marks an object with a repeated key."""
     members = dict(pairs)
     return members if len(members) == len(pairs) else Repeated(members)
 
 
-# An integer read as float has no limit of digits, and one too large is infinite instead of an error.
+# As a float, an integer may have any number of digits; one too large becomes infinite instead of an error.
 DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 
 
 @dataclass(frozen=True)
 class Token:
-    """A piece of text.
+    """A token of the text.
 
     Attributes:
         kind: a group of the pattern; `other` for a character that begins no token, `end` at the text's end.
-        text: as written, but full-width numbers and marks as ASCII.
+        text: the text as written, with full-width numbers and marks as ASCII.
         end: where the next token may begin.
-        repairs: liberties taken up to here.
+        repairs: repairs for the token and the comments before it.
     """
 
     kind: str
@@ -99,7 +99,7 @@ class Token:
 
 
 def next_token(text: str, at: int) -> Token:
-    """The first token at or after `at`; white space and comments are passed over."""
+    """Return the first token at or after `at`; white space and comments are skipped."""
     repairs: frozenset[Repair] = frozenset()
     while True:
         while at < len(text) and text[at].isspace():
@@ -120,12 +120,12 @@ def next_token(text: str, at: int) -> Token:
 
 
 def read(text: str, at: int) -> Reading:
-    """The object that opens at `at`. Raises `Broken` or `Unfinished`."""
+    """Read the object that opens at `at`. Raises `Broken` or `Unfinished`."""
     return _Reader(text, at).run()
 
 
 class _Reader:
-    """Recursive descent with one token of look-ahead."""
+    """A recursive-descent parser with one token of look-ahead."""
 
     def __init__(self, text: str, at: int) -> None:
         self.text = text
@@ -145,8 +145,8 @@ class _Reader:
         return self.last
 
     def _fail(self, token: Token) -> NoReturn:
-        ends = not self.text[token.end :].strip() and token.text not in ("}", "]")
-        if ends or (token.kind == "other" and token.text in "\"'“‘"):
+        is_last = not self.text[token.end :].strip() and token.text not in ("}", "]")
+        if is_last or (token.kind == "other" and token.text in "\"'“‘"):
             raise Unfinished
         raise Broken(self.meant)
 
@@ -200,7 +200,7 @@ class _Reader:
         return items
 
     def _closed(self, closer: str, after_comma: bool) -> bool:
-        """Whether the container ends here, where a member or item may begin."""
+        """Whether the container ends here, where a member or an item may begin."""
         if self.token.kind != "mark" or self.token.text != closer:
             return False
         if after_comma and self.last.text == ",":
@@ -209,7 +209,7 @@ class _Reader:
         return True
 
     def _ends_after_value(self, closer: str) -> bool:
-        """Whether the container ends after a value; takes the comma or closer that stands there."""
+        """Whether the container ends after a value; consumes the comma or the closing bracket there."""
         token = self.token
         if token.kind == "mark" and token.text in (",", closer):
             return self._take().text == closer
@@ -217,7 +217,7 @@ class _Reader:
             self.out.repairs.add(Repair.MISSING_COMMA)
             return False
         last = self.last.kind
-        if token.kind == "end" and last in ("string", "mark"):  # nothing of a quote or bracket can be missing
+        if token.kind == "end" and last in ("string", "mark"):  # a closed string or bracket is complete
             self.out.closed_by_end = True
         elif token.kind != "fence" and not (last == "mark" and token.kind in ("word", "other")):
             self._fail(token)
@@ -235,7 +235,7 @@ class _Reader:
         return re.sub(r"\\(u[0-9a-fA-F]{4}|.)", _unescaped, quoted[1:-1], flags=re.DOTALL)
 
     def _number(self, token: Token) -> float | str:
-        """A number, or a percentage as text. A number without its last digits is never completed."""
+        """Return a number, or a percentage as text; a number that lacks its last digits fails."""
         text = "".join(token.text.split())
         if not _NUMBER.fullmatch(text):
             self._fail(token)

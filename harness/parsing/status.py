@@ -1,11 +1,11 @@
-"""What can be said about a completion: one status, and the repairs it took."""
+"""Define the outcomes of parsing a completion: its status, and the repairs that it took."""
 
 from enum import StrEnum
 from typing import Self
 
 
 class _Documented(StrEnum):
-    """An enum whose members say what they mean."""
+    """An enum whose members have a meaning in words."""
 
     meaning: str
 
@@ -17,7 +17,7 @@ class _Documented(StrEnum):
 
 
 class Status(_Documented):
-    """The one outcome of a completion. All but the first two are failures and give no intent."""
+    """The outcome of a completion. All but the first two are failures and give no intent."""
 
     STRICT = (
         "strict",
@@ -47,7 +47,7 @@ class Status(_Documented):
 
 
 class Repair(_Documented):
-    """What had to be overlooked or mended to read an answer."""
+    """A correction without which an answer cannot be parsed."""
 
     THINK_BLOCK = (
         "think_block",
@@ -87,12 +87,12 @@ class Repair(_Documented):
 
 
 class Failure(Exception):
-    """A completion that gives no intent. Data, not a bug: `parse` turns it into a `Parsed`.
+    """A completion that gives no intent. This is data and no bug: `parse` turns it into a `Parsed`.
 
     Attributes:
-        status: why.
+        status: the reason.
         detail: one sentence for people, safe to print.
-        mass: sum of the probabilities where that is what is wrong.
+        mass: the sum of the probabilities, if the sum is the reason.
     """
 
     def __init__(self, status: Status, detail: str, mass: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The answer that fits as it stands: one typed reading, which costs a third of looking for what to mend."""
+"""Parse an answer that needs no repair in one typed reading, which costs a third of a search for repairs."""
 
 import math
 from functools import lru_cache
@@ -14,9 +14,9 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def fitting(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
-    """The answer if the text is nothing but that, by the published schema and the sum of 1.
+    """Return the answer if the text is nothing else and fits the published schema and the sum of 1.
 
-    None is no verdict: an escape in a text, for one, is left to those who read more slowly.
+    None is no verdict: a text with an escape, for example, is left to the slower readers.
     """
     for decoder, colons in _forms(role, actions):
         try:
@@ -24,7 +24,7 @@ def fitting(text: str, role: str, actions: tuple[str, ...]) -> Answer | None:
         except (ValueError, RecursionError):
             continue
         evidence = answer.evidence if role == "helper" else ""
-        # The reader takes the last of two equal keys, and says nothing; but each key has its colon.
+        # The decoder silently takes the last of two equal keys, so the colons are counted: one for each key.
         if "\\" in text or text.count(":") != colons + evidence.count(":"):
             return None
         return _answer(answer, role, actions)
@@ -57,11 +57,11 @@ def _answer(answer: Any, role: str, actions: tuple[str, ...]) -> Answer | None:
 
 @lru_cache(maxsize=16)
 def _forms(role: str, actions: tuple[str, ...]) -> tuple[tuple[msgspec.json.Decoder[Any], int], ...]:
-    """Readers of the forms that an answer may have, and how many keys each has."""
+    """Return a decoder for each form that an answer may have, and the number of keys of the form."""
     if any(":" in action or "\\" in action for action in actions) or len(set(actions)) < len(actions):
         return ()
-    names = [(f"p{n}", Share, msgspec.field(name=action)) for n, action in enumerate(actions)]
-    shares = msgspec.defstruct("Shares", names, forbid_unknown_fields=True)
+    share_fields = [(f"p{n}", Share, msgspec.field(name=action)) for n, action in enumerate(actions)]
+    shares = msgspec.defstruct("Shares", share_fields, forbid_unknown_fields=True)
     distribution: list[tuple[str, Any]] = [("action_distribution", shares)]
     evidence = Annotated[str, msgspec.Meta(max_length=EVIDENCE_CHARS)]
     report: list[tuple[str, Any]] = [("evidence", evidence), ("risk", Literal[RISKS])]

@@ -1,7 +1,7 @@
-"""What the members of an answer mean: names, numbers, sums.
+"""Read the members of an answer: names, numbers and sums.
 
-The sum is the checksum of a distribution, so it decides: within 0.001 of 1 it is exact, within 0.025 (five
-actions rounded by half a hundredth, and back) it is rounding, beyond that nobody knows which number is wrong.
+The sum is the checksum of a distribution, so it decides. Within 0.001 of 1 it is exact. Within 0.025 (five
+actions rounded by half a hundredth, and back) it is rounding. Beyond, it is unknown which number is wrong.
 """
 
 import math
@@ -14,7 +14,7 @@ from harness.core.errors import printable
 from harness.parsing.relaxed import Repeated
 from harness.parsing.status import Failure, Repair, Status
 
-EXACT = 0.001 + 1e-9  # the slack lets 0.333 * 3 in, whose binary sum is 0.999 less a hair
+EXACT = 0.001 + 1e-9  # the slack admits 0.333 * 3, whose binary sum is slightly below 0.999
 ROUNDED = 0.025 + 1e-9
 
 _NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?")
@@ -28,11 +28,11 @@ Intent = tuple[float, ...]
 
 
 def match(name: str, known: Sequence[str]) -> str | None:
-    """The known name that is meant: the same, or the only one that differs in case and separators."""
+    """Return the known name that is meant: the same, or the only one with other case and separators."""
     if name in known:
         return name
-    near = [other for other in known if _plain(other) == _plain(name)]
-    return near[0] if len(near) == 1 else None
+    similar = [other for other in known if _plain(other) == _plain(name)]
+    return similar[0] if len(similar) == 1 else None
 
 
 def _plain(name: str) -> str:
@@ -42,7 +42,7 @@ def _plain(name: str) -> str:
 def sort_fields(
     members: dict[str, Any], known: Sequence[str], repairs: set[Repair]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Members under their known names, and the rest. Raises duplicate_key, also for two spellings of one."""
+    """Return members by their known names, and the rest. Raises duplicate_key, even for two spellings."""
     if isinstance(members, Repeated):
         raise Failure(Status.DUPLICATE_KEY, "an object has the same key twice")
     fields: dict[str, Any] = {}
@@ -61,15 +61,15 @@ def sort_fields(
 
 
 def distribution(value: object, actions: Sequence[str], repairs: set[Repair]) -> tuple[Intent, float]:
-    """Intent in the order of `actions`, summing to 1, and the sum that was stated.
+    """Return the intent in the order of `actions`, summing to 1, and the sum as stated.
 
     Args:
-        value: what stood where the distribution belongs.
+        value: the value in the place of the distribution.
         actions: meta-action names.
-        repairs: what had to be mended is added here.
+        repairs: receives the repairs.
 
     Raises:
-        Failure: one of the value statuses.
+        Failure: one of the statuses for values.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -90,7 +90,7 @@ def distribution(value: object, actions: Sequence[str], repairs: set[Repair]) ->
     for action, probability in zip(actions, numbers, strict=True):
         check_range(action, probability)
     mass = math.fsum(numbers)
-    # What json_repair mended is believed only for its checksum.
+    # The sum is the only check on what json_repair read, so it must be exact.
     if abs(mass - 1) > (EXACT if Repair.JSON_REPAIR in repairs else ROUNDED):
         raise Failure(Status.BAD_SUM, f"the probabilities sum to {mass:.4g}, not 1", mass)
     if abs(mass - 1) > EXACT:
@@ -99,7 +99,7 @@ def distribution(value: object, actions: Sequence[str], repairs: set[Repair]) ->
 
 
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
-    """A finite number, and whether a percent sign stood behind it."""
+    """Return a finite number, and whether a percent sign followed it. Raises `Failure` for others."""
     percent = False
     if isinstance(value, str):
         text = unicodedata.normalize("NFKC", value).strip()
@@ -122,10 +122,10 @@ def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]
 
 
 def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[float]:
-    """Numbers as fractions: percent only if all say so, or if together they make 100."""
+    """Return numbers as fractions; they are percent only if all say so or if they sum to 100."""
     values = [value for value, _ in numbers]
-    signed = [percent for value, percent in numbers if value]
-    if (any(signed) and all(signed)) or (abs(sum(values) - 100) <= 1 and max(values) > 1):
+    nonzero_percents = [percent for value, percent in numbers if value]
+    if (any(nonzero_percents) and all(nonzero_percents)) or (abs(sum(values) - 100) <= 1 and max(values) > 1):
         repairs.add(Repair.PERCENT)
         return [value / 100 for value in values]
     if any(percent for _, percent in numbers):
@@ -134,18 +134,18 @@ def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[fl
 
 
 def check_range(name: str, value: float) -> None:
-    """Raises out_of_range."""
+    """Raise `Failure` out_of_range unless a value is in 0..1."""
     if not 0 <= value <= 1:
         raise Failure(Status.OUT_OF_RANGE, f"{printable(name, 40)} is {value:.4g}, outside 0..1")
 
 
 def is_placeholder(value: object) -> bool:
-    """Whether a text is what a prompt writes where a number belongs: p1, <number>, 0..1."""
+    """Whether a text is a prompt's placeholder for a number: p1, <number>, 0..1."""
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
 
 
 def is_schema(value: object) -> bool:
-    """Whether an object is a JSON Schema rather than an answer to it."""
+    """Whether an object is a JSON Schema instead of an answer to it."""
     return isinstance(value, dict) and ("$schema" in value or "properties" in value)
 
 

@@ -1,4 +1,4 @@
-"""What moved a run's answers, where `harness attribute` looked: a file beside its tables."""
+"""The file of a run's attribution, which `harness attribute` writes: what moved its answers."""
 
 from pathlib import Path
 from typing import Literal
@@ -10,20 +10,20 @@ FILE = "attribution.json"
 
 
 class LeftOut(Struct, frozen=True, kw_only=True):
-    """One thing that was left out of a prompt, or of what was fused, and what it changed.
+    """One object or message that was left out of a prompt or of the fusion, and what that changed.
 
     Attributes:
         scene: id of the decision point.
-        episode: its number.
-        seed: of the channel's draws of a decision whose message was left out; None otherwise.
-        viewer: whose answer it is; the ego of a policy.
-        role: whose prompt it was left out of, the `ego`'s or a `helper`'s, or `fusion`.
+        episode: the episode's number.
+        seed: seed of the channel's draws, if a message was left out of a decision; None otherwise.
+        viewer: id of the vehicle whose answer changes; that of the ego for a policy.
+        role: what the item was left out of: the prompt of the `ego` or a `helper`, or the `fusion`.
         item: id of the object, or of the helper that sent the message.
         kind: one of `harness.studies.attribution.KINDS`.
-        action: the likeliest with all there.
-        instead: the likeliest without it; None where that answer failed.
-        change: of the probability of `action`; None where that answer failed.
-        shift: total variation between both distributions; None where that answer failed.
+        action: the likeliest action with the item.
+        instead: the likeliest action without it; None if that answer failed.
+        change: change of the probability of `action`; None if that answer failed.
+        shift: total variation between both distributions; None if that answer failed.
     """
 
     scene: str
@@ -40,14 +40,14 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 
 
 class Attribution(Struct, frozen=True, kw_only=True):
-    """All that was left out, one thing at a time.
+    """A run's attribution: every item that was left out, one at a time.
 
     Attributes:
-        condition: the operating point whose decision points were drawn.
-        decision_points: how many were.
-        of: how many the condition came to.
-        sample_seed: of the draw.
-        left_out: what was left out of them.
+        condition: name of the condition whose decision points were drawn.
+        decision_points: how many were drawn.
+        of: how many decision points the condition has.
+        sample_seed: seed of the draw.
+        left_out: the items that were left out.
     """
 
     condition: str
@@ -58,5 +58,5 @@ class Attribution(Struct, frozen=True, kw_only=True):
 
 
 def load(file: Path) -> Attribution:
-    """A run's attribution. Raises OSError or ValueError where it is broken."""
+    """Read a run's attribution. Raises OSError or ValueError if the file is broken."""
     return msgspec.json.decode(file.read_bytes(), type=Attribution)

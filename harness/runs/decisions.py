@@ -1,4 +1,4 @@
-"""The table of decisions: a row a decision point, condition and seed. The file `decisions.parquet`."""
+"""The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -33,27 +33,27 @@ COLUMNS = {
     "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
     "acted": FLAG,
 }  # fmt: skip
-# A file of decisions that know nothing of these lacks them.
+# A file has no such column if all its values are unknown.
 OPTIONAL = ("busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j")
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
-# A column an action: the policy, and the outcome of each action.
+# One column for each action: the policy, and the outcome of the action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
-# A column a message's place, from 1: who was asked, and the fate of the reply.
+# One column for each message, numbered from 1: the helper asked, and what became of its reply.
 OF_MESSAGES = {
     "helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER,
     "trust": NUMBER, "attacker": FLAG,
 }  # fmt: skip
-DECIMALS = {  # that are kept: enough for every figure, and the same on every machine
+DECIMALS = {  # enough for every figure, and few enough to be the same on every machine
     "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
     "airtime_ms": 6, "busy_ratio": 6, "inference_j": 6, "helpers_j": 6, "radio_mj": 6, "waiting_j": 6,
     "arrival_ms": 3, "weight": 6, "trust": 6,
 }  # fmt: skip
 
-ROWS = 2048  # that become mappings at a time
+ROWS = 2048  # how many rows become mappings at a time
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
-    """Names and types of the columns, in the order of the file."""
+    """Return the names and types of the columns, in the order of the file."""
     return pa.schema([
         *COLUMNS.items(),
         *((f"{name}_{action}", kind) for name, kind in OF_ACTIONS.items() for action in actions),
@@ -62,18 +62,18 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
-    """Columns of values (n, A)."""
+    """Return values (n, A) as one column for each action."""
     return {f"{name}_{action}": values[:, place] for place, action in enumerate(actions)}
 
 
 def by_message(name: str, values: Any) -> dict[str, Any]:
-    """Columns of values (n, H)."""
+    """Return values (n, H) as one column for each message."""
     return {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Names (n,), each kept once: `names[code]`, none where a code is negative."""
+    """Names (n,) in a compact form: `names[code]`; a negative code is no name."""
 
     codes: Ints
     names: Sequence[str]
@@ -85,8 +85,8 @@ class Decisions:
 
     Attributes:
         table: the columns of `schema`.
-        actions: meta-actions, in the order of every distribution.
-        helpers: most helpers that a decision point has.
+        actions: the meta-actions, in the order of every distribution.
+        helpers: the most helpers of any decision point.
     """
 
     table: pa.Table
@@ -97,7 +97,7 @@ class Decisions:
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
-        """From arrays and `Labels` (n,) by name; a column that is not given is unknown."""
+        """Make decisions from arrays and `Labels` (n,) by name; a column that is not given is unknown."""
         n = len(columns["seed"])
         fields = schema(actions, helpers)
         arrays = {
@@ -108,7 +108,7 @@ class Decisions:
 
     @classmethod
     def concat(cls, parts: Sequence["Decisions"]) -> "Decisions":
-        """Decisions of the same actions, one after the other."""
+        """Concatenate decisions that have the same actions."""
         actions, helpers = parts[0].actions, max(part.helpers for part in parts)
         tables = pa.concat_tables([part.table for part in parts], promote_options="default")
         return cls(tables.select(schema(actions, helpers).names).unify_dictionaries(), actions, helpers)
@@ -117,48 +117,48 @@ class Decisions:
         return len(self.table)
 
     def __getitem__(self, name: str) -> Floats:
-        """Numbers or flags (n,) as floats; NaN where unknown."""
+        """Return a column of numbers or flags (n,) as floats; NaN where unknown."""
         if name not in self._arrays:
             self._arrays[name] = _values(self.table[name].cast(NUMBER), np.nan, np.float64)
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Whole numbers (n,)."""
+        """Return a column of whole numbers (n,)."""
         return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
-        """Whether a flag is known and true, (n,)."""
+        """Return whether a flag is known and true, (n,)."""
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
-        """A distribution, or the outcome of each action: (n, A)."""
+        """Return the columns of a distribution, or of the outcome of each action, (n, A)."""
         key = f"{name} of actions"
         if key not in self._arrays:
             self._arrays[key] = np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
-        """Numbers or flags of messages, (n, H); NaN where nobody was asked."""
+        """Return the columns of numbers or flags of messages, (n, H); NaN where nobody was asked."""
         columns = [self[f"{name}_{place}"] for place in range(1, self.helpers + 1)]
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Position of each label among `names`, (n,); -1 where there is none. ValueError for any other."""
+        """Return each label's index in `names`, (n,); -1 without a label. Raises ValueError for any other."""
         column = self.table[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}
-        own = column.dictionary.to_pylist()
-        if others := [label for label in own if label not in position]:
-            raise ValueError(f"unknown {name} {others[0]!r}")
-        lookup = np.array([*(position[label] for label in own), -1])
-        return cast(Ints, lookup[_values(column.indices, len(own), np.int32)])
+        labels = column.dictionary.to_pylist()
+        if unknown := [label for label in labels if label not in position]:
+            raise ValueError(f"unknown {name} {unknown[0]!r}")
+        lookup = np.array([*(position[label] for label in labels), -1])
+        return cast(Ints, lookup[_values(column.indices, len(labels), np.int32)])
 
     def labels(self, name: str) -> list[str | None]:
-        """Labels (n,)."""
+        """Return a column of labels (n,)."""
         return cast("list[str | None]", self.table[name].to_pylist())
 
     @cached_property
     def scenes(self) -> dict[str, range]:
-        """The rows of each decision point, in order. Raises ValueError unless they stand together."""
+        """The rows of each decision point, in order. Raises ValueError if they are not adjacent."""
         codes = self.table["scene"].combine_chunks()
         changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]
@@ -173,15 +173,15 @@ class Decisions:
         return ranges
 
     def records(self, start: int, stop: int) -> list[Decision]:
-        """Some rows, one by one."""
-        return [self._record(self._row(place)) for place in range(start, stop)]
+        """Return some rows as records."""
+        return [self._record(self._row(index)) for index in range(start, stop)]
 
-    def _row(self, place: int) -> Mapping[str, Any]:
-        chunk, n = divmod(place, ROWS)
-        if chunk not in self._rows:  # the last is kept, since rows are read in order
+    def _row(self, index: int) -> Mapping[str, Any]:
+        chunk, offset = divmod(index, ROWS)
+        if chunk not in self._rows:  # only the last is kept, since rows are read in order
             self._rows.clear()
             self._rows[chunk] = self.table.slice(chunk * ROWS, ROWS).to_pylist()
-        return self._rows[chunk][n]
+        return self._rows[chunk][offset]
 
     def _record(self, row: Mapping[str, Any]) -> Decision:
         messages = tuple(
@@ -194,88 +194,91 @@ class Decisions:
         return Decision(**{**plain, "fused": fused, "messages": messages})
 
     def infinite(self) -> str | None:
-        """Name of a column with an infinite number; None if there is none."""
+        """Return the name of a column with an infinite number, or None."""
         numbers = [column.name for column in self.table.schema if column.type == NUMBER]
         return next((name for name in numbers if pc.any(pc.is_inf(self.table[name])).as_py()), None)
 
     def take(self, which: Any) -> "Decisions":
-        """Some of the decisions, by their positions."""
+        """Return some of the decisions, by their indices."""
         places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
         return Decisions(self.table.take(places), self.actions, self.helpers)
 
     def replace(self, **columns: Any) -> "Decisions":
-        """The same with other arrays (n,) in some columns."""
+        """Return the decisions with other arrays (n,) in some columns."""
         table = self.table
         for name, values in columns.items():
-            place = table.schema.get_field_index(name)
-            table = table.set_column(place, name, _array(values, table.schema.field(name).type))
+            index = table.schema.get_field_index(name)
+            table = table.set_column(index, name, _array(values, table.schema.field(name).type))
         return Decisions(table, self.actions, self.helpers)
 
     def rounded(self) -> "Decisions":
-        """With the decimals that are kept."""
+        """Return the decisions rounded to `DECIMALS`."""
         decimals = {
-            column: kept
-            for name, kept in DECIMALS.items()
+            column: digits
+            for name, digits in DECIMALS.items()
             for column in self.table.column_names
             if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
         }
-        return self.replace(**{column: self[column].round(kept) for column, kept in decimals.items()})
+        return self.replace(**{column: self[column].round(digits) for column, digits in decimals.items()})
 
     def write(self, path: Path) -> None:
-        """Replace a Parquet file. Equal rows give equal bytes: names are numbered as rows first have them."""
+        """Write a Parquet file. Equal rows give equal bytes: names are numbered in the order of the rows."""
         with replacing(path) as part:
             self._write(part)
 
     def encoded(self) -> bytes:
-        """The bytes that `write` writes."""
+        """Return the bytes that `write` writes."""
         data = BytesIO()
         self._write(data)
         return data.getvalue()
 
-    def _write(self, to: Path | BytesIO) -> None:
+    def _write(self, target: Path | BytesIO) -> None:
         unknown = [name for name in OPTIONAL if self.table[name].null_count == len(self)]
         table = self.table.drop_columns(unknown).combine_chunks()
         columns = [
             column.cast(pa.string()).dictionary_encode() if column.type == LABEL else column
             for column in table.columns
         ]
-        pq.write_table(pa.table(columns, schema=table.schema), to, compression="zstd")
+        pq.write_table(pa.table(columns, schema=table.schema), target, compression="zstd")
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str]) -> "Decisions":
-        """Read a Parquet file. Raises OSError or ValueError if it is none, or has not a run's columns."""
-        with arrow_file(path) as file:  # not read_table, which takes names of folders for columns
+        """Read a Parquet file. Raises OSError or ValueError if it is none or lacks a run's columns."""
+        with arrow_file(path) as file:  # read_table would make columns of folder names
             table = pq.ParquetFile(file).read()
         for name in OPTIONAL:
             if name not in table.column_names:
                 table = table.append_column(name, pa.nulls(len(table), NUMBER))
         helpers = sum(name.startswith("helper_") for name in table.column_names)
-        wanted = schema(actions, helpers)
-        if missing := [name for name in wanted.names if name not in table.column_names]:
+        expected = schema(actions, helpers)
+        if missing := [name for name in expected.names if name not in table.column_names]:
             raise ValueError(f"it lacks {', '.join(missing)}")
         for name in NEVER_UNKNOWN:
             if table[name].null_count:
                 raise ValueError(f"{name} is unknown in some rows")
-        return cls(table.select(wanted.names).cast(wanted).unify_dictionaries(), tuple(actions), helpers)
+        return cls(table.select(expected.names).cast(expected).unify_dictionaries(), tuple(actions), helpers)
 
     def frame(self) -> "pd.DataFrame":
-        """For pandas: names are categories, and what is true, false or unknown stays so."""
+        """Return a pandas table: names are categories, and flags may be unknown."""
         import pandas as pd
 
         return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
 
 
 def arrow_file(path: Path) -> pa.OSFile:
-    """A file open for Arrow's threads, which can abort the process when they let go of one of Python's."""
-    with path.open("rb"):  # which says in few words why a file cannot be opened
+    """Open a file for Arrow.
+
+    Arrow's threads can abort the process when they release a file object of Python; this is Arrow's own.
+    """
+    with path.open("rb"):  # its error says in few words why a file cannot be opened
         return pa.OSFile(os.fsencode(path))
 
 
-# Where pyarrow turns what is not its own into an array, or the reverse, it loads pandas: buffers spare that.
+# pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    """A column of an array or of `Labels`; null where it is NaN or no label."""
+    """Return an array or `Labels` as a column; null for NaN and for no label."""
     if isinstance(values, Labels):
         codes = _of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
         texts = [name.encode() for name in values.names]
@@ -288,18 +291,18 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
     return _of_buffer(numbers, ~np.isnan(numbers), NUMBER).cast(kind)
 
 
-def _of_buffer(values: Any, known: Any, kind: pa.DataType) -> pa.Array:
-    mask = None if known is None else pa.py_buffer(np.packbits(known, bitorder="little"))
+def _of_buffer(values: Any, valid: Any, kind: pa.DataType) -> pa.Array:
+    mask = None if valid is None else pa.py_buffer(np.packbits(valid, bitorder="little"))
     return pa.Array.from_buffers(kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))])
 
 
 def _values(column: Any, unknown: float | int, kind: type) -> Any:
-    """A column's values (n,), `unknown` in place of nulls."""
+    """Return a column's values (n,), with `unknown` for nulls."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     mask, data = array.buffers()
     values: Any = np.frombuffer(data, kind, len(array), array.offset * np.dtype(kind).itemsize)
     if not array.null_count:
         return values
     end = array.offset + len(array)
-    known = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
-    return np.where(known, values, unknown)
+    valid = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
+    return np.where(valid, values, unknown)

@@ -1,4 +1,4 @@
-"""A run's tables as text, for people and other programs. They are written in pieces, whole or not at all."""
+"""Export a run's tables as text files; a file is written in pieces, and appears only once it is complete."""
 
 import csv
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
 from harness.runs.records import TURNS, Answer, Episode
 
-AT_ONCE = 10_000  # decisions that are written together
+AT_ONCE = 10_000  # decisions in a piece
 
 
 def decisions_csv(decisions: Decisions, path: Path) -> Path:
-    """A line a decision, the columns of `decisions.parquet`; nothing where one is unknown."""
+    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`; unknown is empty."""
     plain = pa.schema(
-        (one.name, pa.string() if pa.types.is_dictionary(one.type) else one.type)
-        for one in decisions.table.schema
+        (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
+        for column in decisions.table.schema
     )
     with replacing(path) as part, pacsv.CSVWriter(part, plain) as writer:
         for piece in decisions.table.to_batches(AT_ONCE):
@@ -31,7 +31,7 @@ def decisions_csv(decisions: Decisions, path: Path) -> Path:
 
 
 def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
-    """An object a decision, the columns of `decisions.parquet`; null where one is unknown."""
+    """Write decisions as JSON Lines: one a line, with the columns of `decisions.parquet`; unknown is null."""
     encoder = msgspec.json.Encoder()
     with replacing(path) as part, part.open("wb") as file:
         for piece in decisions.table.to_batches(AT_ONCE):
@@ -40,22 +40,22 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 
 
 def junit(run: Run, path: Path) -> Path:
-    """A test case an episode and condition in JUnit's XML; it fails where a seed has no success."""
-    ends: dict[tuple[str, int], list[Episode]] = {}
-    for end in run.episodes:
-        ends.setdefault((end.condition, end.episode), []).append(end)
+    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails."""
+    episodes: dict[tuple[str, int], list[Episode]] = {}
+    for outcome in run.episodes:
+        episodes.setdefault((outcome.condition, outcome.episode), []).append(outcome)
     cases = []
-    for (condition, episode), by_seed in ends.items():
-        failed = [f"{end.failure} with seed {end.seed}" for end in by_seed if not end.success]
-        of = f"{run.source} · {run.manifest.variant} · {condition}"
-        said = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
-        cases.append(Case(of, f"episode {episode}", said if failed else None))
+    for (condition, episode), by_seed in episodes.items():
+        failed = [f"{outcome.failure} with seed {outcome.seed}" for outcome in by_seed if not outcome.success]
+        group = f"{run.source} · {run.manifest.variant} · {condition}"
+        failure = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
+        cases.append(Case(group, f"episode {episode}", failure if failed else None))
     write_whole(path, test_suite(f"harness {run.manifest.name}", cases))
     return path
 
 
 def answers_csv(answers: Sequence[Answer], actions: Sequence[str], path: Path) -> Path:
-    """A line an answer: the fields of `answers.jsonl`, a column an action for the intent."""
+    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent."""
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]
     unknown = [None] * len(actions)

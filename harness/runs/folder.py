@@ -1,7 +1,7 @@
-"""A run's folder: one writer and one reader, for every world.
+"""Read and write a run's folder; one reader and one writer serve every world.
 
-`answers.jsonl` has an answer a line, `decisions.parquet` a decision a row; `episodes.csv` and `summary.csv`
-follow from them; `run.json` says what all was made of, and is written last.
+`answers.jsonl` has one answer a line, `decisions.parquet` one decision a row. `episodes.csv` and
+`summary.csv` follow from both. `run.json` records the run's settings and origin, and is written last.
 """
 
 import csv
@@ -49,7 +49,7 @@ _BROKEN = (
     ValueError,
     LookupError,
     TypeError,
-    NotImplementedError,  # of Arrow, for a column of another type
+    NotImplementedError,  # Arrow raises it for a column of another type
     RecursionError,
     OverflowError,
     csv.Error,
@@ -61,11 +61,11 @@ _ENCODER = msgspec.json.Encoder()
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. A table is read when it is first asked for; each raises UserError if it is broken.
+    """A finished run; each table is read on first use, and raises UserError if it is broken.
 
     Attributes:
-        path: its folder.
-        manifest: `run.json`.
+        path: the run's folder.
+        manifest: the content of `run.json`.
     """
 
     path: Path
@@ -73,22 +73,22 @@ class Run:
 
     @property
     def world(self) -> World:
-        """Frozen or closed-loop."""
+        """Whether the world is frozen or closed-loop."""
         return "frozen" if isinstance(self.manifest.world, FrozenScenes) else "closed-loop"
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions, in the order of every distribution."""
+        """The meta-actions, in the order of every distribution."""
         return self.manifest.actions
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the operating points, in the run's order."""
+        """The conditions' names, in the run's order."""
         return tuple(str(condition["name"]) for condition in self.manifest.conditions)
 
     @property
     def source(self) -> str:
-        """The source of its episodes, for people."""
+        """The dataset or scenario of the episodes, in words for people."""
         world = self.manifest.world
         return (
             world.name
@@ -98,17 +98,17 @@ class Run:
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """`summary.csv`."""
+        """The rows of `summary.csv`."""
         return self._read("summary.csv", self._scores)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
-        """`episodes.csv`, one of each condition, seed and episode."""
+        """The rows of `episodes.csv`: one for each condition, seed and episode."""
         return self._placed[1]
 
     @property
     def grid(self) -> Grid:
-        """Conditions, seeds and episodes."""
+        """The conditions, seeds and episodes of the run."""
         return self._placed[0]
 
     @cached_property
@@ -117,46 +117,46 @@ class Run:
 
     @cached_property
     def decisions(self) -> Decisions:
-        """`decisions.parquet`: every decision is of an episode of the run."""
+        """The rows of `decisions.parquet`; each belongs to an episode of the run."""
         return self._read("decisions.parquet", self._decisions)
 
     @cached_property
     def answers(self) -> tuple[Answer, ...]:
-        """`answers.jsonl`."""
+        """The lines of `answers.jsonl`."""
         return self._read("answers.jsonl", lambda file: tuple(_answers(file, len(self.actions))))
 
     @cached_property
     def answers_by_scene(self) -> dict[str, list[Answer]]:
-        """The answers of each decision point, in their order."""
+        """The answers of each decision point, in the order of the file."""
         by_scene: dict[str, list[Answer]] = {}
         for answer in self.answers:
             by_scene.setdefault(answer.scene, []).append(answer)
         return by_scene
 
     def agent(self, answer: Answer) -> dict[str, Any]:
-        """Who gave an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
+        """Return the agent of an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
         return self.manifest.agent(self._viewer_place(answer))
 
     def speed(self, answer: Answer) -> Speed:
-        """How fast an answer came on the run's device; the run has a device profile."""
+        """Return the speed of an answer's agent; only for a run with a device profile."""
         return self.manifest.latency.speed(self._viewer_place(answer))
 
     def _viewer_place(self, answer: Answer) -> int:
-        """Of a viewer in its scene, the ego at 0; where all have one agent it is 0."""
+        """Return the place of an answer's viewer, the ego at 0; also 0 if one agent answers for all."""
         if answer.role in ("ego", "merge") or not self.manifest.helpers:
             return 0
-        # A scene's viewers answer in the order in which the agents take them, the ego first.
-        first = [each.viewer for each in self.answers_by_scene[answer.scene] if not each.heard]
-        return first.index(answer.viewer)
+        # The answers of a scene are in the order of its viewers, the ego first.
+        viewers = [other.viewer for other in self.answers_by_scene[answer.scene] if not other.heard]
+        return viewers.index(answer.viewer)
 
     @cached_property
     def attribution(self) -> Attribution | None:
-        """`attribution.json`; None where `harness attribute` did not look."""
-        there = (self.path / attribution.FILE).is_file()
-        return self._read(attribution.FILE, attribution.load) if there else None
+        """The content of `attribution.json`; None if `harness attribute` did not write one."""
+        exists = (self.path / attribution.FILE).is_file()
+        return self._read(attribution.FILE, attribution.load) if exists else None
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """A metric's value in one condition; where it has several intervals, the one over episodes."""
+        """Return a metric's score in one condition; of several intervals, the one over episodes."""
         candidates = [
             s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
@@ -190,11 +190,11 @@ class Run:
             raise ValueError(f"{infinite} is infinite")
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
-        decided = np.sort(places * len(steps) + step, kind="stable")
-        if (decided[1:] == decided[:-1]).any():
+        keys = np.sort(places * len(steps) + step, kind="stable")
+        if (keys[1:] == keys[:-1]).any():
             raise ValueError("a decision is there twice")
-        begun = np.bincount(places, minlength=len(self.episodes))
-        if (begun != [episode.decisions for episode in self.episodes]).any():
+        counts = np.bincount(places, minlength=len(self.episodes))
+        if (counts != [episode.decisions for episode in self.episodes]).any():
             raise ValueError("not every decision of episodes.csv is there")
         return decisions
 
@@ -203,10 +203,10 @@ class Run:
 
 
 def read(path: Path) -> Run:
-    """Read a run folder.
+    """Read a run's folder.
 
     Raises:
-        UserError: it is none, its manifest is broken, or it is of another version.
+        UserError: the folder holds no finished run, or its manifest is broken or of another version.
     """
     file = path / "run.json"
     if not file.is_file():
@@ -235,12 +235,12 @@ def write(
     """Write a run's files, the manifest last.
 
     Args:
-        out: its folder.
-        manifest: `run.json`.
-        decisions: rounded already.
-        episodes: one of each condition, seed and episode.
-        answers: lines of `answers.jsonl`, some at a time.
-        scores: `summary.csv`.
+        out: the run's folder.
+        manifest: the content of `run.json`.
+        decisions: the decisions, already rounded.
+        episodes: one for each condition, seed and episode.
+        answers: the lines of `answers.jsonl`, some at a time.
+        scores: the rows of `summary.csv`.
     """
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
@@ -249,13 +249,13 @@ def write(
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
-    pa.default_memory_pool().release_unused()  # a page is often made next, of tables of its own
+    pa.default_memory_pool().release_unused()  # a report often follows, which needs memory for its own tables
 
 
 def part_files(
     decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer]
 ) -> dict[str, bytes]:
-    """The files of a part of a run, by name. Answers may be in any order."""
+    """Return the files of a part of a run, by name; the answers may be in any order."""
     return {
         "decisions.parquet": decisions.encoded(),
         "answers.jsonl": lines(ordered(answers, decisions)),
@@ -264,7 +264,7 @@ def part_files(
 
 
 def write_part(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write part of a run to a folder of its own, which is there whole or not at all."""
+    """Write a part of a run to its own folder, which exists only once it is complete."""
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)
     for name, data in files.items():
@@ -275,7 +275,7 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
 def read_part(
     part: Path, actions: Sequence[str]
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:  # fmt: skip
-    """What `write_part` wrote. Raises UserError if it is broken."""
+    """Read a part that `write_part` wrote. Raises UserError if it is broken."""
     return whole(part, lambda part: (
         Decisions.read(part / "decisions.parquet", actions), _records(part / "episodes.csv", Episode),
         _FACTS.decode_lines((part / "answers.jsonl").read_bytes()),
@@ -283,36 +283,36 @@ def read_part(
 
 
 def answers_in(part: Path) -> int:
-    """How many answers a part has."""
+    """Return the number of answers in a part."""
     return (part / "answers.jsonl").read_bytes().count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
-    """`answers.jsonl` of a run that has these parts, a part at a time."""
+    """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
     for part in parts:
         yield (part / "answers.jsonl").read_bytes()
 
 
 def lines(answers: Sequence[Answer]) -> bytes:
-    """Lines of `answers.jsonl`."""
+    """Return answers as lines of `answers.jsonl`."""
     return _ENCODER.encode_lines(answers)
 
 
 def ordered(answers: Iterable[Answer], decisions: Decisions) -> list[Answer]:
-    """Answers in the order of their decision points; of each the ego's, the helpers', blind ones', merges.
+    """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
 
-    Those of decision points to which no decision came are left out.
+    Answers for a decision point without a decision are left out.
     """
-    place = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
-    there = (answer for answer in answers if answer.scene in place)
-    return sorted(there, key=lambda answer: (place[answer.scene], answer.heard, answer.role == "blind"))
+    order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
+    reached = (answer for answer in answers if answer.scene in order)
+    return sorted(reached, key=lambda answer: (order[answer.scene], answer.heard, answer.role == "blind"))
 
 
 def dataset_of(run: Run) -> Dataset:
-    """The dataset of a run on frozen scenes, with the same digest.
+    """Return the dataset of a run on frozen scenes.
 
     Raises:
-        UserError: it is not there, or has changed since.
+        UserError: the dataset is missing, or its digest is not that of the run.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
@@ -327,13 +327,13 @@ def dataset_of(run: Run) -> Dataset:
 
 
 def check_scenes(run: Run, dataset: Dataset) -> None:
-    """Raise UserError if a run decided or answered in a scene that its dataset has not."""
+    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset."""
     decided = run.decisions.scenes
-    of_files: dict[str, Iterable[str]] = {
+    scenes_by_file: dict[str, Iterable[str]] = {
         "decisions.parquet": decided,
         "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
     }
-    for file, scenes in of_files.items():
+    for file, scenes in scenes_by_file.items():
         for scene in scenes:
             if scene not in dataset:
                 raise UserError(
@@ -343,14 +343,14 @@ def check_scenes(run: Run, dataset: Dataset) -> None:
 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
-    """Records as CSV: what every line says of the run, and a column a field; nothing where one is None."""
+    """Return records as CSV: the columns of the variant, then a column for each field; None is empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    before = asdict(variant) if variant else {}
-    writer.writerow([*before, *kind.__struct_encode_fields__])
+    variant_columns = asdict(variant) if variant else {}
+    writer.writerow([*variant_columns, *kind.__struct_encode_fields__])
     for record in records:
         values = (getattr(record, name) for name in kind.__struct_fields__)
-        writer.writerow([*before.values(), *("" if value is None else value for value in values)])
+        writer.writerow([*variant_columns.values(), *("" if value is None else value for value in values)])
     return text.getvalue()
 
 
@@ -389,7 +389,7 @@ def _answers(file: Path, actions: int) -> list[Answer]:
 
 
 def whole(file: Path, reader: Callable[[Path], T]) -> T:
-    """A file as its reader returns it. Raises UserError if it is broken."""
+    """Return what `reader` makes of a file. Raises UserError if the file is broken."""
     try:
         with uncollected():
             return reader(file)

@@ -1,4 +1,4 @@
-"""The runs and studies in a folder, from their manifests and summaries alone."""
+"""List the runs and studies in a folder, from their manifests and summaries alone."""
 
 import csv
 import json
@@ -13,7 +13,7 @@ from typing import Any, Literal
 from harness.core.errors import UserError, printable
 from harness.core.formats import CONFIG, FORMAT, READ_BY, SUITE, WORK
 
-DEPTH = 2  # a sweep is in its run's folder, and a closed-loop study's run in the study's
+DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 STUDIES = {
     "sweep.json": "sweep",
@@ -26,7 +26,7 @@ STUDIES = {
     "fidelity.csv": "study",
 }
 SUCCESS, FAILED = "success_rate", "failed_rate_ego"
-UNREAD = 0.5  # least share of failed answers of which a run's headline speaks
+UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
 _BROKEN = (
     OSError,
     ValueError,
@@ -44,22 +44,22 @@ class Listed:
     """One run or study.
 
     Attributes:
-        name: its folder, from the folder that is listed.
-        kind: `eval`, `drive`, `suite`, or of a study one of `STUDIES`; `run` where a broken one does not say.
+        name: its folder, relative to the folder that is listed.
+        kind: `eval`, `drive`, `suite`, or one of `STUDIES`; `run` if it is broken and does not say.
         state: `finished`, `unfinished` or `broken`.
-        date: when it began; of a suite, when the last of its runs did; of a study and a broken run, when
+        date: when it began. For a suite, when the last of its runs began; for a study or a broken run, when
             it was last written.
-        why: of an unfinished one, the option that continues it; of a broken one, the file at fault, and
-            whose format it has where that is an older version's.
-        model: name of its card; of a sweep, its sources.
-        prompt: version; of a suite, those of its families.
-        answer: answer mode.
-        tags: words to find it by.
-        condition: the one of the highest success rate; the first of several.
-        success: that rate, 0 to 1, over episodes; of a suite, the mean over families.
-        low: lower end of its 95 % interval; None where the data cannot bound it.
-        high: upper end.
-        unread: share of the ego's answers that could not be read.
+        why: for an unfinished run, how to continue it; for a broken one, the file at fault, and the version
+            of the harness if the file has an older format.
+        model: name of its card; the sources of a sweep.
+        prompt: the prompt version; those of all families for a suite.
+        answer: the answer mode.
+        tags: words by which to find it.
+        condition: the condition with the highest success rate; the first of several.
+        success: that rate, 0 to 1, over episodes; for a suite, the mean over families.
+        low: lower end of its 95 % interval; None if the data cannot bound it.
+        high: its upper end.
+        unread: share of the ego's answers that could not be parsed.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Listed:
 
 
 def runs(folder: Path) -> list[Listed]:
-    """The runs and studies in a folder, newest first. Links that lead out of it are skipped.
+    """Return the runs and studies in a folder, newest first. Links that lead out of it are skipped.
 
     Raises:
         UserError: there is no such folder.
@@ -89,26 +89,26 @@ def runs(folder: Path) -> list[Listed]:
             f"{printable(folder)} is no folder; give one that holds runs, or make a run with `harness eval`"
         )
     root = os.path.realpath(folder)
-    return sorted(_below(root, root, 0), key=lambda one: (-one.date.timestamp(), one.name))
+    return sorted(_entries(root, root, 0), key=lambda entry: (-entry.date.timestamp(), entry.name))
 
 
-def _below(path: str, root: str, depth: int) -> Iterator[Listed]:
-    found = _one(path, root)
-    if found:
-        yield replace(found, name=os.path.relpath(path, root))
+def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
+    entry = _entry(path, root)
+    if entry:
+        yield replace(entry, name=os.path.relpath(path, root))
     if depth < DEPTH:
         for name in sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else ():
-            inner = os.path.join(path, name)
-            if not name.startswith(".") and os.path.isdir(inner) and _within(inner, root):
-                yield from _below(inner, root, depth + 1)
+            subfolder = os.path.join(path, name)
+            if not name.startswith(".") and os.path.isdir(subfolder) and _within(subfolder, root):
+                yield from _entries(subfolder, root, depth + 1)
 
 
 def _within(path: str, root: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(root)
 
 
-def _one(path: str, root: str) -> Listed | None:
-    """A folder as an entry; None if it is neither a run nor a study."""
+def _entry(path: str, root: str) -> Listed | None:
+    """Return a folder's entry; None if it is neither a run nor a study."""
 
     def has(*names: str) -> bool:
         file = os.path.join(path, *names)
@@ -116,17 +116,17 @@ def _one(path: str, root: str) -> Listed | None:
 
     written = datetime.fromtimestamp(os.stat(path).st_mtime, UTC)
     if has("run.json"):
-        return _finished(path, has("summary.csv"), written)
+        return _finished_entry(path, has("summary.csv"), written)
     if has(WORK, CONFIG):
         try:
-            begun = _json(path, WORK, CONFIG)
-            kind = KINDS[begun["settings"]["world"]["kind"]]
-            made = Listed("", kind, "unfinished", _date(begun["created"]), "the same command continues it")
-            return _described(made, {**begun["settings"], "tags": begun["tags"]})
+            config = _json(path, WORK, CONFIG)
+            kind = KINDS[config["settings"]["world"]["kind"]]
+            entry = Listed("", kind, "unfinished", _date(config["created"]), "the same command continues it")
+            return _with_config(entry, {**config["settings"], "tags": config["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     if has(SUITE):
-        return _suite(path, root, has("summary.csv"), written)
+        return _suite_entry(path, root, has("summary.csv"), written)
     for name, kind in STUDIES.items():
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
@@ -141,7 +141,7 @@ def _one(path: str, root: str) -> Listed | None:
     return None
 
 
-def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
+def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
     listed = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
@@ -150,41 +150,44 @@ def _finished(path: str, has_summary: bool, written: datetime) -> Listed:
         if config["format"] != FORMAT:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
-        listed = replace(_described(listed, config), why="summary.csv")
-        return _summed(path, listed) if has_summary else listed
+        listed = replace(_with_config(listed, config), why="summary.csv")
+        return _with_summary(path, listed) if has_summary else listed
     except _BROKEN:
         return listed
 
 
-def _suite(path: str, root: str, has_summary: bool, written: datetime) -> Listed:
-    """A suite's folder: its runs say what it was made of, and its summary has the means."""
+def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> Listed:
+    """Return the entry of a suite's folder: settings from its runs, means from its summary."""
     listed = Listed("", "suite", "broken", written, SUITE)
     try:
         names = _json(path, SUITE)["families"].values()
-        found = [_one(os.path.join(path, name), root) for name in names if own_name(name)]
-        parts = [one for one in found if one and one.state == "finished"]
+        entries = [_entry(os.path.join(path, name), root) for name in names if own_name(name)]
+        parts = [entry for entry in entries if entry and entry.state == "finished"]
         if not 0 < len(parts) == len(names):
             return listed
         listed = replace(
-            parts[0], kind="suite", state="broken", why="summary.csv", date=max(one.date for one in parts),
-            prompt=" and ".join(dict.fromkeys(str(one.prompt) for one in parts)),
+            parts[0], kind="suite", state="broken", why="summary.csv",
+            date=max(entry.date for entry in parts),
+            prompt=" and ".join(dict.fromkeys(str(entry.prompt) for entry in parts)),
         )  # fmt: skip
-        return _summed(path, listed) if has_summary else listed
+        return _with_summary(path, listed) if has_summary else listed
     except _BROKEN:
         return listed
 
 
 def own_name(name: str) -> bool:
-    """Whether a name is that of a folder in another, and not hidden there."""
+    """Whether a name is a plain name of a visible folder, and no path."""
     return os.path.basename(name) == name and not name.startswith(".")
 
 
-def _summed(path: str, listed: Listed) -> Listed:
-    """The same, finished, with the best condition of its summary."""
+def _with_summary(path: str, listed: Listed) -> Listed:
+    """Return an entry as finished, with the best condition of its summary."""
     with open(os.path.join(path, "summary.csv"), encoding="utf-8") as file:
-        # A summary may have a thousand rows, and a folder a thousand summaries.
-        wanted = (f",{SUCCESS},", f",{FAILED},")
-        head, *lines = [x for n, x in enumerate(file) if n == 0 or any(each in x for each in wanted)]
+        # Parse only the rows needed: a folder may hold a thousand summaries of a thousand rows.
+        markers = (f",{SUCCESS},", f",{FAILED},")
+        head, *lines = [
+            line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
+        ]
     table = list(csv.DictReader([head, *lines]))
     rows = [row for row in table if (row["metric"], row["interval"]) == (SUCCESS, "episodes")]
     best = max(rows, key=lambda row: _number(row["value"]) or 0.0)
@@ -196,9 +199,9 @@ def _summed(path: str, listed: Listed) -> Listed:
     )  # fmt: skip
 
 
-def _described(made: Listed, config: dict[str, Any]) -> Listed:
+def _with_config(entry: Listed, config: dict[str, Any]) -> Listed:
     return replace(
-        made,
+        entry,
         model=" + ".join(str(agent["model"]["name"]) for agent in (config, *config.get("helpers", ()))),
         prompt=str(config["prompt"]["version"]),
         answer=str(config["answer"]),

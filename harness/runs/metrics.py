@@ -1,4 +1,4 @@
-"""The registry of metrics: one entry a metric, with values from the tables of decisions and episodes."""
+"""The registry of metrics: each one's meaning, and its values from decisions or episodes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ from harness.runs.records import Episode
 
 World = Literal["frozen", "closed-loop"]
 SUCCESS, LATENCY = "success_rate", "latency_proxy_ms"
-GAIN = "success_gain_over_"  # and the name of the condition it is over
+GAIN = "success_gain_over_"  # followed by the name of the other condition
 PERCENTILES = (50, 95, 99)
-ALL = "all"  # stands for the condition where a figure does not depend on it
+ALL = "all"  # the condition of a figure that is the same in all of them
 
 
 class Columns(Protocol):
-    """Numbers of decisions (n,) by name, NaN where unknown."""
+    """The numeric columns (n,) of a table of decisions, by name; NaN where unknown."""
 
     def __getitem__(self, name: str, /) -> Floats: ...
 
@@ -41,13 +41,14 @@ class Metric:
     """One metric.
 
     Attributes:
-        name: in tables, with its unit at the end.
-        meaning: for people.
-        decisions: its values (n,), of which an episode has the mean; None for a metric of episodes.
-        episodes: an episode's value; None for a metric of decisions.
-        total: an episode has the sum over its decisions, not the mean.
-        world: where it is known; None for everywhere.
-        optional: a run that knows it nowhere has no row of it.
+        name: its name in tables, with the unit at the end.
+        meaning: its meaning, in words for people.
+        decisions: returns its values for decisions (n,), whose mean is the episode's; None for a metric of
+            episodes.
+        episodes: returns an episode's value; None for a metric of decisions.
+        total: whether an episode has the sum over its decisions instead of the mean.
+        world: the world in which it is known; None for every world.
+        optional: whether a run in which it is nowhere known has no row of it.
     """
 
     name: str
@@ -59,12 +60,12 @@ class Metric:
     optional: bool = False
 
 
-def _ends(name: str, meaning: str, of: Callable[[Episode], bool]) -> Metric:
-    return Metric(name, meaning, episodes=of)
+def _rate(name: str, meaning: str, happened: Callable[[Episode], bool]) -> Metric:
+    return Metric(name, meaning, episodes=happened)
 
 
-def _fails(*how: str) -> Callable[[Episode], bool]:
-    return lambda e: e.failure in how
+def _fails(*failures: str) -> Callable[[Episode], bool]:
+    return lambda e: e.failure in failures
 
 
 def _field(name: str) -> Callable[[Episode], Any]:
@@ -78,19 +79,19 @@ def _column(name: str) -> Callable[[Columns], Floats]:
 METRICS = {
     metric.name: metric
     for metric in (
-        _ends(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
+        _rate(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
               _field("success")),
-        _ends("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
+        _rate("unsafe_rate", "share of episodes that end in a collision, by time-out or off the road",
               lambda e: not e.success and e.failure != "late"),
-        _ends("collision_rate", "share of episodes that end in a collision", _fails("collision")),
-        _ends("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
+        _rate("collision_rate", "share of episodes that end in a collision", _fails("collision")),
+        _rate("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
               lambda e: e.fault == "ego"),
-        _ends("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
+        _rate("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
               _fails("late")),
-        _ends("time_out_rate", "share of episodes in which time runs out before the ego clears the "
+        _rate("time_out_rate", "share of episodes in which time runs out before the ego clears the "
               "intersection",
               _fails("time_out")),
-        _ends("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
+        _rate("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
         Metric("regret_rate", "share of decisions that gave success away, of those in which it was still "
                "possible",
                _column("regret"), world="frozen"),
@@ -161,7 +162,7 @@ METRICS = {
                "kept its own intent", _column("fusion_failed")),
     )
 }  # fmt: skip
-# What a summary has besides, and what it means.
+# Meanings of the figures in a summary that are not metrics.
 DERIVED = {
     "message_count": "number of scheduled replies in the whole run; requests do not count",
     **{f"latency_p{p}_ms": f"{p} % of all decisions are at most this slow" for p in PERCENTILES},
@@ -169,24 +170,24 @@ DERIVED = {
 
 
 def metrics_of(world: World) -> tuple[Metric, ...]:
-    """The metrics that are known in a world."""
+    """Return the metrics that are known in a world."""
     return tuple(metric for metric in METRICS.values() if metric.world in (None, world))
 
 
 def meaning(name: str) -> str:
-    """A metric's meaning; empty for a name that says it all."""
+    """Return the meaning of a figure; empty if its name needs no explanation."""
     metric = METRICS.get(name)
     return metric.meaning if metric else DERIVED.get(name, "")
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Conditions by seeds by episodes, in which every episode has a place.
+    """The grid of conditions, seeds and episodes; each cell is one episode of a run.
 
     Attributes:
-        conditions: names of the operating points.
-        seeds: of the channel's draws.
-        episodes: their numbers.
+        conditions: the conditions' names.
+        seeds: seeds of the channel's draws.
+        episodes: the episodes' numbers.
     """
 
     conditions: tuple[str, ...]
@@ -195,11 +196,11 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(C, S, E)."""
+        """The numbers of conditions, seeds and episodes, (C, S, E)."""
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """The episode of each decision, (n,), counted row by row. ValueError for one outside the grid."""
+        """Return the flat index of each decision's cell, (n,). Raises ValueError for one outside the grid."""
         condition = decisions.codes("condition", self.conditions)
         seed, episode = (
             _position(decisions.whole(name), names)
@@ -208,24 +209,24 @@ class Grid:
         return np.ravel_multi_index((condition, seed, episode), self.shape)
 
     def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
-        """The episodes by place. Raises ValueError if one is missing or there twice."""
-        by_place = {(e.condition, e.seed, e.episode): e for e in episodes}
-        wanted = [(c, s, e) for c in self.conditions for s in self.seeds for e in self.episodes]
-        if len(by_place) != len(episodes) or set(by_place) != set(wanted):
+        """Return the episodes in the order of the cells. Raises ValueError unless each is there once."""
+        by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
+        cells = [(c, s, e) for c in self.conditions for s in self.seeds for e in self.episodes]
+        if len(by_cell) != len(episodes) or set(by_cell) != set(cells):
             raise ValueError("not every episode is there once in every condition and seed")
-        return [by_place[place] for place in wanted]
+        return [by_cell[cell] for cell in cells]
 
 
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Each metric's values, (C, S, E): of an episode's decisions, or the field of the episode's record.
+    """Return each metric's values by episode, (C, S, E).
 
     Args:
-        metrics: which.
-        grid: where each episode stands.
-        decisions: of all episodes.
-        episodes: by place (`Grid.ordered`).
+        metrics: the metrics.
+        grid: the grid of the episodes.
+        decisions: the decisions of all episodes.
+        episodes: the episodes in the order of the grid (`Grid.ordered`).
     """
     places = grid.places(decisions)
 
@@ -239,7 +240,7 @@ def by_episode(
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
-    """A metric of n episodes, (n,), from their decisions, each at its episode's place."""
+    """Return a metric of n episodes, (n,), from decisions; `places` has the episode's index of each."""
     assert metric.decisions
     values = np.asarray(metric.decisions(decisions), dtype=float)
     if not metric.total:
@@ -249,12 +250,12 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Sum of what is known at each of n places, (n,)."""
+    """Return the sum of the known values at each of n places, (n,)."""
     return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
 
 
 def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Mean of what is known at each of n places, (n,); NaN where nothing is."""
+    """Return the mean of the known values at each of n places, (n,); NaN where there is none."""
     known = ~np.isnan(values)
     count = np.bincount(places[known], minlength=n)
     total = sum_by_place(values[known], places[known], n)
@@ -262,48 +263,51 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:
-    """Interval over seeds of a metric's values (S, E), for these episodes."""
+    """Return the interval over seeds of a metric's values (S, E), for these episodes."""
     if is_rate(name):
         return in_range(name, seed_rate_interval(values))
     return in_range(name, seed_interval(known_mean(values, axis=1)))
 
 
 def over_episodes(name: str, values: Floats) -> Estimate:
-    """Interval over episodes of a metric's values (S, E)."""
-    each = known_mean(values, axis=0)
-    return rate_interval(each) if is_rate(name) else in_range(name, episode_interval(each))
+    """Return the interval over episodes of a metric's values (S, E)."""
+    means = known_mean(values, axis=0)
+    return rate_interval(means) if is_rate(name) else in_range(name, episode_interval(means))
 
 
 def difference(name: str, a: Floats, b: Floats, level: float = 0.95) -> Estimate:
-    """Interval over episodes of a metric's a - b, both (E, S)."""
+    """Return the interval over episodes of the difference a - b of a metric, both (E, S)."""
     return rate_difference(a, b, level) if is_rate(name) else episode_interval(a - b, level=level)
 
 
 def p_value(name: str, a: Floats, b: Floats) -> float | None:
-    """Of no difference of a metric's a - b, both (E, S), by the interval of `difference`."""
+    """Return the p-value of no difference a - b, both (E, S), from the interval of `difference`."""
     return multiplicity.p_value(lambda level: difference(name, a, b, level))
 
 
 def is_rate(name: str) -> bool:
-    """Whether a metric is a share of what happened: `effective_loss` is a probability that was computed."""
+    """Whether a metric is a share of events; `effective_loss` is not, it is a computed probability."""
     return name.endswith(("_rate", "_reply_loss"))
 
 
 def in_range(name: str, e: Estimate) -> Estimate:
-    """No metric here is below 0 and no share above 1; Student's t may go beyond."""
-    most = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass")) else np.inf
-    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, most))
+    """Cut an interval to the range of its metric: 0 or more, and at most 1 for a share.
+
+    Student's t may go beyond.
+    """
+    greatest = 1.0 if name.endswith(("_rate", "_ratio", "_loss", "_mass")) else np.inf
+    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, greatest))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 
 
 def percentiles(latency_ms: Floats) -> Floats:
-    """`PERCENTILES` of the latencies (n,) that are known; NaN where none is."""
+    """Return the `PERCENTILES` of the known latencies among (n,); NaN if none is known."""
     measured = latency_ms[~np.isnan(latency_ms)]
     return np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
 
 
 def unit(name: str) -> tuple[float, str, int]:
-    """How a metric is shown: factor, unit, decimals."""
+    """Return how to show a metric: the factor on its value, its unit, and the number of decimals."""
     if "_gain_" in name:
         return 100.0, " points", 1
     if "_rate" in name or name.endswith(("_ratio", "_loss")):
@@ -319,7 +323,7 @@ def unit(name: str) -> tuple[float, str, int]:
 
 
 def label(name: str) -> str:
-    """A metric's name in words; its unit is shown with the value."""
+    """Return a metric's name in words, without the unit, which is shown with the value."""
     for suffix in ("_ms", "_mj", "_j", "_nats", "_s", "_m"):
         name = name.removesuffix(suffix)
     return name.replace("_", " ")

@@ -1,8 +1,8 @@
-"""Latency percentiles: their intervals, and their differences between two runs.
+"""Compute intervals of latency percentiles, and of their differences between two runs.
 
-A percentile is of all decisions or answers of a run: episodes have none of their own that have a mean. The
-interval is a bootstrap: episodes are resampled, each with all that is of it, in two runs the same ones, and
-the ends are percentiles of what the percentile, or B - A, then is (Efron and Tibshirani 1993, chapter 13).
+A percentile is taken over all decisions or answers of a run; it is not a mean of percentiles of episodes. Its
+interval is a percentile bootstrap (Efron and Tibshirani 1993, chapter 13): whole episodes are resampled, the
+same ones in two runs, and the ends are percentiles of the resampled percentile, or of its difference B - A.
 """
 
 import math
@@ -15,82 +15,90 @@ from harness.core.statistics import Estimate, known_mean, resampled
 from harness.runs.metrics import PERCENTILES
 
 RESAMPLES, RESAMPLING_SEED = 999, 0
-AT_ONCE = 4_000_000  # numbers that are laid out together
+AT_ONCE = 4_000_000  # how many numbers are in memory at once
 
-Decided = tuple[Ints, Floats]  # of one seed's decisions, the episode's place and the value
+Decided = tuple[Ints, Floats]  # the episode's index and the value of each decision of one seed
 
 
 def differences(
     a: Sequence[Decided], b: Sequence[Decided], episodes: int
 ) -> Iterator[tuple[int, float, float, Estimate]]:
-    """Of each of `PERCENTILES`: itself, A's, B's, and B - A with its interval over so many episodes.
+    """Yield for each of `PERCENTILES`: the percent, A's value, B's value, and B - A with its interval.
 
-    A run's percentile is the mean over its seeds. An episode that either run knows nothing of in a seed is
-    left out there.
+    A run's percentile is the mean over its seeds. In a seed, an episode without values in either run is left
+    out.
+
+    Args:
+        a: the decisions of run A, for each seed.
+        b: those of run B, for the same seeds.
+        episodes: the number of episodes.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
-    both = [_met(one, other) for one, other in zip(a, b, strict=True)]
-    n = len(set().union(*(set(one[0].tolist()) for one, _ in both)))
+    common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
+    n = len(set().union(*(set(of_a[0].tolist()) for of_a, _ in common)))
     if not n:
         return
-    before, after = (
-        known_mean(np.array([_percentiles(pair[side], weights) for pair in both]), 0) for side in (0, 1)
+    values_a, values_b = (
+        known_mean(np.array([_percentiles(pair[side], weights) for pair in common]), 0) for side in (0, 1)
     )
-    for percent, x, y in zip(PERCENTILES, before, after, strict=True):
+    for percent, x, y in zip(PERCENTILES, values_a, values_b, strict=True):
         estimate = Estimate(float(y[0] - x[0]), *_ends(y - x, n), n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate
 
 
 def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """The 95 % interval of each of `PERCENTILES` of some values, (n,), each of an episode; NaN for none."""
-    names, place = np.unique(episodes, return_inverse=True)
+    """Return the 95 % interval of each of `PERCENTILES` of values (n,), over episodes; NaN if unbounded."""
+    names, index = np.unique(episodes, return_inverse=True)
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)
-    found = _percentiles((place, values), weights)
-    return {p: _ends(each, len(names)) for p, each in zip(PERCENTILES, found, strict=True)}
+    resampled_percentiles = _percentiles((index, values), weights)
+    return {
+        p: _ends(resamples, len(names))
+        for p, resamples in zip(PERCENTILES, resampled_percentiles, strict=True)
+    }
 
 
-def _ends(found: Floats, episodes: int) -> tuple[float, float]:
-    """Where the middle 95 % of the resamples end; NaN where they tell nothing of other episodes."""
-    sampled = found[1:][~np.isnan(found[1:])]
+def _ends(resamples: Floats, episodes: int) -> tuple[float, float]:
+    """Return the ends of the middle 95 % of resamples; NaN for a single episode or if both ends are equal."""
+    sampled = resamples[1:][~np.isnan(resamples[1:])]
     low, high = np.percentile(sampled, (2.5, 97.5)) if episodes > 1 else (math.nan, math.nan)
     return (math.nan, math.nan) if low == high else (float(low), float(high))
 
 
-def _met(a: Decided, b: Decided) -> tuple[Decided, Decided]:
-    """What is known, of the episodes that both know."""
-    (one, other) = ((place[~np.isnan(v)], v[~np.isnan(v)]) for place, v in (a, b))
-    in_both = np.intersect1d(one[0], other[0])
-    kept = [(p[np.isin(p, in_both)], v[np.isin(p, in_both)]) for p, v in (one, other)]
-    return kept[0], kept[1]
+def _common(a: Decided, b: Decided) -> tuple[Decided, Decided]:
+    """Return the known values of both runs, of the episodes in which both have some."""
+    (known_a, known_b) = ((place[~np.isnan(v)], v[~np.isnan(v)]) for place, v in (a, b))
+    in_both = np.intersect1d(known_a[0], known_b[0])
+    shared = [(p[np.isin(p, in_both)], v[np.isin(p, in_both)]) for p, v in (known_a, known_b)]
+    return shared[0], shared[1]
 
 
 def _percentiles(decided: Decided, weights: Ints) -> Floats:
-    """`PERCENTILES` of decisions, each counted as often as its episode: (P, R) from weights (R, E)."""
+    """Return `PERCENTILES` of weighted decisions, (P, R); weights (R, E) count each episode in a resample."""
     parts = math.ceil(len(weights) * max(len(decided[0]), 1) / AT_ONCE)
     return np.hstack([_weighted(decided, part) for part in np.array_split(weights, parts)])
 
 
 def _weighted(decided: Decided, weights: Ints) -> Floats:
-    place, values = decided
+    index, values = decided
     result = np.full((len(PERCENTILES), len(weights)), np.nan)
-    some = weights[:, np.unique(place)].any(axis=1)  # resamples that have a decision at all
+    filled = weights[:, np.unique(index)].any(axis=1)  # resamples that have any decision
     order = np.argsort(values, kind="stable")
-    counted = weights[some][:, place[order]].cumsum(axis=1)
+    counted = weights[filled][:, index[order]].cumsum(axis=1)
     if not counted.size:
         return result
     last = counted[:, -1] - 1
-    # Rows one above the other are one ascending line, in which every row is searched at once.
+    # Each row is lifted above the one before, so that one sorted search serves all rows.
     row, size = np.arange(len(counted)), counted.shape[1]
     lift = row * (last.max() + 2)
-    line = (counted + lift[:, None]).ravel()
+    ascending = (counted + lift[:, None]).ravel()
 
-    def at(k: Ints) -> Floats:
-        """The k-th smallest, from 0."""
-        picked: Floats = values[order][np.searchsorted(line, k + lift, side="right") - row * size]
+    def smallest(k: Ints) -> Floats:
+        """Return the k-th smallest value of each resample, from 0."""
+        picked: Floats = values[order][np.searchsorted(ascending, k + lift, side="right") - row * size]
         return picked
 
     position = np.array(PERCENTILES)[:, None] / 100 * last
     lower = np.floor(position).astype(np.int64)
-    low, high = at(lower), at(np.minimum(lower + 1, last))
-    result[:, some] = low + (high - low) * (position - lower)
+    low, high = smallest(lower), smallest(np.minimum(lower + 1, last))
+    result[:, filled] = low + (high - low) * (position - lower)
     return result

@@ -1,4 +1,4 @@
-"""The records of a run, typed: they own the names of what its files hold. docs/files.md has their meaning."""
+"""Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
 from typing import Annotated, Any, Literal
 
@@ -8,13 +8,13 @@ from harness.core.config import Count, Seconds
 from harness.core.statistics import Estimate
 
 Role = Literal["ego", "helper", "merge", "blind"]
-BLIND = "~blind"  # at the end of an answer's key
-REWRITTEN = "!"  # in a sender's key, before what an attack or a defence makes of its message
-TURNS = ("turns", "first_status", "first_raw")  # what tables say of an answer's turns
+BLIND = "~blind"  # ends the key of a blind helper's answer
+REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
+TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that tables show as columns
 
 
 class FirstTurn(Struct, frozen=True, kw_only=True):
-    """The answer before a repair turn: what was said, how that was parsed, and what it took."""
+    """The answer before a repair turn: its text, how it was parsed, its tokens and its time."""
 
     raw: str
     status: str
@@ -26,37 +26,37 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """One answer of a model: a line of `answers.jsonl`. Tokens and times are those of a repair turn, too.
+    """One answer of a model: a line of `answers.jsonl`; tokens and times include those of a repair turn.
 
     Attributes:
         scene: id of the decision point.
         viewer: id of the vehicle that answered.
         heard: keys of the helpers' answers whose messages were in the prompt of a fusion call.
         role: `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing.
-        raw: the completion, untouched but for lone surrogates, which no file can hold.
+        raw: the completion as it came, except for lone surrogates, which no file can hold.
         finish_reason: `stop`, `length` or `error`.
         error: the engine's message; None if it answered.
         prompt_tokens: tokens in; None if the engine has no tokenizer.
         completion_tokens: tokens out; None if the engine has no tokenizer.
-        seconds: time of this answer where its request was alone; None otherwise.
+        seconds: time of this answer if its request was alone in the engine; None otherwise.
         batch_size: how many requests went through the engine together.
-        label_mass: probability on the letters together, of a read-out; None otherwise.
-        retries: attempts that failed before this one.
-        cached: it comes from the cache.
-        slow_s: seconds that it is declared to take beyond its card's latency.
-        first_token_s: time to its first token, prefill included; None where `seconds` is, or not known, or
-            after a repair turn.
-        token_s: time of each token after the first; None where `first_token_s` is, or there is none.
+        label_mass: probability of all letters together in a read-out; None otherwise.
+        retries: failed attempts before this one.
+        cached: whether it comes from the completion cache.
+        slow_s: declared seconds that it takes beyond its card's latency.
+        first_token_s: time to the first token, prefill included; None if `seconds` is None, if it is unknown,
+            or after a repair turn.
+        token_s: time of each token after the first; None if `first_token_s` is None or no token follows.
         prompt_sha256: digest of the chat messages.
-        status: the parser's one outcome (`harness.parsing.status`).
+        status: the outcome of parsing (`harness.parsing.status`).
         verdict: the status in three classes: `strict`, `recovered` or `failed`.
         repairs: corrections before parsing; empty unless recovered.
         intent: probabilities in the order of the actions; None if failed.
-        mass: their sum as written; None where none was.
+        mass: their sum as written; None if none were written.
         message: the rest of a helper's answer; None if there is none.
         detail: one sentence for people.
-        first: the answer before a repair turn; unset where there was none.
-        image_sha256: digest of the pixels of the picture in its prompt; unset where there was none.
+        first: the answer before a repair turn; unset without one.
+        image_sha256: digest of the pixels of the picture in its prompt; unset without one.
     """
 
     scene: str
@@ -94,29 +94,29 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def first_status(self) -> str | None:
-        """How the first turn was parsed, where there were two."""
+        """How the first turn was parsed; None without a repair turn."""
         return self.first.status if self.first else None
 
     @property
     def first_raw(self) -> str | None:
-        """What the first turn said, where there were two."""
+        """The text of the first turn; None without a repair turn."""
         return self.first.raw if self.first else None
 
     @property
     def id(self) -> str:
-        """Of the request: scene, viewer, the senders heard, and whether it was shown nothing."""
+        """The id of its request: the scene and the answer's key."""
         return f"{self.scene}/{self.key}"
 
     @property
     def key(self) -> str:
-        """Names the answer among those of its decision point."""
+        """The answer's name within its decision point: viewer, senders heard, and whether it was blind."""
         return "+".join((self.viewer, *self.heard)) + (BLIND if self.role == "blind" else "")
 
 
 class AnswerFacts(Struct, frozen=True):
-    """What a run's figures count of an answer, in its own words: all answers of a run fit into memory so.
+    """The fields of `Answer` from which a run's figures are computed.
 
-    The fields are those of `Answer`.
+    Without the texts, all answers of a run fit into memory.
     """
 
     scene: str
@@ -140,13 +140,17 @@ class AnswerFacts(Struct, frozen=True):
 
 
 class Times(Struct, frozen=True, omit_defaults=True):
-    """How long some answers took, each asked alone: how many, and percentiles in seconds.
+    """How long some answers took, each asked alone: their number, and percentiles in seconds.
 
     Attributes:
-        median_ci_s: 95 % interval of the median, over episodes; None where they cannot bound it.
-        p95_ci_s: of the 95th percentile.
-        first_token: the same of the time to first token, where the engine can tell.
-        token: the same of the time per output token.
+        n: number of answers.
+        median_s: the median.
+        p5_s: the 5th percentile.
+        p95_s: the 95th percentile.
+        median_ci_s: 95 % interval of the median, over episodes; None if they cannot bound it.
+        p95_ci_s: 95 % interval of the 95th percentile.
+        first_token: times to the first token, if the engine reports them.
+        token: times per output token, if the engine reports them.
     """
 
     n: int
@@ -160,14 +164,14 @@ class Times(Struct, frozen=True, omit_defaults=True):
 
 
 class Speed(Struct, frozen=True):
-    """How fast a computer answers with a model, alone, and what a token costs; None where it is not known.
+    """How fast a computer answers one request with a model, and the energy of a token; None if unknown.
 
     Attributes:
-        model: whose row of the device profile this is.
-        prefill_tokens_per_s: tokens of a prompt that are read in a second.
-        decode_tokens_per_s: tokens that are written in a second.
-        joules_per_prompt_token: what reading one takes.
-        joules_per_output_token: what writing one takes.
+        model: the model of the row in the device profile.
+        prefill_tokens_per_s: prompt tokens read in a second.
+        decode_tokens_per_s: output tokens written in a second.
+        joules_per_prompt_token: energy to read one token.
+        joules_per_output_token: energy to write one token.
     """
 
     model: str
@@ -178,18 +182,18 @@ class Speed(Struct, frozen=True):
 
 
 class Latency(Struct, frozen=True, omit_defaults=True):
-    """How long inference takes, fixed before a run: it decides who is heard in time.
+    """How long inference takes; it is fixed before a run and decides who is heard in time.
 
     Attributes:
-        source: `card`, `paper`, `declared` (by the user), `measured`, or `device`, where each answer takes
-            what its own tokens take on a declared computer.
+        source: `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer
+            follows from its own tokens on a declared computer.
         basis: where the numbers come from.
-        ego_s: seconds of one inference of the ego; None where the source is `device`, as are the next two.
-        helper_s: of a helper; with several helper models the first one's.
-        fusion_s: of the ego's fusion call.
-        sample: the answers behind a measured time, by role.
-        helpers_s: of each of several helper models; empty where there is one.
-        speeds: of each agent, the ego's first, where the source is `device`.
+        ego_s: seconds of one inference of the ego; None if the source is `device`, like the next two.
+        helper_s: seconds of one inference of a helper; of the first of several helper models.
+        fusion_s: seconds of the ego's fusion call.
+        sample: times of the answers behind a measured latency, by role.
+        helpers_s: seconds of each of several helper models; empty if there is only one.
+        speeds: the speed of each agent, the ego's first, if the source is `device`; else empty.
     """
 
     source: Literal["card", "paper", "declared", "measured", "device"]
@@ -202,30 +206,30 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     speeds: tuple[Speed, ...] = ()
 
     def __post_init__(self) -> None:
-        known = None not in (self.ego_s, self.helper_s, self.fusion_s)
-        if known == (self.source == "device") or bool(self.speeds) != (self.source == "device"):
+        has_seconds = None not in (self.ego_s, self.helper_s, self.fusion_s)
+        if has_seconds == (self.source == "device") or bool(self.speeds) != (self.source == "device"):
             raise ValueError("latency has speeds where its source is device, and else seconds")
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
-        """Seconds of each helper model, who take turns; none where the source is `device`."""
+        """Return the seconds of each helper model, which take turns; empty if the source is `device`."""
         return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
 
     def speed(self, place: int) -> Speed:
-        """Of a scene's viewer at this place, the ego at 0; helpers' agents take turns."""
+        """Return the speed of a scene's viewer at this place, the ego at 0; helpers' agents take turns."""
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
-    """A helper's reply: what became of it, and of what worth it was to the ego.
+    """A helper's reply: whether and when it arrived, and its weight in the policy.
 
     Attributes:
         sender: the helper.
         delivered: whether it arrived.
-        on_time: within the window.
-        arrival_ms: None if lost.
-        weight: in the policy; None if a fusion call answered.
-        trust: how far the consensus rule trusted it, from 0 to 1; None if the rule judges nobody.
+        on_time: whether it arrived within the decision window.
+        arrival_ms: when it arrived, from the start of the decision; None if lost.
+        weight: its weight in the policy; None if a fusion call answered.
+        trust: how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust.
         attacker: whether the sender attacks under this condition.
     """
 
@@ -239,32 +243,32 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
 
 
 class Decision(Struct, frozen=True, kw_only=True):
-    """One decision: a row of `decisions.parquet`, for people and pages; None where unknown.
+    """One decision, a row of `decisions.parquet` as reports use it; None where unknown.
 
     Attributes:
         scene: id of the decision point.
-        episode: its number.
+        episode: the episode's number.
         step: its number in the episode.
         danger: where the hidden danger comes from; None without one.
         condition: name of the operating point.
-        seed: of the channel's draws.
-        action: what was decided.
+        seed: seed of the channel's draws.
+        action: the meta-action that was taken.
         fused: the policy, in the order of the actions.
-        entropy_nats: of the ego's own intent.
+        entropy_nats: entropy of the ego's own intent.
         triggered: whether the ego asked.
-        own_failed: the ego's own answer could not be parsed.
-        own_weight: weight of its intent in the policy; None where a fusion call answered.
-        latency_ms: from seeing to acting.
-        fusion_ms: part of it that fusion takes.
-        deadline_missed: it took longer than the window.
-        messages: replies scheduled.
-        value: whether success was still possible; known of frozen scenes, as are the next four.
-        safe: whether it still is after the action.
-        regret: whether the action gave it away; None where it was gone.
-        delay_s: how much later the action lets the ego be, at best.
+        own_failed: whether the ego's own answer could not be parsed.
+        own_weight: weight of its intent in the policy; None if a fusion call answered.
+        latency_ms: time from seeing to acting.
+        fusion_ms: the part of it that fusion takes.
+        deadline_missed: whether it took longer than the window.
+        messages: the replies that were scheduled.
+        value: whether success was still possible; frozen scenes only, like the next four.
+        safe: whether success is still possible after the action.
+        regret: whether the action gave success away; None if it was not possible before.
+        delay_s: by how much the action puts off the earliest success.
         off_lag: whether the decision took longer or shorter than the dataset's lag, in whole frames.
-        acts_at_s: when it acts; in the closed loop.
-        acted: whether the episode lasted until then; in the closed loop.
+        acts_at_s: when the action takes effect; closed loop only.
+        acted: whether the episode lasted until then; closed loop only.
     """
 
     scene: str
@@ -297,21 +301,21 @@ class Episode(Struct, frozen=True, kw_only=True):
 
     Attributes:
         condition: name of the operating point.
-        seed: of the channel's draws.
-        episode: its number.
-        layout_seed: of the layout.
+        seed: seed of the channel's draws.
+        episode: the episode's number.
+        layout_seed: seed of the layout.
         danger: where the hidden danger comes from; `none` without one.
         success: whether it succeeded.
         failure: how it failed; empty if it did not.
-        delay_s: needless delay in all.
+        delay_s: total needless delay.
         messages: replies scheduled.
         trigger_rate: share of its decisions in which the ego asked.
         latency_ms: mean latency of its decisions.
         deadline_misses: decisions that outlasted the window.
-        time_s: when it was decided.
-        partner: the vehicle the ego collided with.
-        striker: whose front hit.
-        fault: who should have given way.
+        time_s: when the outcome was decided.
+        partner: the vehicle that the ego collided with.
+        striker: the vehicle whose front hit.
+        fault: the vehicle that should have given way.
         least_gap_m: smallest distance to another vehicle's outline.
         hard_brakings: times the ego began to brake harder than 4 m/s².
         other_crashes: vehicles that crashed without the ego.
@@ -345,13 +349,13 @@ class Episode(Struct, frozen=True, kw_only=True):
 
 
 class Variant(Struct, frozen=True):
-    """Who answered, and how they were asked: what every line of a run's CSV files begins with.
+    """The agents of a run, in words: the first columns of every line of its CSV files.
 
     Attributes:
         model: name of the card.
-        prompt: its version.
+        prompt: the prompt version.
         answer: the answer mode.
-        helpers: the same of the helpers, one or several; empty where the ego's model answers for them.
+        helpers: the same for the helpers' agents; empty if the ego's agent answers for them.
     """
 
     model: str
@@ -364,7 +368,7 @@ class Variant(Struct, frozen=True):
 
     @property
     def mix(self) -> str:
-        """The helpers as they are added to a name; empty where the ego's model answers for them."""
+        """The helpers' agents as the end of a name; empty if the ego's agent answers for them."""
         return self.helpers and f" + {self.helpers}"
 
 
@@ -372,12 +376,12 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     """An estimate of a metric: a line of `summary.csv`.
 
     Attributes:
-        condition: name of the operating point, or `all` for what does not depend on it.
+        condition: name of the operating point, or `all` for what is the same in all.
         metric: name of the metric, its unit at the end.
         value: the mean; None if there was nothing to average.
-        low: lower end of the 95 % interval; None where the data cannot bound it.
-        high: upper end.
-        n: units behind it.
+        low: lower end of the 95 % interval; None if the data cannot bound it.
+        high: its upper end.
+        n: number of units.
         n_excluded: units without a value.
         interval: what the units are: `episodes`, `seed means` or `answers`.
     """
@@ -393,7 +397,7 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
     @classmethod
     def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
-        """An estimate as a line; None for NaN."""
+        """Return an estimate as a line, with None for NaN."""
         value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
         return cls(condition, metric, value, low, high, e.n, e.n_excluded, interval)
 
@@ -405,7 +409,7 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
 
 class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True):
-    """Decision trees: a dataset, and which of its episodes: all without `limit` and `selection`."""
+    """The record of a dataset and the episodes walked: all of them without `limit` and `selection`."""
 
     name: str
     sha256: str
@@ -419,9 +423,10 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
 
 
 class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True):
-    """A world that is simulated: episode e has layout seed `first_seed` + e.
+    """The record of a closed-loop world; episode e has layout seed `first_seed` + e.
 
-    Of so many `episodes`; where a sample was drawn, `selection` has how many it is `of`, and the draw.
+    `episodes` is how many were driven. If a sample was drawn, `selection` has the number of episodes that it
+    is drawn from, `of`, and the draw.
     """
 
     scenario: dict[str, Any]
@@ -437,7 +442,7 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):
-    """A channel profile as it was: `harness.radio.profiles.Profile`, with every parameter of its model."""
+    """A channel profile at the time of the run: a `harness.radio.profiles.Profile` with all parameters."""
 
     model: str
     description: str
@@ -451,7 +456,7 @@ Status = Literal["measured", "cited", "modelled", "assumed"]
 
 
 class Constant(Struct, frozen=True):
-    """A number of a device profile, above 0: what it is, and where it comes from."""
+    """A number of a device profile, above 0, and where it comes from."""
 
     value: Annotated[float, Meta(gt=0, description="a number above 0")]
     status: Status
@@ -459,17 +464,17 @@ class Constant(Struct, frozen=True):
 
 
 class DeviceRow(Struct, frozen=True, kw_only=True):
-    """What a device does with one model; None where nobody says.
+    """The rates of a device with one model; None where no source states them.
 
     Attributes:
-        model: its name: that of a card, where there is one.
-        billions: of weights.
+        model: the model's name; that of a card, if there is one.
+        billions: billions of weights.
         precision: number format of the weights.
-        batch_size: requests that went through it together when it was timed.
-        prefill_tokens_per_s: tokens of a prompt that are read in a second.
-        decode_tokens_per_s: tokens that are written in a second, of one request.
-        joules_per_prompt_token: what reading one takes, the device's idling included.
-        joules_per_output_token: what writing one takes, the device's idling included.
+        batch_size: requests that went through the device together when it was timed.
+        prefill_tokens_per_s: prompt tokens read in a second.
+        decode_tokens_per_s: output tokens written in a second for one request.
+        joules_per_prompt_token: energy to read one token, the device's idle draw included.
+        joules_per_output_token: energy to write one token, the device's idle draw included.
     """
 
     model: str
@@ -486,16 +491,16 @@ class Device(Struct, frozen=True, kw_only=True):
     """A file of `devices/`: a computer that vehicles may have.
 
     Attributes:
-        name: of the file.
+        name: the file's name.
         description: one sentence for lists.
-        power_mode: in which it was timed.
-        rows: a model each.
-        scaling: how a model without a row is timed: `weights`, rates inversely proportional to the number of
-            weights, from the nearest row. None refuses it.
-        load_watts: what it draws while it infers; joules a token that a row does not have follow from it.
-        idle_watts: what it draws while it waits.
-        transmit_dbm: radiated power of its radio, where the channel states none.
-        amplifier_efficiency: share of what the radio's amplifier draws that is radiated.
+        power_mode: the power mode in which it was timed.
+        rows: one row for each model.
+        scaling: how a model without a row is timed: `weights` scales the nearest row inversely to the number
+            of weights; None refuses the model.
+        load_watts: its draw while it infers; a row without joules per token gets them from this.
+        idle_watts: its draw while it waits.
+        transmit_dbm: radiated power of its radio, if the channel states none.
+        amplifier_efficiency: the share of the radio amplifier's draw that is radiated.
     """
 
     name: str
@@ -551,34 +556,34 @@ class Manifest(Struct, frozen=True, kw_only=True):
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for where, table, keys in (
+        for table_name, table, keys in (
             ("model", self.model, ("name", "engine")), ("prompt", self.prompt, ("version", "sha256")),
             *(("conditions", point, ("name",)) for point in self.conditions),
             *(("helpers", helper, ("answer",)) for helper in self.helpers),
             *(("helpers", helper.get("model", {}), ("name", "engine")) for helper in self.helpers),
             *(("helpers", helper.get("prompt", {}), ("version", "sha256")) for helper in self.helpers),
         ):  # fmt: skip
-            if lacks := [key for key in keys if not isinstance(table.get(key), str)]:
-                raise ValueError(f"{where}: {lacks[0]} is no text")
+            if missing := [key for key in keys if not isinstance(table.get(key), str)]:
+                raise ValueError(f"{table_name}: {missing[0]} is no text")
         if any(not isinstance(point.get("profile", ""), str | None) for point in self.conditions):
             raise ValueError("conditions: a profile is no text")
         if any(not isinstance(point.get("radio", ""), str) for point in self.conditions):
             raise ValueError("conditions: a radio is no text")
         names = tuple(point["name"] for point in self.conditions)
-        for what, several in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
-            if not 0 < len(several) == len(set(several)):
-                raise ValueError(f"{what}: none, or one twice")
+        for field_name, values in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
+            if not 0 < len(values) == len(set(values)):
+                raise ValueError(f"{field_name}: none, or one twice")
 
     @property
     def variant(self) -> Variant:
-        """Who answered, and how they were asked."""
+        """The agents of the run, in words."""
         helpers = [(h["model"]["name"], h["prompt"]["version"], h["answer"]) for h in self.helpers]
         return Variant(
             self.model["name"], self.prompt["version"], self.answer, " + ".join(map(" · ".join, helpers))
         )
 
     def agent(self, place: int) -> dict[str, Any]:
-        """Who answers for a scene's viewer at this place, as `helpers` has it; the ego is at 0."""
+        """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
         if place and self.helpers:
             return {"image": "own", **self.helpers[(place - 1) % len(self.helpers)]}
         return {k: getattr(self, k) for k in ("model", "prompt", "answer", "thinking", "image")}

@@ -1,4 +1,4 @@
-"""A run as pandas tables, for notebooks and scripts: `harness.load`. Columns: docs/files.md."""
+"""Load a run as pandas tables, for notebooks and scripts: `harness.load`. docs/files.md has the columns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,19 +19,19 @@ TEXT = (
     "model", "prompt", "answer", "condition", "metric", "interval", "danger", "failure", "partner", "striker",
     "fault",
 )  # fmt: skip
-MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")  # what a helper says beside its intent
+MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")  # a helper's answer without its intent
 PLACE = ["scene", "episode", "step", "danger"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """A finished run, frozen or closed-loop. A table is read when it is first asked for.
+    """A finished run, frozen or closed-loop, as tables.
 
-    Every table raises UserError if its file is missing or broken.
+    Each table is read on first use, and raises UserError if its file is missing or broken.
 
     Attributes:
-        path: its folder.
-        config: run.json.
+        path: the run's folder.
+        config: the content of run.json.
     """
 
     path: Path
@@ -40,22 +40,22 @@ class Tables:
 
     @cached_property
     def summary(self) -> "pd.DataFrame":
-        """A row a condition, metric and interval: summary.csv."""
+        """One row for each condition, metric and interval: summary.csv."""
         return self._csv("summary.csv")
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """A row an episode, condition and seed: episodes.csv."""
+        """One row for each episode, condition and seed: episodes.csv."""
         return self._csv("episodes.csv")
 
     @cached_property
     def decisions(self) -> "pd.DataFrame":
-        """A row a decision point, condition and seed: decisions.parquet."""
+        """One row for each decision point, condition and seed: decisions.parquet."""
         return self._run.decisions.frame()
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """A row an answer: answers.jsonl, and where its decision point is."""
+        """One row for each answer: answers.jsonl, with the episode and step of its decision point."""
         import numpy as np
         import pandas as pd
 
@@ -94,10 +94,10 @@ class Tables:
 
 
 def load(run: Path) -> Tables:
-    """A run by its folder.
+    """Load a run from its folder.
 
     Raises:
-        UserError: it is no finished run, or one of another version.
+        UserError: the folder holds no finished run, or one of another version.
     """
     source = read(run)
     return Tables(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)
