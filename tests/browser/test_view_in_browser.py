@@ -61,7 +61,7 @@ def test_two_runs_are_picked_and_compared_by_keyboard_alone(page, address):
     page.get_by_role("button", name="Compare two").focus()
     page.keyboard.press("Enter")
     page.wait_for_url("**/compare?path=*")
-    assert page.locator("h1").inner_text() == "B against A"
+    assert page.locator("h1").inner_text() == "B compared with A"
     page.go_back()
     page.get_by_role("searchbox").fill("second")
     page.keyboard.press("Enter")
