@@ -69,11 +69,12 @@ def test_no_command_drives_layouts_for_two_purposes_together(harness, words, tmp
     assert not list(tmp_path.iterdir())
 
 
-def test_the_model_that_ships_learnt_from_train_seeds():
+def test_the_models_that_ship_learnt_from_train_seeds():
     data = json.loads((ROOT / "models/swarm-tiny/training.json").read_text())["dataset"]
     assert purpose(data["seed"], data["episodes"]) == "train"
-    data = json.loads((ROOT / "models/swarm-tiny-six/training.json").read_text())
-    assert purpose(data["first_seed"], data["layouts"]) == "train"
+    for model in ("swarm-tiny-six", "swarm-tiny-vl"):
+        data = json.loads((ROOT / "models" / model / "training.json").read_text())
+        assert purpose(data["first_seed"], data["layouts"]) == "train"
 
 
 def test_the_readmes_table_is_from_report_seeds():

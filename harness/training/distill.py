@@ -83,7 +83,8 @@ def distill(
     """
     if threads:
         torch.set_num_threads(threads)
-    settings = {**curriculum.settings(), **asdict(plan)}
+    learnt = curriculum.settings()  # once: the base's file may change while this learns from it
+    settings = {**learnt, **asdict(plan)}
     if begun := work.begun(out, work.Begun):
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.Begun(settings=settings)) as place:
@@ -93,18 +94,18 @@ def distill(
             for scenario, prompts in curriculum.prompts.items()
         ]  # fmt: skip
         student = Student(lessons, plan, place, device, curriculum.base)
-        facts = _trained(curriculum, student, out, progress)
+        facts = _trained(learnt, student, out, progress)
         work.tidy(out)
     return facts
 
 
-def _trained(curriculum: Curriculum, student: Student, out: Path, progress: Progress) -> dict[str, Any]:
-    """Train what is missing, and write the model's folder."""
+def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: Progress) -> dict[str, Any]:
+    """Train what is missing, and write the model's folder; its card states what is `learnt` from."""
     plan = student.plan
     curves = {name: student.stage(name, progress) for name in STAGES}
     weights = student.rounded()
     facts = {
-        **curriculum.settings(),
+        **learnt,
         "scenes": {each.scenario.name: len(each.scenes) for each in student.lessons},
         "plan": asdict(plan),
         "parameters": sum(p.numel() for p in student.model.parameters()),
