@@ -192,7 +192,7 @@ class Counting(Perceiving):
 
 def test_the_closed_loop_has_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = Counting({})
-    monkeypatch.setattr(evaluation, "_opened_all", lambda spec: [backend])
+    monkeypatch.setattr(evaluation, "_open_all", lambda spec: [backend])
     loop = live_spec_of(episodes=1, points=(named_point("6g:loss=0"), BLIND), seeds=(0,))
     evaluate(loop, tmp_path / "run", lambda done: None)
     answers = answers_of(tmp_path / "run")

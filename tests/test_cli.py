@@ -183,7 +183,7 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
     said = harness("eval", "--dry-run", "--dataset", small_path, "--limit", "2", "--seeds", "7,9")
     assert (said.code, said.err, os.listdir()) == (0, "", [])
     assert f"{4 * scenes} requests for the {scenes} scenes on the reference drivers' courses" in said.out
-    assert "; would score 3 conditions × 2 seeds; no model was called" in said.out
+    assert "; would score 3 conditions × 2 channel seeds; no model was called" in said.out
     assert "prompt tokens not counted" in said.out
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
