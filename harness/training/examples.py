@@ -8,7 +8,6 @@ import numpy as np
 
 from harness.core import noise
 from harness.core.arrays import Floats
-from harness.core.image import Image
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode
 from harness.prompts.versions import Prompt
@@ -41,7 +40,7 @@ class Question:
     graph: Mapping[str, Any]
     messages: tuple[Mapping[str, str], ...]
     label: Floats
-    image: Image | None = None
+    image: Sight | None = None
 
     @property
     def named(self) -> bool:

@@ -10,7 +10,6 @@ import torch
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.core.image import Image
 from harness.prompts import readout
 from harness.training.answers import answer, evidence, sights
 from harness.training.cells import CLASSES
@@ -18,6 +17,7 @@ from harness.training.examples import Question, alone, excerpts, key, kl_nats, w
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
+from harness.world.perception.camera import Sight
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
 BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be
@@ -189,7 +189,7 @@ class Student:
         return read_out(self.model, samples, self.letters)
 
     def _sample(
-        self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None, image: Image | None
+        self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None, image: Sight | None
     ) -> Sample:
         system, rest = chat(messages)
         if system not in self._shared:

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
 from harness.core.files import replacing
-from harness.core.image import Image
 from harness.training.cells import cells
 from harness.training.model import image_processor
 from harness.training.muon import Muon
@@ -63,7 +62,7 @@ class Sample:
     kind: str
     answer_at: int
     target: Floats | None
-    image: Image | None = None
+    image: Sight | None = None
 
 
 @dataclass(frozen=True)
@@ -193,10 +192,12 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
     """KL of the read-out to its target (nats), plus cross-entropies of text and of pictures, each a mean."""
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_input_embeddings().weight, hidden.device, batch[0].shared
-    picture = getattr(model.config, "image_token_id", None)
-    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, picture)
-    if any(s.image is not None for s in batch):
-        total = total + CELLS_WEIGHT * _cells_loss(hidden, weight[digits], batch, picture)
+    rest = _padded([s.ids[shared:] for s in batch]).to(device)
+    picture = rest == getattr(model.config, "image_token_id", -1)  # a model of texts has no such token
+    pictures = [s.image for s in batch if s.image is not None]  # of all or of none
+    total = PROMPT_WEIGHT * _prompt_loss(hidden, weight, batch, rest, picture)
+    if pictures:
+        total = total + CELLS_WEIGHT * _cells_loss(hidden[picture] @ weight[digits].T, pictures)
     targets = {i: s.target for i, s in enumerate(batch) if s.target is not None}
     if targets:
         reading = list(targets)
@@ -207,7 +208,7 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
         kl = F.kl_div(F.log_softmax(logits[:, letters], -1), target, reduction="batchmean")
         # Beside the letters nothing should be likely where a letter is asked for.
         outside = torch.logsumexp(logits, -1) - torch.logsumexp(logits[:, letters], -1)
-        kl_weight = SEEN_WEIGHT if batch[0].image else 1.0  # all of a kind have a picture, or none has
+        kl_weight = SEEN_WEIGHT if pictures else 1.0
         total = total + (kl_weight * kl + 0.1 * outside.mean()) * len(reading) / len(batch)
     said = [(i, s.answer_at + (s.target is not None), len(s.ids)) for i, s in enumerate(batch)]
     writing = [(i, start, end) for i, start, end in said if start < end]
@@ -221,28 +222,22 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any) -> A
     return total
 
 
-def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], picture: int | None) -> Any:
+def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, picture: Any) -> Any:
     """Cross-entropy of the prompt's own tokens behind the shared ones: it teaches to read numbers.
 
-    The token that stands for a `picture` is none of them.
+    Tokens that stand for a `picture` are none of them; like `ids`, that mask is (n, longest rest).
     """
-    shared = batch[0].shared
-    ids = _padded([s.ids[shared:] for s in batch]).to(hidden.device)
     places = torch.arange(ids.shape[1])
-    ends = torch.tensor([s.answer_at - shared for s in batch])
-    there = (places[None, 1:] < ends[:, None]).to(hidden.device)
-    if picture is not None:
-        there &= ids[:, 1:] != picture
+    ends = torch.tensor([s.answer_at - s.shared for s in batch])
+    there = (places[None, 1:] < ends[:, None]).to(hidden.device) & ~picture[:, 1:]
     return F.cross_entropy((hidden[:, :-1][there]) @ weight.T, ids[:, 1:][there])
 
 
-def _cells_loss(hidden: Any, of_digits: Any, batch: Sequence[Sample], picture: int | None) -> Any:
-    """Cross-entropy of what the tokens of pictures show, vehicles and nobody weighing alike."""
-    ids = _padded([s.ids[s.shared :] for s in batch])
-    logits = hidden[(ids == picture).to(hidden.device)] @ of_digits.T
-    shown = np.concatenate([cells(s.image) for s in batch if isinstance(s.image, Sight)])
-    target = torch.from_numpy(shown).to(hidden.device)
-    weight = torch.full((len(of_digits),), 1.0 / max(1, int((shown > 0).sum())), device=hidden.device)
+def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
+    """Cross-entropy of what each token of the pictures shows, vehicles and nobody weighing alike."""
+    shown = np.concatenate([cells(picture) for picture in pictures])
+    target = torch.from_numpy(shown).to(logits.device)
+    weight = torch.full((logits.shape[1],), 1.0 / max(1, int((shown > 0).sum())), device=logits.device)
     weight[0] = 1.0 / max(1, int((shown == 0).sum()))
     return F.cross_entropy(logits, target, weight=weight, reduction="sum") / 2
 
