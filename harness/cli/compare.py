@@ -51,9 +51,9 @@ def command(
     if html:
         from harness.report.compare import page
 
-        save(page.render(difference, verdicts, show, page.beside(html)), html, "--html")
+        save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
     if junit:
-        save(text.junit(difference, verdicts), junit, "--junit")
+        save([text.junit(difference, verdicts)], junit, "--junit")
     if as_json:
         echo_json(text.mapping(difference, verdicts, show))
     else:

@@ -18,6 +18,7 @@ else:  # typer takes any text; what is evaluated says which are allowed
     AnswerMode = ImageMode = str
 
 MOST_SEEDS = 1000
+_RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 
 Runs = Annotated[list[Path], Argument(help="One or more folders of finished runs.", metavar="RUN...")]
 Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds the runs.")]
@@ -128,25 +129,21 @@ Servers = Annotated[
 ]
 Workers = Annotated[
     str,
-    Option(
-        metavar="WHO",
-        help="Number of worker processes, or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT.",
-    ),
+    Option(metavar="WHO", help=f"Number of worker processes, {_RAY}"),
 ]
 ModelWorkers = Annotated[
     str,
     Option(
         metavar="WHO",
-        help="Number of worker processes, each of which loads the model, or a Ray cluster: ray, "
-        "ray://HOST:PORT or ray:HOST:PORT.",
+        help=f"Number of worker processes, each of which loads the model, {_RAY}",
     ),
 ]
 RuleWorkers = Annotated[
     str | None,
     Option(
         metavar="WHO",
-        help="Number of worker processes, or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT. For rules "
-        "such as proxy only; used on more than 256 layouts. Default: 2.",
+        help=f"Number of worker processes, {_RAY} For rules such as proxy only; used on more than 256 "
+        "layouts. Default: 2.",
     ),
 ]
 Shard = Annotated[

@@ -108,7 +108,7 @@ def _group(lines: Sequence[Line], metric: str, condition: str | None) -> Group:
 
 def write(groups: Sequence[Group], metric: str, out: Path) -> None:
     """Write the page. Raises UserError if `out` cannot be written."""
-    save(render(groups, metric, beside(out)), out, "--html")
+    save([render(groups, metric, beside(out))], out, "--html")
 
 
 def render(groups: Sequence[Group], metric: str, place: Place) -> str:

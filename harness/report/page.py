@@ -56,11 +56,11 @@ def write_report(
     return out
 
 
-def save(page: Iterable[str], out: Path, option: str) -> None:
-    """Write a page, whole or in pieces, where an option says. Raises UserError if it cannot be written."""
+def save(pieces: Iterable[str], out: Path, option: str) -> None:
+    """Write the pieces of a page where an option says. Raises UserError if it cannot be written."""
     try:
         with replacing(out) as part, part.open("w", encoding="utf-8", newline="") as file:
-            file.writelines([page] if isinstance(page, str) else page)
+            file.writelines(pieces)
     except OSError as error:
         raise UserError(
             f"{option} {printable(out)} cannot be written ({error.strerror}); name another file"

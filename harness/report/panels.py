@@ -52,8 +52,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "success-latency", "overview", "Success and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
             "the paper reports, with other scenes and another model. A reply that arrives after the "
-            "decision window "
-            "is not fused." + (
+            "decision window is not fused." + (
                 " Dashed: reference drivers, which need no model, in the same episodes." if references else ""
             ),
             charts.success_latency(rows, references, windows_ms),

@@ -107,7 +107,7 @@ def seeds_of(run: Run) -> str:
 
 def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
     """Write the page of one suite's run, or of several. Raises UserError if `out` cannot be written."""
-    save(render(suites, beside(out)), out, "--out")
+    save([render(suites, beside(out))], out, "--out")
     return out
 
 
