@@ -23,7 +23,7 @@ __all__ = ["Parsed", "Repair", "Status", "parse", "spans"]
 _SAME = 1e-9  # two spellings of one distribution (0.5, 50%) differ by less
 # The class of first characters comes first, so that the search skips everything else at once.
 _SPECIAL = re.compile(
-    r"[<\[](?=[|｜/sebpuI])(?:(?<=<)(?:\|im_start\|>assistant|start_of_turn>model"
+    r"[<\[](?=[|｜sebpuI]|/[sI])(?:(?<=<)(?:\|im_start\|>assistant|start_of_turn>model"
     r"|\|start_header_id\|>assistant<\|end_header_id\|>|[|｜][^<>{}\n]{1,40}[|｜]>"
     r"|/?s>|eos>|bos>|pad>|unk>|end_of_turn>)|(?<=\[)/?INST\])"
 )

@@ -15,7 +15,7 @@ _NAMES = r"(?=[tras])(?:think(?:ing)?|thoughts?|reason(?:ing)?|reflection|analys
 _LEFT = r"(?:(?<=[<＜])|(?<=&)lt;)"
 _TAG = re.compile(
     rf"""
-    [<&＜\[] (?=[\s|\\/lctras]) (?:
+    [<&＜\[] (?=[\s|\\lctras]|/[\stras]) (?:
     (?P<close> {_LEFT}\|?\s*\\?/\s*{_NAMES}\s*\|?(?:>|&gt;|＞) | (?<=\[)\s*/\s*think\s*\]
              | (?<=<)\|channel\|>\s*final | (?<=<)channel\|> )
   | (?P<open>  {_LEFT}\|?\s*(?:{_NAMES}\b[^<>&＞{{}}\n]*(?:>|&gt;|＞) | think(?:ing)?\b)
@@ -49,7 +49,7 @@ def split(text: str, thinking: bool) -> tuple[str | None, str]:
     closed = False
     for tag in _TAG.finditer(text):
         piece, at = text[at : tag.start()], tag.end()
-        if tag["open"]:
+        if tag.lastgroup == "open":
             (thoughts if depth else answers).append(piece)
             depth += 1
             continue

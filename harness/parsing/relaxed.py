@@ -15,10 +15,11 @@ from harness.parsing.status import Repair
 
 MAX_DEPTH = 32
 
-_DIGITS = r"(?:\d+(?:[.．]\d*)?|[.．]\d+)(?:[eE][-+]?\d*)?"
+# Possessive: no digit is given back, which would take a second look at each.
+_DIGITS = r"(?:\d++(?:[.．]\d*+)?|[.．]\d++)(?:[eE][-+]?\d*+)?"
 _TOKEN = re.compile(
     rf"""
-    (?P<comment> //[^\n]* | /\*.*?\*/ | \#[^\n]* )
+    (?P<comment> (?: (?: //[^\n]*+ | /\*.*?\*/ | \#[^\n]*+ ) \s*+ )++ )
   | (?P<string> "(?:[^"\\]++|\\.)*+" | '(?:[^'\\]++|\\.)*+' | `[^`]+`(?!`)
               | [“”„‟＂][^“”„‟＂"\\]*[“”„‟＂"] | [‘’‚][^‘’‚\\]*[‘’] )
   | (?P<expression> [-+]?{_DIGITS}\s*%?(?:\s*(?:\*\*|[-+*/^])\s*[-+(]*{_DIGITS}\s*%?\)*)+ )
