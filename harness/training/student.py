@@ -129,9 +129,12 @@ class Student:
         with_heard = self.reading(self.heard)
         if stage == "messages":
             return with_heard + self.some(self.asked, len(self.heard))
-        count = self.plan.samples["answers"]
-        stated = self.some(list(zip(self.questions, self.asked, strict=True)), count // 3)
-        stated += self.some(list(zip(self.heard, with_heard, strict=True)), count // 6)
+        # As many texts of the ego alone, and with messages, as of helpers: the ego's are what is driven.
+        pairs = list(zip(self.questions, self.asked, strict=True))
+        kinds = [[pair for pair in pairs if pair[0].graph["role"] == role] for role in ("helper", "ego")]
+        kinds.append(list(zip(self.heard, with_heard, strict=True)))
+        most = self.plan.samples["answers"] // 6
+        stated = [pair for kind in kinds for pair in self.some(kind, most)]
         texts = self.writing([q for q, _ in stated], self.read([sample for _, sample in stated]))
         return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
 
