@@ -197,7 +197,7 @@ def check(
                     c.curve.configuration or c.curve.source,
                     str(len(c.reception)),
                     f"{100 * c.mean_difference:.1f}",
-                    f"{100 * c.largest_difference:+.1f}",
+                    f"{100 * c.largest_difference:+z.1f}",
                 )
                 for c in of_others
             ],

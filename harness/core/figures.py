@@ -30,5 +30,5 @@ def interval(
 ) -> str:
     """Format `value [low, high]`; a dash stands for each number that is not known."""
     ends = (math.nan if number is None else number for number in (value, low, high))
-    numbers = ("–" if math.isnan(number) else f"{scale * number:.{decimals}f}" for number in ends)
+    numbers = ("–" if math.isnan(number) else f"{scale * number:z.{decimals}f}" for number in ends)
     return "{} [{}, {}]".format(*numbers)

@@ -19,8 +19,8 @@ from harness.runs.suite import SuiteRun
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number with so many decimals; a dash for None."""
-    return "–" if value is None else f"{value:.{digits}f}"
+    """A number with so many decimals, never -0; a dash for None."""
+    return "–" if value is None else f"{value:z.{digits}f}"
 
 
 def shown(score: Score) -> dict[str, str]:

@@ -155,7 +155,7 @@ def headline(result: Fidelity) -> list[str]:
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
     sentences = [
-        f"Largest difference, frozen minus closed loop: {points:+.1f} points [{low:+.1f}, {high:+.1f}], "
+        f"Largest difference, frozen minus closed loop: {points:+z.1f} points [{low:+z.1f}, {high:+z.1f}], "
         f"{worst['model']} {worst['prompt']} under {worst['condition']}, n = {worst['n']} episodes."
     ]
     if not np.isnan(result.rank):

@@ -142,7 +142,7 @@ def shown(row: Any) -> dict[str, Any]:
         "what": " ".join(filter(None, (row.condition, f"{row.variable}{value}", f"{row.metric}{unit}"))),
         "paper": theirs,
         "ours": "" if cited else interval(row.ours, row.ci_low, row.ci_high),
-        "off": "" if cited else f"{row.difference:+.1f}",
+        "off": "" if cited else f"{row.difference:+z.1f}",
         "allowed": "" if cited else f"{row.allowed:.1f}",
         "kind": row.kind,
         "verdict": row.verdict,

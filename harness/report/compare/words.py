@@ -61,8 +61,7 @@ def line(d: Difference) -> Line:
             return "–"
         least = 3 - math.floor(math.log10(max(abs(value * factor), 1e-9)))
         places = min(digits, least)
-        # 0.0 is added so that there is no -0.0.
-        return f"{round(value * factor, places) + 0.0:{sign}.{max(places, 0)}f}"
+        return f"{round(value * factor, places):{sign}z.{max(places, 0)}f}"
 
     def signed(value: float) -> str:
         return figures(value, "+")
@@ -70,7 +69,7 @@ def line(d: Difference) -> Line:
     e = d.change
     return Line(
         verdict(d), f"{d.metric}{' %' if suffix == ' %' else ''}", figures(d.a), figures(d.b),
-        signed(e.value), f"[{signed(e.low)}, {signed(e.high)}]",
+        signed(e.value), "–" if e.low != e.low else f"[{signed(e.low)}, {signed(e.high)}]",
         "–" if d.p_corrected is None else p_value(d.p_corrected).removeprefix("= "),
     )  # fmt: skip
 
@@ -154,7 +153,7 @@ def success(c: InCondition, pair: Pair) -> str:
         return said
     if c.test.p_value is not None:
         return f"{said}; McNemar's exact test over episodes p {p_value(c.test.p_value)}"
-    ends = " to ".join(f"{100 * (end or 0.0):+.1f}" for end in (c.test.low, c.test.high))
+    ends = " to ".join(f"{100 * (end or 0.0):+z.1f}" for end in (c.test.low, c.test.high))
     return f"{said}; 95 % interval over episodes {ends} points"
 
 
