@@ -39,6 +39,7 @@ docs: .venv/docs ## the documentation as a site: build/docs/index.html
 
 bench: .venv/dev ## the benchmarks; see benchmarks/README.md
 	$(BIN)/python benchmarks/commands.py
+	$(BIN)/python benchmarks/install.py
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python benchmarks/own_time.py
 	$(BIN)/python benchmarks/coordinate.py
