@@ -11,11 +11,14 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests/browser"))
+from opening import FLAGS, wait
+
 HERE = Path(__file__).parent
 DECISION, CAMERAS = "#scene=00003-3-86ea843fc7e0&condition=v2x", "#scene=00156-2-c2bfbec56419&condition=6g"
 
 with sync_playwright() as playwright:
-    browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+    browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
     for name, where, part in (
         ("overview", "", None),
         ("decision", DECISION, None),
@@ -23,6 +26,6 @@ with sync_playwright() as playwright:
     ):
         page = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="light")
         page.goto(f"file://{Path(sys.argv[1]).absolute()}/report.html{where}")
-        page.wait_for_selector("#decision[data-drawn]" if where else "body[data-drawn]", state="attached")
+        wait(page)
         (page.locator(part) if part else page).screenshot(path=HERE / f"report-{name}.png")
     browser.close()
