@@ -25,11 +25,12 @@ def main() -> None:
     arguments.add_argument("--against", help="commit to install beside this one")
     against = arguments.parse_args().against
     rows = [row(None), *([row(against)] if against else [])]
-    print(f"{'':<10}{'environment':>12}{'install':>12}{'first run':>12}{'all':>12}{'fetch':>12}{'size':>10}")
+    columns = ("environment", "install", "first run", "all", "fetch")
+    print(" " * 10 + "".join(f"{name:>12}" for name in columns) + f"{'fetched':>10}{'installed':>10}")
     for r in rows:
         seconds = [r[name] for name in ("environment_s", "install_s", "run_s")]
         times = "".join(f"{s:10.1f} s" for s in (*seconds, sum(seconds), r["fetch_s"]))
-        print(f"{r['commit']:<10}{times}{r['mb']:7.0f} MB")
+        print(f"{r['commit']:<10}{times}{r['fetched_mb']:7.0f} MB{r['mb']:7.0f} MB")
         print("  " + ", ".join(f"{name} {mb:.0f}" for name, mb in r["largest_mb"].items()))
     print(json.dumps(rows))
 
@@ -48,11 +49,13 @@ def row(commit: str | None) -> dict[str, Any]:
         install_s = run(python, "-m", "pip", "install", *PIP, clone)
         mb = size_mb(environment) - bare
         run_s = run(environment / "bin/harness", "eval", "--model", "proxy", at=place)
-        fetch_s = run(python, "-m", "pip", "download", *PIP, "--dest", place / "wheels", clone)
+        wheels = place / "wheels"
+        fetch_s = run(python, "-m", "pip", "download", *PIP, "--dest", wheels, clone)
+        fetched_mb = size_mb(wheels)
         packages = {p.name: size_mb(p) for p in next(environment.glob("lib/*/site-packages")).iterdir()}
         largest = dict(sorted(packages.items(), key=lambda item: -item[1])[:6])
     times = {"environment_s": environment_s, "install_s": install_s, "run_s": run_s, "fetch_s": fetch_s}
-    return {"commit": commit or "here", **times, "mb": mb, "largest_mb": largest}
+    return {"commit": commit or "here", **times, "fetched_mb": fetched_mb, "mb": mb, "largest_mb": largest}
 
 
 def run(*command: object, at: Path = HERE) -> float:
