@@ -58,7 +58,7 @@ def test_its_picture_tokens_see(shipped: Dataset) -> None:
     for question in asked(shipped, "own"):
         assert isinstance(question.image, Sight)
         ids = np.array([filled if token < 0 else token for token in backend.tokens(question)], dtype=np.int32)
-        sample = Sample(ids, 1, "", len(ids), None, question.image)
+        sample = Sample(ids, 1, "", len(ids), None, image=question.image)
         with torch.inference_mode():
             [hidden] = hidden_states(model, [sample])
             read.append((hidden[torch.from_numpy(ids[1:] == filled)] @ digits.T).argmax(1).numpy())

@@ -31,6 +31,7 @@ class Question:
         graph: the viewer's scene graph.
         messages: chat messages.
         label: soft label, (A,).
+        weight: how often it is learnt, beside others.
         image: what the viewer's cameras see, if the prompt shows it.
     """
 
@@ -40,6 +41,7 @@ class Question:
     graph: Mapping[str, Any]
     messages: tuple[Mapping[str, str], ...]
     label: Floats
+    weight: float
     image: Sight | None = None
 
     @property
@@ -101,7 +103,8 @@ def question(
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
     image = Sight(scenario, scene.state, viewer, VISION.size_px) if prompt.image else None
-    return Question(name, scenario, prompt, graph, sent, lessons.labels[scene.id], image)
+    label, weight = lessons.labels[scene.id], lessons.weights[scene.id]
+    return Question(name, scenario, prompt, graph, sent, label, weight, image)
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:

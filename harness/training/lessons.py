@@ -1,7 +1,8 @@
 """The decision points that a model learns from, and what it should have intended there.
 
 They are drawn from the decision trees of train layouts: of each level up to `OF_A_LEVEL` points. So a model
-sees the scenes that its own errors lead to.
+sees the scenes that its own errors lead to. An episode passes one point of each level, so the levels of a
+layout weigh alike: the point at which every episode begins as much as all points of a later level together.
 
 An action is safe if the episode still succeeds when the driver that sees no more than the ego takes the rest:
 what only one who sees everything could still save is not safe for who does not. Each safe action has the
@@ -12,9 +13,10 @@ point at which nothing is safe any more teaches nothing; what follows it may, wh
 take the rest and one more SLOWER saves it.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +63,13 @@ class Lessons:
     def episodes(self) -> tuple[int, ...]:
         """The layouts that are learnt from, by number."""
         return tuple(dict.fromkeys(scene.record["episode"] for scene in self.scenes))
+
+    @cached_property
+    def weights(self) -> Mapping[str, float]:
+        """How often each scene is learnt from, by its id: each level of a layout in all as often."""
+        levels = [(scene.record["episode"], scene.record["step"]) for scene in self.scenes]
+        points = Counter(levels)
+        return {scene.id: 1 / points[level] for scene, level in zip(self.scenes, levels, strict=True)}
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
         """All but the last layouts, of which a share is held out, at least one; and those."""

@@ -17,7 +17,6 @@ from harness.training.examples import Question, alone, excerpts, key, kl_nats, w
 from harness.training.lessons import Lessons
 from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
 from harness.training.train import Plan, Sample, read_out, run_stage, save
-from harness.world.perception.camera import Sight
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
 BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be
@@ -67,7 +66,7 @@ class Student:
             target = self.taught.get(_place(q), q.label) if q.image else q.label
             letter = readout.letters(q.actions)[rng.choice(len(q.actions), p=target)]
             report = sights(q.graph) if seen and q.image else evidence(q.graph, q.named)
-            samples.append(self._sample(q.read_out, f"{letter}: {report}{END}", target, q.image))
+            samples.append(self._sample(q, q.read_out, f"{letter}: {report}{END}", target))
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
@@ -75,10 +74,10 @@ class Student:
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         return [
             self._sample(
+                q,
                 q.messages,
                 answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named) + END,
                 None,
-                q.image,
             )
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
@@ -192,14 +191,15 @@ class Student:
         return read_out(self.model, samples, self.letters)
 
     def _sample(
-        self, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None, image: Sight | None
+        self, question: Question, messages: Sequence[Mapping[str, str]], said: str, target: Floats | None
     ) -> Sample:
         system, rest = chat(messages)
         if system not in self._shared:
             self._shared[system] = self._encode(system)
         head, asked = self._shared[system], self._encode(rest)
         ids = np.concatenate([head, asked, self._encode(said)])
-        return Sample(ids, len(head), system, len(head) + len(asked), target, image)
+        answer_at = len(head) + len(asked)
+        return Sample(ids, len(head), system, answer_at, target, question.weight, question.image)
 
     def _encode(self, text: str) -> Any:
         return np.array(self.tokenizer.encode(text).ids, dtype=np.int32)

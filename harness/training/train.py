@@ -53,6 +53,7 @@ class Sample:
         answer_at: where the answer starts.
         target: what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
             text from its first token.
+        weight: how often it is drawn, beside others.
         image: the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
             or none has.
     """
@@ -62,6 +63,7 @@ class Sample:
     kind: str
     answer_at: int
     target: Floats | None
+    weight: float = 1.0
     image: Sight | None = None
 
 
@@ -141,8 +143,8 @@ def run_stage(
 def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.int64]:
     """Places of the samples of each step, (steps, batch): of one kind and of like length, in random order."""
     rng = np.random.default_rng(plan.seed)
-    epochs = math.ceil(count / len(samples))
-    order = np.concatenate([rng.permutation(len(samples)) for _ in range(epochs)])[:count]
+    weights = np.array([sample.weight for sample in samples])
+    order = rng.choice(len(samples), count, p=weights / weights.sum())
     kinds = np.array([samples[i].kind for i in order])
     lengths = np.array([len(samples[i].ids) for i in order])
     parts = []
