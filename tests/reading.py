@@ -7,6 +7,8 @@ import re
 from collections import Counter
 from html.parser import HTMLParser
 
+from harness.report.page import write_report
+
 
 class Page(HTMLParser):
     """What a browser would make of a page: elements, attributes, text."""
@@ -44,3 +46,15 @@ def details(text):
     count = -(-len(index["scenes"]) // index["block"])
     every = [detail for n in range(count) for detail in json.loads(packed(text, f"block-{n}"))]
     return dict(zip((scene for scene, *_ in index["scenes"]), every, strict=True))
+
+
+def unpacked(decisions):
+    """The details of every decision of a report, before they are packed."""
+    return [d for part in decisions.parts() for block in part.details.blocks(part.ids) for d in block]
+
+
+def by_workers(runs, base, monkeypatch):
+    """The page of some runs as one process writes it, and as two do, of a few scenes each."""
+    for name, scenes in (("details.BLOCK", 2), ("decisions.BLOCK", 2), ("decisions.AT_ONCE", 4)):
+        monkeypatch.setattr(f"harness.report.{name}", scenes)
+    return [write_report(runs, base / f"{workers}.html", workers=workers).read_text() for workers in (1, 2)]

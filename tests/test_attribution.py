@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import decisions, run, says, spec_of
+from reading import unpacked
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -264,12 +265,12 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
 
 def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[..., Path]) -> None:
     path = made()
-    bare = [detail["runs"][0] for of in Decisions(gather([path])).blocks() for detail in of]
+    bare = [detail["runs"][0] for detail in unpacked(Decisions(gather([path])))]
     assert not any("left_out" in each for each in bare)
     found = attribute(Stored(path), SIXG.name, 6, 0)
     attribution.write(found, path)
     shown = Decisions(gather([path]))
-    details = dict(zip(shown.ids, (d["runs"][0] for of in shown.blocks() for d in of), strict=True))
+    details = dict(zip(shown.ids, (d["runs"][0] for d in unpacked(shown)), strict=True))
     assert {scene for scene, d in details.items() if "left_out" in d} == {e.scene for e in found.left_out}
     for scene, detail in details.items():
         here = detail.get("left_out", [])

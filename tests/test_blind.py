@@ -21,6 +21,7 @@ from evaluating import (
     sure,
     walked,
 )
+from reading import unpacked
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
@@ -230,9 +231,10 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
     assert len({a.id for a in merges}) == len(merges)
     replayed = spec_of(small, f"replay:{done.out}", points=both)
     assert same_decisions(run(replayed, tmp_path / "replay").out, done.out)
-    shown = Decisions(gather([done.out]))
-    details = [answer for of in shown.blocks() for d in of for answer in d["runs"][0]["answers"]]
-    assert all(answer["prompt"] is not None for answer in details), "each as it was sent"
+    details = unpacked(Decisions(gather([done.out])))
+    assert all(answer["prompt"] is not None for d in details for answer in d["runs"][0]["answers"]), (
+        "each as it was sent"
+    )
 
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:

@@ -197,7 +197,7 @@ def _evaluated(
     from harness.cli.report import write
 
     with work.going_on(folder):
-        page = write([folder], quiet=silent, dataset=dataset)
+        page = write([folder], quiet=silent, dataset=dataset, workers=workers)
     work.tidy(folder)
     return done, page
 

@@ -143,8 +143,12 @@ RuleWorkers = Annotated[
     Option(
         metavar="WHO",
         help=f"Number of worker processes, {_RAY} For rules such as proxy only; used on more than 256 "
-        "layouts. Default: 2.",
+        "layouts, and for the report of more than 1536 scenes. Default: 2.",
     ),
+]
+PageWorkers = Annotated[
+    str,
+    Option(metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 1536 scenes."),
 ]
 Shard = Annotated[
     str | None,

@@ -11,6 +11,7 @@ from harness.core.errors import UserError, printable
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
+    from harness.core.parallel import Workers
     from harness.dataset.load import Dataset
 
 
@@ -19,16 +20,18 @@ def command(
     out: Path | None = typer.Option(
         None, help="File to write. Default: RUN/report.html; needed for several runs."
     ),
+    workers: options.PageWorkers = "2",
 ) -> None:
     """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
         raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
-    typer.echo(f"wrote {write(runs, out)}")
+    typer.echo(f"wrote {write(runs, out, workers=options.workers_of(workers))}")
 
 
 def write(
-    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None
-) -> Path:
+    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | None" = None,
+    workers: "Workers" = 1,
+) -> Path:  # fmt: skip
     """Write a report, with a progress bar; returns the file. `dataset` spares reading theirs again."""
     if any((run / SUITE).is_file() for run in runs):
         return _write_suites(runs, out, quiet)
@@ -38,7 +41,7 @@ def write(
     gathered = gather(runs, dataset)
     scenes = len({scene for run in gathered.runs for scene in run.decisions.scenes})
     with bar("packing decisions", scenes, quiet) as progress:
-        return write_report(gathered, out or runs[0] / "report.html", progress=progress)
+        return write_report(gathered, out or runs[0] / "report.html", progress=progress, workers=workers)
 
 
 def _write_suites(folders: list[Path], out: Path | None, quiet: bool) -> Path:

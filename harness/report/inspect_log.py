@@ -17,7 +17,7 @@ from harness.core.errors import UserError
 from harness.core.files import digest, replacing
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import messages_of
-from harness.report.decisions import as_shown, prompts_of
+from harness.report.details import as_shown, prompts_of
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import Answer, FrozenScenes
 

@@ -16,10 +16,12 @@ from markupsafe import Markup
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing
 from harness.core.memory import uncollected
+from harness.core.parallel import Workers, each
 from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
-from harness.report.decisions import Decisions, Prompts, prompts_of
+from harness.report.decisions import Decisions
+from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
@@ -34,6 +36,7 @@ def write_report(
     out: Path,
     prompts: Prompts = prompts_of,
     progress: Callable[[int], None] = lambda done: None,
+    workers: Workers = 1,
 ) -> Path:
     """Write a report about one run, or about several on the same scenes.
 
@@ -43,6 +46,7 @@ def write_report(
         prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
             had heard; None where they are unknown. By default the run's own prompt version, if it is here.
         progress: called with the number of scenes just packed.
+        workers: who packs the scenes of a report of many.
 
     Returns:
         The file written.
@@ -52,7 +56,7 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
-    save(_pieces(runs, prompts, progress), out, "--out")
+    save(_pieces(runs, prompts, progress, workers), out, "--out")
     return out
 
 
@@ -72,10 +76,10 @@ def render(
     runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None
 ) -> str:
     """The page."""
-    return "".join(_pieces(runs, prompts, progress))
+    return "".join(_pieces(runs, prompts, progress, 1))
 
 
-def _pieces(runs: Runs, prompts: Prompts, progress: Callable[[int], None]) -> Iterator[str]:
+def _pieces(runs: Runs, prompts: Prompts, progress: Callable[[int], None], workers: Workers) -> Iterator[str]:
     """The page in pieces, since that of a million decisions weighs as much as all that is read for it."""
     lines = matrix.lines(runs)
     charts = list(panels(runs))
@@ -109,14 +113,27 @@ def _pieces(runs: Runs, prompts: Prompts, progress: Callable[[int], None]) -> It
         script=library.script(),
         about=library.packed(_about(runs, charts)),
         index=library.packed(decisions.index),
-        blocks=_packed(decisions, progress),
+        blocks=_packed(decisions.parts(), progress, workers),
     )  # fmt: skip
 
 
-def _packed(decisions: Decisions, progress: Callable[[int], None]) -> Iterator[Markup]:
-    for block in decisions.blocks():
-        yield library.packed(block)
-        progress(len(block))
+def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Workers) -> Iterator[Markup]:
+    """The blocks of all parts, in order."""
+    if workers == 1 or len(parts) == 1:
+        for part in parts:
+            for block in part.details.blocks(part.ids):
+                yield library.packed(block)
+                progress(len(block))
+        return
+    done: dict[int, list[Markup]] = {}
+
+    def keep(place: int, blocks: list[Markup]) -> None:
+        done[place] = blocks
+        progress(len(parts[place].ids))
+
+    each(Part.packed, parts, workers, keep, lambda part: f"scenes {part.ids[0]} to {part.ids[-1]}", False)
+    for place in range(len(parts)):
+        yield from done.pop(place)
 
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The runs that one report holds side by side."""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,12 @@ class Runs:
         world = self.runs[0].manifest.world
         assert isinstance(world, ClosedLoop)
         return scenarios.stated(world.scenario["name"], world.scenario["parameters"])
+
+    def of_scenes(self, ids: Collection[str]) -> "Runs":
+        """Return the runs' part in some scenes, with the trees of their layouts alone."""
+        runs = tuple(run.of_scenes(ids) for run in self.runs)
+        layouts = {number for run in runs for number in run.grid.episodes}
+        return replace(self, runs=runs, dataset=self.dataset and self.dataset.of_episodes(layouts))
 
     @property
     def conditions(self) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ import csv
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -132,6 +132,30 @@ class Run:
         for answer in self.answers:
             by_scene.setdefault(answer.scene, []).append(answer)
         return by_scene
+
+    def episodes_of(self, layout: int) -> list[Episode]:
+        """Return the episodes in a layout, by condition and seed."""
+        number, layouts = self._places[layout], len(self.grid.episodes)
+        return list(self.episodes[number::layouts])
+
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        return {layout: place for place, layout in enumerate(self.grid.episodes)}
+
+    def of_scenes(self, ids: Collection[str]) -> "Run":
+        """Return the run with only its decisions and answers in some scenes, and the episodes of these."""
+        rows = [row for scene in ids for row in self.decisions.scenes.get(scene, ())]
+        decisions = self.decisions.take(rows)
+        layouts = tuple(dict.fromkeys(decisions.whole("episode").tolist()))
+        grid = replace(self.grid, episodes=layouts)
+        part = replace(self)
+        part.__dict__.update({
+            "decisions": decisions,
+            "_placed": (grid, tuple(grid.ordered([e for n in layouts for e in self.episodes_of(n)]))),
+            "answers_by_scene": {scene: self.answers_by_scene.get(scene, []) for scene in ids},
+            "attribution": self.attribution,
+        })  # fmt: skip
+        return part
 
     def agent(self, answer: Answer) -> dict[str, Any]:
         """Return the agent of an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""

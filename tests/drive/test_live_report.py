@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from driving import FROM_LEFT
 from evaluating import live_spec_of, run
-from reading import Page, details
+from reading import Page, by_workers, details
 from run_on_disk import change, rows_of
 
 from harness.coordination.operating_point import named_point
@@ -54,6 +54,12 @@ def test_every_moment_played_again_is_the_moment_that_was_asked(driven):
     found = read(driven)
     assert found.decisions.scenes
     assert all(scene_of(found, scene).id == scene for scene in found.decisions.scenes)
+
+
+def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
+    one, two = by_workers(gather([driven]), tmp_path, monkeypatch)
+    assert len(details(one)) > 8
+    assert two == one
 
 
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):

@@ -15,7 +15,7 @@ import pytest
 import typer
 from evaluating import scenes_of, spec_of
 from msgspec import structs
-from reading import Page, details, packed
+from reading import Page, by_workers, details, packed
 from run_on_disk import answers_of, change, configure, rows_of
 from sample_run import write_run
 from typer.testing import CliRunner
@@ -27,7 +27,7 @@ from harness.core.files import digest
 from harness.evaluate.asking import answer_of, requests
 from harness.prompts import readout
 from harness.prompts import versions as prompts
-from harness.report.decisions import prompts_of
+from harness.report.details import prompts_of
 from harness.report.page import render, visible
 from harness.report.runs import gather
 from harness.report.words import answer_times, figures, headline, latency_source, pace
@@ -222,6 +222,14 @@ def test_the_page_asks_for_nothing_and_runs_two_scripts_that_it_names(text, page
 
 def test_the_same_runs_give_the_same_page(run):
     assert written(run) == written(run)
+
+
+def test_workers_change_no_byte_of_a_page(run, dataset, tmp_path, monkeypatch):
+    other = write_run(tmp_path / "other", dataset, model="other")
+    change(other, decision=lambda row: row.update(triggered=False))
+    one, two = by_workers(gather([run, other]), tmp_path, monkeypatch)
+    assert len(details(one)) > 8
+    assert two == one
 
 
 def test_several_runs_stand_side_by_side_and_each_is_named(run, dataset, tmp_path):

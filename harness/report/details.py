@@ -1,0 +1,229 @@
+"""What a page shows of each decision: what was seen, asked, answered and decided, and where it led."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import msgspec
+import numpy as np
+from markupsafe import Markup
+
+from harness.core.files import digest
+from harness.dataset.forest import Forest
+from harness.dataset.load import Scene
+from harness.evaluate.agent import in_mode, shown
+from harness.evaluate.device import answer_s
+from harness.evaluate.fusion import messages_of
+from harness.parsing.parse import spans
+from harness.prompts import versions
+from harness.report import scenes
+from harness.report.library import packed
+from harness.report.runs import Runs
+from harness.runs.folder import Run
+from harness.runs.records import Answer, Decision, Episode
+from harness.world import scenarios
+from harness.world.perception.graph import blinded
+
+BLOCK = 24  # scenes that are compressed and read together
+
+Messages = Sequence[Mapping[str, Any]]
+Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
+Prompts = Callable[[Run], Sent | None]
+GOOD, SLOW, BAD, BLAMELESS = "s", "d", "u", "n"
+KEPT = (
+    "role", "raw", "finish_reason", "error", "status", "verdict", "repairs", "detail", "intent", "mass",
+    "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
+    "first_raw", "first_status",
+)  # fmt: skip
+# The same for all decisions of a scene, or known from its outcomes.
+LEFT_OUT = ("scene", "episode", "step", "danger", "seed", "safe", "delay_s")
+
+
+def prompts_of(run: Run) -> Sent | None:
+    """Gives the chat messages that a viewer was sent; None if a prompt of the run is not here as it was."""
+    manifest, prompts = run.manifest, dict[str, versions.Prompt]()
+    for agent in (manifest.agent(0), *manifest.helpers):
+        prompt = versions.as_it_was(agent["prompt"]["version"], agent["prompt"]["sha256"])
+        if prompt is None:
+            return None
+        prompts[prompt.version] = prompt
+
+    def sent(scene: Scene, viewer: str, heard: Messages) -> Sequence[Mapping[str, str]]:
+        words = scenarios.get(scene.state.scenario).prompt_words
+        agent = manifest.agent(scene.viewers.index(viewer))
+        prompt = prompts[agent["prompt"]["version"]]
+        graph = scene.record["graphs"][viewer]
+        messages = shown(agent.get("image", "own"), prompt.render(graph, run.actions, heard, words))
+        return in_mode(agent["answer"], prompt, messages, graph["role"], run.actions)
+
+    return sent
+
+
+def as_shown(scene: Scene, answer: Answer) -> Scene:
+    """A decision point as it was shown to who answered."""
+    if answer.role != "blind":
+        return scene
+    graphs = {viewer: blinded(graph) for viewer, graph in scene.record["graphs"].items()}
+    return Scene({**scene.record, "graphs": graphs})
+
+
+@dataclass(frozen=True)
+class Details:
+    """The details of scenes.
+
+    Attributes:
+        runs: the runs.
+        replayed: of closed-loop runs, the scenes that could be replayed.
+        framed: scenes that have their cameras' pictures.
+        prompts: as in `harness.report.page.write_report`.
+    """
+
+    runs: Runs
+    replayed: Mapping[str, Scene]
+    framed: frozenset[str]
+    prompts: Prompts
+
+    def of_scenes(self, ids: Sequence[str]) -> "Details":
+        """Return the same with no more of the runs than these scenes need."""
+        replayed = {name: self.replayed[name] for name in ids if name in self.replayed}
+        return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed)
+
+    def blocks(self, ids: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
+        """Details of these scenes, so many a block."""
+        forest, scenes = None, self.replayed
+        if dataset := self.runs.dataset:
+            scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
+            forest = dataset.of_episodes({scene.record["episode"] for scene in scenes.values()}).forest
+        for at in range(0, len(ids), BLOCK):
+            yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
+
+    @cached_property
+    def _sent(self) -> list[Sent | None]:
+        return [self.prompts(run) for run in self.runs.runs]
+
+    @cached_property
+    def ends(self) -> list[Any]:
+        """What each decision of each run led to, a letter a decision (n,)."""
+        return [_ends(run) for run in self.runs.runs]
+
+    @cached_property
+    def _left_out(self) -> list[dict[str, list[dict[str, Any]]]]:
+        return [_left_out(run) for run in self.runs.runs]
+
+    def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
+        sent: dict[str, Any] = {}
+        runs = [self._of_run(n, name, scene, sent) for n in range(len(self.runs.runs))]
+        asked = {tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]}
+        return {
+            "world": scene and scenes.world(self.runs.scenario, scene, asked),
+            "cameras": scene and name in self.framed and scenes.cameras(self.runs.scenario, scene),
+            "outcomes": forest and scenes.outcomes(forest, name),
+            "runs": runs,
+            "prompts": list(sent.values()),
+        }
+
+    def _of_run(self, n: int, name: str, scene: Scene | None, sent: dict[str, Any]) -> dict[str, Any] | None:
+        run, prompts = self.runs.runs[n], self._sent[n]
+        rows = run.decisions.scenes.get(name)
+        if rows is None:
+            return None
+        answers = []
+        by_viewer = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
+        for answer in by_viewer.values():
+            shown = {
+                key: v
+                for key in KEPT
+                if (v := getattr(answer, key)) is not None and v is not False and v != ()
+            }
+            asked = None
+            if scene and prompts:
+                shown_to = as_shown(scene, answer)
+                messages = prompts(shown_to, answer.viewer, messages_of(by_viewer, answer.heard, run.actions))
+                key = digest(messages)
+                if answer.prompt_sha256 == key:
+                    sent.setdefault(key, messages)
+                    asked = list(sent).index(key)
+            agent = run.agent(answer)
+            if answer.image_sha256:
+                shown["picture"] = "blank" if answer.role == "blind" else agent["image"]
+            if run.manifest.helpers:
+                shown["agent"] = " · ".join(
+                    (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
+                )
+            if run.manifest.latency.speeds:
+                shown["took_s"] = answer_s(run.speed(answer), answer)
+            spans_read = _read_in(answer, run) if answer.repairs else []
+            answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
+        decisions: dict[str, dict[str, Any]] = {}  # seeds with the same decision share an entry
+        for row, d in enumerate(run.decisions.records(rows.start, rows.stop), rows.start):
+            shown = {**_shown(d), "end": str(self.ends[n][row])}
+            decisions.setdefault(repr(shown), {**shown, "seeds": []})["seeds"].append(d.seed)
+        episode = int(run.decisions.whole("episode")[rows.start])
+        detail = {
+            "answers": answers, "decisions": list(decisions.values()),
+            "ends": [_end(end) for end in run.episodes_of(episode)],
+        }  # fmt: skip
+        if left_out := self._left_out[n].get(name):
+            detail |= {"left_out": left_out}
+        return detail
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some scenes whose details are packed together, here or in another process.
+
+    It is pickled with no more of the runs than these scenes need.
+    """
+
+    details: Details
+    ids: Sequence[str]
+
+    def __reduce__(self) -> Any:
+        return Part, (self.details.of_scenes(self.ids), self.ids)
+
+    def packed(self) -> list[Markup]:
+        """The blocks of the scenes, as the page holds them."""
+        return [packed(block) for block in self.details.blocks(self.ids)]
+
+
+def _shown(d: Decision) -> dict[str, Any]:
+    plain = msgspec.to_builtins(d)
+    return {key: value for key, value in plain.items() if key not in LEFT_OUT and not (
+        value is None and key in ("acts_at_s", "acted")
+    )}  # fmt: skip
+
+
+def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
+    """Where in a recovered completion its answers stand."""
+    role = "helper" if answer.role in ("helper", "blind") else "ego"
+    return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
+
+
+def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """What was left out of each decision point that `harness attribute` drew, what moved most first."""
+    of: dict[str, list[dict[str, Any]]] = {}
+    if run.attribution:
+        for each in sorted(run.attribution.left_out, key=lambda each: -(each.shift or 0.0)):
+            plain = {**msgspec.to_builtins(each), "condition": run.attribution.condition}
+            of.setdefault(each.scene, []).append(plain)
+    return of
+
+
+def _end(e: Episode) -> dict[str, Any]:
+    """How an episode ended, for the page."""
+    return {
+        "condition": e.condition, "seed": e.seed, "result": e.failure or "cleared", "partner": e.partner,
+        "striker": e.striker, "fault": e.fault, "time_s": e.time_s, "delay_s": e.delay_s,
+        "least_gap_m": e.least_gap_m, "hard_brakings": e.hard_brakings, "other_crashes": e.other_crashes,
+    }  # fmt: skip
+
+
+def _ends(run: Run) -> Any:
+    """What each decision led to, a letter a decision (n,); in the closed loop, what its episode came to."""
+    d = run.decisions
+    if run.world == "closed-loop":
+        letters = {"": GOOD, "late": SLOW}
+        return np.array([letters.get(e.failure, BAD) for e in run.episodes])[run.grid.places(d)]
+    safe = np.where(np.nan_to_num(d["delay_s"]) > 0, SLOW, GOOD)
+    return np.where(d.flags("value"), np.where(d.flags("safe"), safe, BAD), BLAMELESS)
