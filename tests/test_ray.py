@@ -19,6 +19,7 @@ from harness.core.versions import of_node
 
 ray = pytest.importorskip("ray", reason="needs the ray extra")
 
+from chores import counted, dies, stays, where, wrong  # noqa: E402
 from evaluating import FILES  # noqa: E402
 from typer.main import get_command  # noqa: E402
 
@@ -58,10 +59,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def node() -> str:
-    return str(ray.get_runtime_context().get_node_id())
-
-
 def test_a_run_has_the_bytes_of_one_process_where_its_command_is_killed_and_goes_on(
     cluster: Any, whole: Path, harness: Typed, tmp_path: Path
 ) -> None:
@@ -79,11 +76,6 @@ def test_a_run_has_the_bytes_of_one_process_where_its_command_is_killed_and_goes
         assert (tmp_path / "killed" / name).read_bytes() == (whole / name).read_bytes(), name
 
 
-def where(number: int) -> str:
-    time.sleep(0.2)
-    return node()
-
-
 def test_both_nodes_work(cluster: Any) -> None:
     found = spread(where, range(8), Ray(), lambda done: None, repeatable=False)
     assert len(set(found)) == 2
@@ -98,13 +90,6 @@ def test_nodes_that_disagree_are_named(cluster: Any) -> None:
     assert all(one["NodeID"][:8] in said for one in ray.nodes() if one["Alive"])
 
 
-def dies(graves: Path, number: int) -> int:
-    if number == 2:
-        (graves / str(os.getpid())).touch()
-        os._exit(9)
-    return number
-
-
 def test_what_kills_its_worker_three_times_is_named_and_the_rest_is_done(
     cluster: Any, tmp_path: Path
 ) -> None:
@@ -113,13 +98,6 @@ def test_what_kills_its_worker_three_times_is_named_and_the_rest_is_done(
         each(partial(dies, tmp_path), range(6), Ray(), taken.__setitem__)
     assert taken == {n: n for n in (0, 1, 3, 4, 5)}
     assert len(list(tmp_path.iterdir())) == TRIES
-
-
-def wrong(tried: Path, number: int) -> int:
-    (tried / f"{number}-{time.monotonic_ns()}").touch()
-    if number == 1:
-        raise (UserError("the weights are missing") if tried.name == "user" else ZeroDivisionError("a bug"))
-    return number
 
 
 def test_an_error_of_the_works_own_is_raised_and_never_tried_again(cluster: Any, tmp_path: Path) -> None:
@@ -147,12 +125,6 @@ def test_another_version_is_named_with_its_node(cluster: Any, monkeypatch: pytes
             spread(abs, range(2), Ray(), lambda done: None)
 
 
-def counted(begun: Path, number: int) -> int:
-    (begun / f"{number}-{node()}").touch()
-    time.sleep(0.15)
-    return number
-
-
 def test_a_node_that_is_killed_costs_nothing(
     cluster: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,16 +141,6 @@ def test_a_node_that_is_killed_costs_nothing(
     assert taken == dict.fromkeys(range(20), 1)
     assert third not in cluster.worker_nodes, "it was killed while it worked"
     capfd.readouterr()
-
-
-def stays(begun: Path, number: int) -> int:
-    (begun / f"{number}-{os.getpid()}").touch()
-    if number == 1:
-        while not list(begun.glob("0-*")):
-            time.sleep(0.01)
-        raise UserError("enough")
-    time.sleep(600)
-    return number
 
 
 def test_what_is_still_worked_on_ends_with_an_error(cluster: Any, tmp_path: Path) -> None:
