@@ -63,7 +63,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         decisions = of_decisions(given.decisions, Path(scratch))
     workers = [of_workers(n) for n in given.workers]
-    for rows in (decisions, workers):
+    for rows in filter(None, (decisions, workers)):
         print("".join(f"{name:>12}" for name in rows[0]))
         for row in rows:
             print("".join(f"{value:12.0f}" if value >= 100 else f"{value:12.2f}" for value in row.values()))
