@@ -1,7 +1,7 @@
 """Export a run's tables as text files; a file is written in pieces, and appears only once it is complete."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -54,7 +54,7 @@ def junit(run: Run, path: Path) -> Path:
     return path
 
 
-def answers_csv(answers: Sequence[Answer], actions: Sequence[str], path: Path) -> Path:
+def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
     """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent."""
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]

@@ -27,6 +27,7 @@ from harness.core.formats import FORMAT, READ_BY, SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.runs import attribution
+from harness.runs.answers import Answers
 from harness.runs.attribution import Attribution
 from harness.runs.decisions import Decisions, arrow_file
 from harness.runs.metrics import Grid, World
@@ -55,7 +56,7 @@ _BROKEN = (
     csv.Error,
 )
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-_ANSWER, _FACTS = msgspec.json.Decoder(Answer), msgspec.json.Decoder(AnswerFacts)
+_FACTS = msgspec.json.Decoder(AnswerFacts)
 _ENCODER = msgspec.json.Encoder()
 
 
@@ -121,17 +122,14 @@ class Run:
         return self._read("decisions.parquet", self._decisions)
 
     @cached_property
-    def answers(self) -> tuple[Answer, ...]:
+    def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
-        return self._read("answers.jsonl", lambda file: tuple(_answers(file, len(self.actions))))
+        return self._read("answers.jsonl", lambda file: Answers.read(file, len(self.actions)))
 
     @cached_property
-    def answers_by_scene(self) -> dict[str, list[Answer]]:
+    def answers_by_scene(self) -> Mapping[str, list[Answer]]:
         """The answers of each decision point, in the order of the file."""
-        by_scene: dict[str, list[Answer]] = {}
-        for answer in self.answers:
-            by_scene.setdefault(answer.scene, []).append(answer)
-        return by_scene
+        return self.answers.by_scene
 
     def episodes_of(self, layout: int) -> list[Episode]:
         """Return the episodes in a layout, by condition and seed."""
@@ -400,16 +398,6 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         columns[field] = values
     rows = zip(*columns.values(), strict=True)
     return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
-
-
-def _answers(file: Path, actions: int) -> list[Answer]:
-    answers = _ANSWER.decode_lines(file.read_bytes())
-    for answer in answers:
-        if answer.intent is not None and len(answer.intent) != actions:
-            raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
-    if len({answer.id for answer in answers}) < len(answers):
-        raise ValueError("an answer is there twice")
-    return answers
 
 
 def whole(file: Path, reader: Callable[[Path], T]) -> T:

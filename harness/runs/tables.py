@@ -59,7 +59,7 @@ class Tables:
         import numpy as np
         import pandas as pd
 
-        answers, actions = self._run.answers, self.config["actions"]
+        answers, actions = list(self._run.answers), self.config["actions"]
         columns = {
             name: [getattr(answer, name) for answer in answers]
             for name in (*Answer.__struct_fields__, *TURNS)

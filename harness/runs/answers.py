@@ -1,0 +1,79 @@
+"""The answers of a run, `answers.jsonl`: one answer a line."""
+
+from collections.abc import Collection, Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+
+import msgspec
+
+from harness.runs.records import Answer
+
+_ANSWER = msgspec.json.Decoder(Answer)
+
+
+class Answers(Collection[Answer]):
+    """Answers in the order of their file, which are decoded each time they are read.
+
+    So a run of a million decisions takes the memory of its file, a tenth of what its answers would take.
+
+    Attributes:
+        by_scene: the answers of each decision point.
+    """
+
+    def __init__(self, lines: bytes, actions: int) -> None:
+        """Check the lines of a run with so many actions. Raises ValueError for a broken one."""
+        self._lines, self._count = lines, 0
+        self._spans: list[tuple[int, int]] = []  # of lines that stand together and are of one decision point
+        of_scene: dict[str, list[int]] = {}  # places in `_spans`
+        keys: set[str] = set()
+        scene, start = None, 0
+        for line in BytesIO(lines):
+            stop = start + len(line)
+            for answer in _ANSWER.decode_lines(line):  # one; none in a blank line
+                if answer.intent is not None and len(answer.intent) != actions:
+                    raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
+                if answer.scene != scene:
+                    scene = answer.scene
+                    keys = {other.key for place in of_scene.get(scene, ()) for other in self._span(place)}
+                    of_scene.setdefault(scene, []).append(len(self._spans))
+                    self._spans.append((start, stop))
+                if answer.key in keys:
+                    raise ValueError("an answer is there twice")
+                keys.add(answer.key)
+                self._spans[-1] = self._spans[-1][0], stop
+                self._count += 1
+            start = stop
+        self.by_scene: Mapping[str, list[Answer]] = _ByScene(self, of_scene)
+
+    @classmethod
+    def read(cls, file: Path, actions: int) -> "Answers":
+        """Read and check a file."""
+        return cls(file.read_bytes(), actions)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Answer]:
+        for place in range(len(self._spans)):
+            yield from self._span(place)
+
+    def __contains__(self, answer: object) -> bool:
+        return any(other == answer for other in self)
+
+    def _span(self, place: int) -> list[Answer]:
+        start, stop = self._spans[place]
+        return _ANSWER.decode_lines(self._lines[start:stop])
+
+
+class _ByScene(Mapping[str, list[Answer]]):
+    def __init__(self, answers: Answers, places: Mapping[str, list[int]]) -> None:
+        self._answers, self._places = answers, places
+
+    def __getitem__(self, scene: str) -> list[Answer]:
+        return [answer for place in self._places[scene] for answer in self._answers._span(place)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)

@@ -1,0 +1,55 @@
+"""The answers of a run as its file has them: the same as a list, however they stand in it."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.runs.answers import Answers
+from harness.runs.records import Answer
+
+ANSWER = Answer(
+    scene="", viewer="", role="ego", raw="I would wait.", finish_reason="stop", error=None, prompt_tokens=1,
+    completion_tokens=None, seconds=None, batch_size=1, label_mass=None, retries=0, cached=False, slow_s=0.0,
+    prompt_sha256="", status="strict", verdict="strict", repairs=(), intent=(0.2, 0.3, 0.5), mass=1.0,
+    message=None, detail="",
+)  # fmt: skip
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=3)
+MADE = st.lists(
+    st.builds(
+        lambda scene, viewer, raw: msgspec.structs.replace(ANSWER, scene=scene, viewer=viewer, raw=raw),
+        st.sampled_from("abc"), NAMES, NAMES,
+    ),
+    unique_by=lambda answer: (answer.scene, answer.key),
+)  # fmt: skip
+
+
+def written(answers: list[Answer], between: bytes = b"") -> bytes:
+    return b"".join(msgspec.json.encode(answer) + b"\n" + between for answer in answers)
+
+
+@given(MADE, st.sampled_from([b"", b"\n", b" \n\n"]))
+def test_they_are_read_in_order_and_by_scene(made: list[Answer], between: bytes) -> None:
+    answers = Answers(between + written(made, between), 3)
+    assert len(answers) == len(made)
+    assert [*answers] == [*answers] == made
+    by_scene = {
+        scene: [a for a in made if a.scene == scene] for scene in dict.fromkeys(a.scene for a in made)
+    }
+    assert dict(answers.by_scene) == by_scene
+    assert [*answers.by_scene] == [*by_scene], "in the order of the file"
+
+
+@given(MADE.filter(bool), st.data())
+def test_one_that_is_there_twice_is_refused_wherever_it_stands(
+    made: list[Answer], data: st.DataObject
+) -> None:
+    again = data.draw(st.sampled_from(made))
+    at = data.draw(st.integers(0, len(made)))
+    with pytest.raises(ValueError, match="an answer is there twice"):
+        Answers(written([*made[:at], again, *made[at:]]), 3)
+
+
+def test_another_number_of_probabilities_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"answer a/v has 3 probabilities"):
+        Answers(written([msgspec.structs.replace(ANSWER, scene="a", viewer="v")]), 5)
