@@ -126,6 +126,10 @@ class Dataset:
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
 
+    def __reduce__(self) -> Any:
+        # Another process reads what it needs: to send what lies in memory would take longer.
+        return Dataset, (self.path, self.manifest, self.sha256, self.trees, self.trusted)
+
     @property
     def name(self) -> str:
         """The name in the manifest."""
@@ -302,6 +306,9 @@ class _Folder:
     trusted: bool
     _kept: dict[int, Tree] = field(default_factory=dict, repr=False, compare=False)
     _checked: set[int] = field(default_factory=set, repr=False, compare=False)
+
+    def __reduce__(self) -> Any:
+        return _Folder, (self.path, self.manifest, self.trusted, {}, self._checked)
 
     def __call__(self, number: int) -> Tree:
         if number in self._kept:
