@@ -39,7 +39,7 @@ class Decisions:
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         if runs.dataset:
             for run in runs.runs:
-                check_scenes(run, runs.dataset)
+                check_scenes(run, runs.dataset, ())  # decisions are checked where their trees are read
         self._replayed = {} if runs.dataset else self._played(failed)
         framed = self._telling()
         self._details = Details(runs, self._replayed, framed, prompts)

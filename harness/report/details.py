@@ -20,7 +20,7 @@ from harness.prompts import versions
 from harness.report import scenes
 from harness.report.library import packed
 from harness.report.runs import Runs
-from harness.runs.folder import Run
+from harness.runs.folder import Run, check_scenes
 from harness.runs.records import Answer, Decision, Episode
 from harness.world import scenarios
 from harness.world.perception.graph import blinded
@@ -93,6 +93,8 @@ class Details:
         """Details of these scenes, so many a block."""
         forest, scenes = None, self.replayed
         if dataset := self.runs.dataset:
+            for run in self.runs.runs:
+                check_scenes(run, dataset, ids)
             scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
             forest = dataset.of_episodes({scene.record["episode"] for scene in scenes.values()}).forest
         for at in range(0, len(ids), BLOCK):

@@ -348,11 +348,14 @@ def dataset_of(run: Run) -> Dataset:
     return dataset
 
 
-def check_scenes(run: Run, dataset: Dataset) -> None:
-    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset."""
+def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:
+    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset.
+
+    With `some`, only decisions in these scenes are checked, and answers where there is no decision.
+    """
     decided = run.decisions.scenes
     scenes_by_file: dict[str, Iterable[str]] = {
-        "decisions.parquet": decided,
+        "decisions.parquet": decided if some is None else (scene for scene in some if scene in decided),
         "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
     }
     for file, scenes in scenes_by_file.items():
