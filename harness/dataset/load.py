@@ -174,12 +174,12 @@ class Dataset:
 
     def driver_success(self) -> dict[str, Bools]:
         """Return whether each reference driver succeeds in each episode, (E,)."""
-        forests = [
-            replace(self, trees=self.trees[start : start + TREES_AT_ONCE]).forest
-            for start in range(0, len(self.trees), TREES_AT_ONCE)
-        ]
-        drivers = forests[0].drivers
-        return {name: np.concatenate([forest.driver_success(name) for forest in forests]) for name in drivers}
+        parts: dict[str, list[Bools]] = {}
+        for start in range(0, len(self.trees), TREES_AT_ONCE):
+            forest = replace(self, trees=self.trees[start : start + TREES_AT_ONCE]).forest
+            for name in forest.drivers:
+                parts.setdefault(name, []).append(forest.driver_success(name))
+        return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
         """Return decision points' scenes. Raises UserError for a damaged one, KeyError for an unknown id."""
