@@ -31,7 +31,7 @@ from harness.training.examples import Question, alone, excerpts, kl_nats, with_m
 from harness.training.lessons import Lessons, draw, label
 from harness.training.model import chat
 from harness.training.muon import Muon, orthogonal
-from harness.training.train import STAGES, Plan
+from harness.training.train import STAGES, Plan, Sample, _batches
 from harness.world import scenarios
 from harness.world.reference import drive, finish
 from harness.world.world import World
@@ -80,6 +80,24 @@ def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
     assert Counter(point["step"] for point in points) == {
         step: min(lessons.OF_A_LEVEL, n) for step, n in by_step.items()
     }
+
+
+def test_the_levels_of_a_layout_weigh_alike(few: list[Lessons]) -> None:
+    """In whatever an ego is asked."""
+    for each in few:
+        by_level: dict[tuple[int, int], list[float]] = {}
+        egos = [q for q in alone(each) if q.graph["role"] == "ego" and q.prompt == each.prompts[0]]
+        for scene, q in zip(each.scenes, egos, strict=True):
+            by_level.setdefault((scene.record["episode"], scene.record["step"]), []).append(q.weight)
+        assert [sum(level) for level in by_level.values()] == pytest.approx([1.0] * len(by_level))
+        assert max(map(len, by_level.values())) > 1
+
+
+def test_a_sample_is_drawn_as_often_as_it_weighs() -> None:
+    ids = np.zeros(3, dtype=np.int32)
+    samples = [Sample(ids, 1, "", 2, None, weight) for weight in (1.0, 3.0)]
+    drawn = np.bincount(_batches(samples, 16_000, replace(PLAN, batch=16)).ravel())
+    assert drawn[1] / drawn.sum() == pytest.approx(0.75, abs=0.02)
 
 
 @pytest.fixture(scope="module")

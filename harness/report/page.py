@@ -46,7 +46,7 @@ def write_report(
         prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
             had heard; None where they are unknown. By default the run's own prompt version, if it is here.
         progress: called with the number of scenes just packed.
-        workers: who packs the scenes of a report of many.
+        workers: who packs the scenes of a report of many; `prompts` can be pickled then.
 
     Returns:
         The file written.

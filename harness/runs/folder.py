@@ -147,7 +147,7 @@ class Run:
         layouts = tuple(dict.fromkeys(decisions.whole("episode").tolist()))
         grid = replace(self.grid, episodes=layouts)
         part = replace(self)
-        part.__dict__.update({
+        part.__dict__.update({  # as if it had read them from its files
             "decisions": decisions,
             "_placed": (grid, tuple(grid.ordered([e for n in layouts for e in self.episodes_of(n)]))),
             "answers_by_scene": {scene: self.answers_by_scene.get(scene, []) for scene in ids},
