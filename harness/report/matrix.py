@@ -126,11 +126,9 @@ def _score(run: Run, condition: str, metric: str) -> Score | None:
 
 
 def _tokens(run: Run) -> tuple[float | None, float | None]:
-    counts = [
-        [count for a in run.answers if (count := getattr(a, key)) is not None]
-        for key in ("prompt_tokens", "completion_tokens")
-    ]
-    sent, answered = (float(median(of)) if of else None for of in counts)
+    counts = [(a.prompt_tokens, a.completion_tokens) for a in run.answers]
+    stated = ([count for count in of if count is not None] for of in zip(*counts, strict=True))
+    sent, answered = (float(median(of)) if of else None for of in stated) if counts else (None, None)
     return sent, answered
 
 

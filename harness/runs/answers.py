@@ -1,8 +1,7 @@
 """The answers of a run, `answers.jsonl`: one answer a line."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from io import BytesIO
-from pathlib import Path
 
 import msgspec
 
@@ -11,7 +10,7 @@ from harness.runs.records import Answer
 _ANSWER = msgspec.json.Decoder(Answer)
 
 
-class Answers(Collection[Answer]):
+class Answers:
     """Answers in the order of their file, which are decoded each time they are read.
 
     So a run of a million decisions takes the memory of its file, a tenth of what its answers would take.
@@ -45,20 +44,12 @@ class Answers(Collection[Answer]):
             start = stop
         self.by_scene: Mapping[str, list[Answer]] = _ByScene(self, of_scene)
 
-    @classmethod
-    def read(cls, file: Path, actions: int) -> "Answers":
-        """Read and check a file."""
-        return cls(file.read_bytes(), actions)
-
     def __len__(self) -> int:
         return self._count
 
     def __iter__(self) -> Iterator[Answer]:
         for place in range(len(self._spans)):
             yield from self._span(place)
-
-    def __contains__(self, answer: object) -> bool:
-        return any(other == answer for other in self)
 
     def _span(self, place: int) -> list[Answer]:
         start, stop = self._spans[place]

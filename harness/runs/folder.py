@@ -124,7 +124,7 @@ class Run:
     @cached_property
     def answers(self) -> Answers:
         """The lines of `answers.jsonl`."""
-        return self._read("answers.jsonl", lambda file: Answers.read(file, len(self.actions)))
+        return self._read("answers.jsonl", lambda file: Answers(file.read_bytes(), len(self.actions)))
 
     @cached_property
     def answers_by_scene(self) -> Mapping[str, list[Answer]]:
