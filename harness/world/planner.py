@@ -81,6 +81,8 @@ def plan(scenario: Scenario, graph: Mapping[str, Any]) -> str:
 def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
     """Whether each sequence takes a bend faster than tyres hold, (n,)."""
     speed_mps = np.diff(tried.travelled_m, axis=1, prepend=tried.travelled_m[:, :1]) / STEP_S
+    if speed_mps.max() ** 2 * way.bends.max() <= LATERAL_MPS2:  # most ways are straight; the look-up costs
+        return np.zeros(len(tried.actions), dtype=np.bool_)
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)
     return np.asarray(((speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
 
