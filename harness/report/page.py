@@ -6,6 +6,7 @@ out, and the page's own policy lets two scripts run, named by their digests, and
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +173,7 @@ def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
     }
 
 
+@cache
 def environment(*more: Path) -> Environment:
     """The report's templates, and those of other folders: everything is escaped and made `visible`."""
     templates = Environment(
