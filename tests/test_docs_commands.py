@@ -36,6 +36,8 @@ CUT = {
     "harness eval --model ./my-checkpoint": "--limit 1",  # by transformers, which is slow on a CPU
     "harness eval --model ./my-checkpoint --prompt v2": "--limit 1",
     "harness eval --model my-model": "--limit 1",
+    "harness eval --model swarm-tiny-six --prompt v4 --dataset suite:v2v-safety --condition single-local"
+    " --condition 6g --control shuffled-messages": "--limit 1",  # of six families
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
     "harness grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
