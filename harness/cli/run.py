@@ -204,8 +204,8 @@ def show(done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Seque
         text.print(note)
 
 
-def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterator[str]:
-    """Where a run's times come from and how its answers were read."""
+def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: str = "") -> Iterator[str]:
+    """Where a run's times come from and how its answers were read; `means` says what shares are means of."""
     from harness.report.words import energy, pace
 
     yield from pace(m)
@@ -224,8 +224,8 @@ def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]") -> Iterat
         shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
         if shares[0] is not None:
             values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
-            yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}"
+            yield f"{role} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
         for when in ("at_first", "after_repair"):
             if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
                 share = Column("", turn.metric, 100, interval=True).cell(turn)
-                yield f"{role} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}"
+                yield f"{role} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}{means}"

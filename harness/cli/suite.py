@@ -127,7 +127,8 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         "for; 95 % intervals over episodes; gains are paired; the mean gives each family the same weight, "
         "and its interval is about other episodes of these families, not about other families"
     )
-    for note in origins(done.manifest, {(s.condition, s.metric): s for s in done.scores}):
+    figures = {(s.condition, s.metric): s for s in done.scores}
+    for note in origins(done.manifest, figures, ", as means over families"):
         text.print(note)
 
 
