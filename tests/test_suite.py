@@ -207,6 +207,15 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     assert Path("again.html").read_text() == page.replace('href="', f'href="{DONE}/')
 
 
+def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
+    code, _, err = project(*EVAL, "--control", "shuffled-messages")
+    assert (code, err) == (0, "")
+    gains = [s.value for s in read(DONE).scores if s.metric == "success_gain_over_single-local"]
+    assert min(gains) < 0, "messages of other layouts lose episodes"
+    page = (DONE / "report.html").read_text()
+    assert f">{100 * min(gains):.1f} points<" in page
+
+
 def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) -> None:
     code, _, err = evaluated(*EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1")
     assert (code, err) == (0, "")
