@@ -41,10 +41,9 @@ from harness.evaluate.lifecycle import (
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import table, walk
 from harness.runs import folder
-from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
-from harness.runs.records import Answer, ClosedLoop, Latency, Manifest
-from harness.runs.summary import counted, scores
+from harness.runs.records import Answer, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.summary import Figures, counted
 
 if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
@@ -299,13 +298,21 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
     """Score the chunks in a working folder and write the files of the finished run."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
-    grid = Grid(names, tuple(settings["seeds"]), tuple(chain.from_iterable(chunks)))
+    figures, by_part = list[Figures](), list[list[Episode]]()
     with uncollected():
-        contents = [folder.read_part(part, settings["actions"]) for part in parts]
-        decisions = Decisions.concat([decisions for decisions, _, _ in contents])
-        answers = [answer for _, _, answers in contents for answer in answers]
-        episodes = counted(grid, decisions, [episode for _, episodes, _ in contents for episode in episodes])
-        summary = scores(settings["world"]["kind"], grid, decisions, episodes, answers)
+        for chunk, part in zip(chunks, parts, strict=True):  # all decisions need not fit into memory
+            decisions, ended, part_answers = folder.read_part(part, settings["actions"])
+            grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
+            by_part.append(counted(grid, decisions, ended))
+            kind = settings["world"]["kind"]
+            figures.append(Figures.of(kind, grid, decisions, by_part[-1], part_answers))
+        whole = Figures.joined(figures)
+        answers, summary = [answer for answer, _ in whole.answers], whole.scores()
+        cells = len(names) * len(settings["seeds"])
+        episodes = [
+            episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)
+            for episode in of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
+        ]  # fmt: skip
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
             "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
@@ -316,7 +323,8 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
             "retries": sum(answer.retries for answer in answers),
             "versions": begun.versions,
         }, Manifest)  # fmt: skip
-        folder.write(out, manifest, decisions, episodes, folder.lines_of(parts), summary)
+        decisions_of_all = folder.decisions_of(parts, settings["actions"])
+        folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary)
     return Evaluated(out, manifest, summary)
 
 
