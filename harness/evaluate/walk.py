@@ -381,6 +381,17 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 
+def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
+    """Return tables of the same episodes and of different seeds, in their order, as `table` makes one."""
+    if len(tables) == 1:
+        return tables[0]
+    whole = Decisions.concat(tables)
+    ids = sorted(set().union(*(part.scenes for part in tables)))
+    condition = whole.codes("condition", [point.name for point in points])
+    order = np.lexsort((condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode")))
+    return whole.take(order)
+
+
 def _labels(of_scenes: Sequence[str | None], at: Ints, mask: Any = True) -> Labels:
     names = list(dict.fromkeys(label for label in of_scenes if label is not None))
     code: dict[str | None, int] = {None: -1, **{name: place for place, name in enumerate(names)}}
