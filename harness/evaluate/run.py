@@ -321,14 +321,16 @@ def _gather(out: Path, begun: Begun, chunks: Sequence[Sequence[int]], place: Pat
     """Score the chunks in a working folder and write the files of the finished run."""
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     names = tuple(condition["name"] for condition in settings["conditions"])
-    figures, by_part = list[Figures](), list[list[Episode]]()
+
+    def scored(chunk: Sequence[int], part: Path) -> tuple[list[Episode], Figures]:
+        decisions, ended, answers = folder.read_part(part, settings["actions"])
+        grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
+        episodes = counted(grid, decisions, ended)
+        return episodes, Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
+
     with uncollected():
-        for chunk, part in zip(chunks, parts, strict=True):  # all decisions need not fit into memory
-            decisions, ended, part_answers = folder.read_part(part, settings["actions"])
-            grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
-            by_part.append(counted(grid, decisions, ended))
-            kind = settings["world"]["kind"]
-            figures.append(Figures.of(kind, grid, decisions, by_part[-1], part_answers))
+        # One part after the other: the decisions of all would not fit into memory.
+        by_part, figures = zip(*map(scored, chunks, parts), strict=True)
         whole = Figures.joined(figures)
         answers, summary = [answer for answer, _ in whole.answers], whole.scores()
         cells = len(names) * len(settings["seeds"])
