@@ -9,11 +9,10 @@ from matplotlib.figure import Figure
 
 from harness.core.files import replacing, write_whole
 from harness.report.drawing.pictures import FORMATS, save
+from harness.studies.tables import as_csv, as_json_lines
 
 if TYPE_CHECKING:
     import pandas as pd
-
-ROWS = 100_000  # that are text in memory at a time
 
 
 def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.DataFrame]") -> None:
@@ -26,11 +25,10 @@ def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.Dat
         for kind in FORMATS:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
     for stem, table in tables.items():
-        with replacing(out / f"{stem}.csv") as part:
-            table.to_csv(part, index=False)
-        with replacing(out / f"{stem}.jsonl") as part, part.open("w", encoding="utf-8") as file:
-            for first in range(0, len(table), ROWS):
-                file.write(table[first : first + ROWS].to_json(orient="records", lines=True))
+        for ending, written in (("csv", as_csv), ("jsonl", as_json_lines)):
+            with replacing(out / f"{stem}.{ending}") as part, part.open("wb") as file:
+                for rows in written(table):
+                    file.write(rows)
 
 
 def write_manifest(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
