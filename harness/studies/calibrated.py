@@ -27,6 +27,7 @@ from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints
 from harness.evaluate.walk import Decided, Due, Fuses
 from harness.radio.channel import Draws, Unit
+from harness.studies.axes import Setting
 from harness.studies.play import Walked, walk_through
 
 VERSION = "3"
@@ -207,13 +208,17 @@ class Calibrated:
             "episodes_per_seed": self.episodes,
         }
 
-    def walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
+    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Sequence[Walked]]:
         """Episodes of every seed, `CHUNK` at a time, which bounds memory."""
+        for setting in settings:
+            yield list(self._walked(setting.point, setting.vehicles, seeds))
+
+    def _walked(self, point: OperatingPoint, vehicles: int, seeds: Sequence[int]) -> Iterator[Walked]:
         for first in range(0, self.episodes, CHUNK):
             numbers = first + np.arange(min(CHUNK, self.episodes - first))
             drawn = self._of_seeds(tuple(seeds), vehicles - 1, first)
             world = CalibratedWorld(drawn, seeds, numbers)
-            columns, places = walk_through(world, point, world, seeds, numbers)
+            [(columns, places)] = walk_through(world, [point], world, seeds, numbers)
             success = world.success.reshape(len(seeds), len(numbers)).astype(float)
             ends = {
                 "success_rate": success,

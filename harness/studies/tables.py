@@ -67,7 +67,7 @@ def _cell(value: Any) -> str:
 
 
 def _rows(columns: Sequence[tuple[Ints, list[str]]], start: str = "", end: str = "") -> Iterator[memoryview]:
-    """Yield rows between `start` and `end`; a column is the place of each row's text, `(n,)`, and the texts."""
+    """Yield rows from `start` to `end`; a column is the place of each row's text, `(n,)`, and the texts."""
     texts = [of_column for _, of_column in columns]
     texts[0] = [start + text for text in texts[0]]
     texts[-1] = [text + end + "\n" for text in texts[-1]]
