@@ -94,7 +94,7 @@ class FrozenWorld(Placed):
     def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
         self.scenario = dataset.scenario
-        self._walks = {point.name: _Walks(len(seeds), self._forest.root) for point in points}
+        self._walks = {point: _Walks(len(seeds), self._forest.root) for point in points}
         self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
         self._luck: tuple[Bools, Draws] | None = None  # of the moments just shown
 
@@ -108,7 +108,7 @@ class FrozenWorld(Placed):
 
     def due(self, point: OperatingPoint) -> Due:
         """Return a decision for each walk of the condition that is not at its end."""
-        walks, forest = self._walks[point.name], self._forest
+        walks, forest = self._walks[point], self._forest
         undecided = walks.at >= 0
         seed_index, tree = np.nonzero(undecided)
         at = np.searchsorted(self._moments, walks.at[undecided])
@@ -133,7 +133,7 @@ class FrozenWorld(Placed):
 
     def leave_out(self, point: OperatingPoint, moments: Bools) -> None:
         """End the walks that are at these of the moments just shown, and leave them out of the results."""
-        walks = self._walks[point.name]
+        walks = self._walks[point]
         undecided = walks.at >= 0
         ended = np.zeros_like(undecided)
         ended[undecided] = moments[np.searchsorted(self._moments, walks.at[undecided])]
@@ -143,7 +143,7 @@ class FrozenWorld(Placed):
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         """Follow the edge of each action."""
         for part in decided:
-            walks, action = self._walks[part.point.name], part.result.action
+            walks, action = self._walks[part.point], part.result.action
             undecided = walks.at >= 0
             at = walks.at[undecided]
             edge = np.full_like(walks.at, -1)
@@ -174,7 +174,7 @@ class FrozenWorld(Placed):
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
         """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out."""
-        walks, trees = self._walks[point.name], np.arange(len(self._forest.root))
+        walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
         ends = {"success_rate": success, "unsafe_rate": ~cleared, "late_rate": cleared & ~success}
@@ -183,8 +183,8 @@ class FrozenWorld(Placed):
     def episodes(self) -> list[Episode]:
         """Return how each episode ended under each condition and seed."""
         return [
-            self._episode(condition, walks, place)
-            for condition, walks in self._walks.items()
+            self._episode(point.name, walks, place)
+            for point, walks in self._walks.items()
             for place in np.ndindex(*walks.at.shape)
         ]
 

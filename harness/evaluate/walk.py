@@ -157,12 +157,13 @@ def walk(
     world: World[Moment], points: Sequence[OperatingPoint], ask: Ask[Moment]
 ) -> Iterator[Sequence[Decided[Moment]]]:
     """Walk a world under some conditions until every episode is decided; yield the decisions of each step."""
-    memories: dict[str, Memory] = {point.name: Memory() for point in points}
-    attackers = {point.name: Attackers(point) for point in points}
+    memories = {point: Memory() for point in points}
+    attackers = {point: Attackers(point) for point in points}
+    physical = {point for point in points if isinstance(point.channel, Physical)}
     while moments := world.observe():
         intents = ask(moments)
         due = {point: of_point for point in points if len((of_point := world.due(point)).at)}
-        if any(isinstance(point.channel, Physical) for point in due):
+        if not physical.isdisjoint(due):
             intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
         if any(point.needs("outlook") for point in due):
             intents = replace(intents, outlook=world.outlook())
@@ -171,7 +172,7 @@ def walk(
         asked_blind = [of_point.at for point, of_point in due.items() if point.asks_blind]
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         said = {
-            point: attackers[point.name].said(
+            point: attackers[point].said(
                 heard(point, intents, blind, of_point), of_point.draws, of_point.episodes
             )
             for point, of_point in due.items()
@@ -182,11 +183,11 @@ def walk(
         for point, due_here in due.items():
             said_here = said[point]
             call = calls[point.rewrites](due_here.at, shown(point, said_here)) if point.asks_again else None
-            fusion = Fusion(call, memories[point.name].recall(due_here))
+            fusion = Fusion(call, memories[point].recall(due_here))
             result = fuse(point, sent[point], said_here.intents, fusion)
             decided.append(Decided(point, moments, due_here, result, said_here))
         for part in decided:
-            memories[part.point.name].keep(part.due, part.result.state)
+            memories[part.point].keep(part.due, part.result.state)
         yield decided
         world.step(decided)
 
@@ -290,7 +291,7 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
     """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
     channel = point.channel

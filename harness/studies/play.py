@@ -82,20 +82,20 @@ def walk_through(
     world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int], episodes: Ints
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
     """The `columns` and `places` of each point's decisions, as rows round them; `episodes` (E,) ascending."""
-    parts: dict[str, list[dict[str, Floats]]] = {point.name: [] for point in points}
-    places: dict[str, list[Ints]] = {point.name: [] for point in points}
+    parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
+    places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     of_seed = {seed: place for place, seed in enumerate(seeds)}
     for decided in walk(world, points, ask):
         for part in decided:
-            parts[part.point.name].append(columns(part))
+            parts[part.point].append(columns(part))
             row = np.array([of_seed[seed] for seed in part.due.seed.tolist()])
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
-            places[part.point.name].append(place)
-    for name, steps in parts.items():
+            places[part.point].append(place)
+    for point, steps in parts.items():
         joint = {column: np.concatenate([step[column] for step in steps]) for column in steps[0]}
         for column in joint.keys() & DECIMALS.keys():
             joint[column] = joint[column].round(DECIMALS[column])
-        yield joint, np.concatenate(places[name])
+        yield joint, np.concatenate(places[point])
 
 
 @dataclass(frozen=True)

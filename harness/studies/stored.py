@@ -139,18 +139,17 @@ class Stored:
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int]
     ) -> Iterator[Sequence[Walked]]:
         """The same at points that are walked together."""
-        named = [
-            replace(point, name=f"{n}") for n, point in enumerate(points)
-        ]  # a walk tells them apart by it
-        world = FrozenWorld(self.dataset, named, seeds)
+        different = list(dict.fromkeys(points))
+        world = FrozenWorld(self.dataset, different, seeds)
 
         def leave_out(moments: Bools) -> None:
-            for point in named:
+            for point in different:
                 world.leave_out(point, moments)
 
-        walks = walk_through(world, named, _Nearest(self, vehicles - 1, leave_out), seeds, world.numbers)
-        for point, (columns, places) in zip(named, walks, strict=True):
-            yield [Walked(world.numbers, world.ends(point), columns, places)]
+        walks = walk_through(world, different, _Nearest(self, vehicles - 1, leave_out), seeds, world.numbers)
+        walked = dict(zip(different, walks, strict=True))
+        for point in points:
+            yield [Walked(world.numbers, world.ends(point), *walked[point])]
 
     def joules(self, moments: Sequence[Scene], point: OperatingPoint) -> tuple[Floats, float]:
         """Joules of each vehicle's answer, (n, 1+H), and watts of a radio that sends; NaN where unknown."""
