@@ -21,8 +21,9 @@ def write(out: Path, figures: Mapping[str, Figure], tables: "Mapping[str, pd.Dat
     out.mkdir(parents=True, exist_ok=True)
     for stem, figure in figures.items():
         # Where things go is laid out once and not for every format: it is half of the work.
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")
+        if layout := figure.get_layout_engine():
+            layout.execute(figure)
+            figure.set_layout_engine("none")
         for kind in FORMATS:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
     for stem, table in tables.items():
