@@ -19,7 +19,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.scheduling import Outlook
 from harness.core import noise
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, any_of
 from harness.dataset.load import Scene
 from harness.evaluate.attackers import Attackers, Said
 from harness.evaluate.claims import claims
@@ -173,7 +173,9 @@ def walk(
         blind = ask.blind(moments, np.unique(np.concatenate(asked_blind))) if asked_blind else None
         said = {
             point: attackers[point].said(
-                heard(point, intents, blind, of_point), of_point.draws, of_point.episodes
+                heard(point, intents, blind, of_point),
+                of_point.draws,
+                of_point.episodes if point.attack else (),
             )
             for point, of_point in due.items()
         }
@@ -199,7 +201,8 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
     they come from another layout: the next one in which the same seed has a decision at this step. If there
     is none, the ego hears nobody. Who is asked, the distances and the times stay the same.
     """
-    own = intents.take(due.at)
+    every = np.array_equal(due.at, np.arange(len(intents.own)))
+    own = intents if every else intents.take(due.at)
     if point.asks_blind:
         assert blind is not None
         said = blind.take(due.at)
@@ -301,7 +304,7 @@ def busy_ratio(point: OperatingPoint) -> float:
 def columns(decided: Decided[Any]) -> dict[str, Any]:
     """Return the numeric columns of decisions (n,) by name; NaN where unknown."""
     c, point = decided.result, decided.point
-    anybody = c.on_time.any(axis=-1)
+    anybody = any_of(c.on_time)
     return {
         "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
         "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,

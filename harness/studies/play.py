@@ -84,11 +84,11 @@ def walk_through(
     """The `columns` and `places` of each point's decisions, as rows round them; `episodes` (E,) ascending."""
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
-    of_seed = {seed: place for place, seed in enumerate(seeds)}
+    ascending = np.argsort(seeds)
     for decided in walk(world, points, ask):
         for part in decided:
             parts[part.point].append(columns(part))
-            row = np.array([of_seed[seed] for seed in part.due.seed.tolist()])
+            row = ascending[np.searchsorted(seeds, part.due.seed, sorter=ascending)]
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
             places[part.point].append(place)
     for point, steps in parts.items():
