@@ -36,7 +36,7 @@ LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
 # Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our own.
 PARTS: dict[str, tuple[Any, str]] = {
     "frames": (lockstep, "advance"),
-    "sensors": (freeze, "scene_graph"),
+    "sensors": (freeze, "scene_graphs"),
     "proxy": (Proxy, "complete"),
     "reference": (live, "decide"),
 }

@@ -5,6 +5,7 @@ workers and a resume cannot change it, and two operating points share their draw
 """
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,11 @@ def generator(*key: object) -> np.random.Generator:
     """Return the generator of one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
     return np.random.Generator(np.random.PCG64(int.from_bytes(seed, "big")))
+
+
+def normals(n: int, keys: Sequence[tuple[object, ...]]) -> NDArray[np.float64]:
+    """Return n standard normal draws of each key, (keys, n)."""
+    return np.array([generator(*key).standard_normal(n) for key in keys]).reshape(-1, n)
 
 
 def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:

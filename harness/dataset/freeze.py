@@ -17,7 +17,7 @@ from harness.world import lockstep
 from harness.world.beacons import known
 from harness.world.drivers import DRIVERS, choose
 from harness.world.outcome import Outcome
-from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.perception.graph import Graph, scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
 from harness.world.state import VehicleState, WorldState
 from harness.world.world import Target, World
@@ -31,15 +31,22 @@ def freeze(scenario: Scenario, seed: int, episode: int) -> tuple[list[list[Branc
     branchings, scenes = [], []
     while level:
         out_edges, following = edges(level, episode)
-        records, points = [], []
-        for world, edges_of_point in zip(level, out_edges, strict=True):
-            state = world.state()
-            record = _record(world, state, episode)
-            drivers = _drivers(scenario, state, record["graphs"][state.ego.id])
-            points.append(Branching(record["scene"], drivers, edges_of_point))
-            records.append(record)
-        scenes.append(records)
-        branchings.append(points)
+        states = [world.state() for world in level]
+        seen = moments([
+            (world, state, episode, (state.ego, *state.helpers))
+            for world, state in zip(level, states, strict=True)
+        ])  # fmt: skip
+        graphs = [record["graphs"][state.ego.id] for record, state in zip(seen, states, strict=True)]
+        drivers = _drivers(scenario, states, graphs)
+        branchings.append([
+            Branching(record["scene"], actions, out)
+            for record, actions, out in zip(seen, drivers, out_edges, strict=True)
+        ])  # fmt: skip
+        road = scenario.road().facts
+        scenes.append([
+            {**record, "road": road, "snapshot": world.snapshot()}
+            for world, record in zip(level, seen, strict=True)
+        ])  # fmt: skip
         level = following
     return branchings, scenes
 
@@ -84,23 +91,24 @@ def _edge(actions: list[str], branch: World, episode: int, following: dict[str, 
     return Edge(actions, child, end, gap_m, branch.hard_brakings, outcome.other_crashes)
 
 
-def _drivers(scenario: Scenario, state: WorldState, seen: Mapping[str, Any]) -> dict[str, str]:
-    """Return each reference driver's action at a decision point; `seen` is the ego's scene graph."""
-    truth = truth_graph(scenario, state)
-    return {driver: choose(scenario, driver, seen, truth) for driver in DRIVERS}
-
-
-def _record(world: World, state: WorldState, episode: int) -> Record:
-    return {
-        **moment(world, state, episode, (state.ego, *state.helpers)),
-        "road": world.scenario.road().facts,
-        "snapshot": world.snapshot(),
-    }
+def _drivers(
+    scenario: Scenario, states: Sequence[WorldState], seen: Sequence[Mapping[str, Any]]
+) -> list[dict[str, str]]:
+    """Return each reference driver's action at some decision points; `seen` has the ego's scene graphs."""
+    truths = truth_graphs(scenario, states)
+    return [
+        {driver: choose(scenario, driver, graph, truth) for driver in DRIVERS}
+        for graph, truth in zip(seen, truths, strict=True)
+    ]
 
 
 def scene_id(episode: int, state: WorldState) -> str:
     """Return `<episode>-<step>-<digest>`; equal states have equal ids, frozen and in the closed loop."""
-    return f"{episode:05d}-{state.step}-{digest(state.to_dict())[:12]}"
+    return _id(episode, state.to_dict())
+
+
+def _id(episode: int, state: Mapping[str, Any]) -> str:
+    return f"{episode:05d}-{state['step']}-{digest(state)[:12]}"
 
 
 def moment(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
@@ -108,20 +116,37 @@ def moment(world: World, state: WorldState, episode: int, viewers: Sequence[Vehi
 
     Distances to the conflict zone and to the ego are as the ego knows them.
     """
-    zone, ego = world.scenario.road().zone_m, viewers[0]
-    known_states = {v.id: known(state, v.id, ego.id) for v in viewers}
+    [record] = moments([(world, state, episode, viewers)])
+    return record
+
+
+def moments(points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]) -> list[Record]:
+    """Return the `moment` of some decision points of one scenario."""
+    scenario = points[0][0].scenario
+    looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
+    graphs = iter(scene_graphs(scenario, looks))
+    return [
+        _moment(world, state, episode, {viewer.id: next(graphs) for viewer in viewers})
+        for world, state, episode, viewers in points
+    ]
+
+
+def _moment(world: World, state: WorldState, episode: int, graphs: dict[str, Graph]) -> Record:
+    """Return a decision point's record, with the scene graphs of its viewers, by their ids."""
+    zone, (ego_id, *others) = world.scenario.road().zone_m, graphs
+    ego = state.vehicle(ego_id)
+    known_states = {name: known(state, name, ego_id) for name in graphs}
+    stated = state.to_dict()
     return {
-        "scene": scene_id(episode, state),
+        "scene": _id(episode, stated),
         "episode": episode,
         "episode_seed": world.seed,
         "step": state.step,
         "danger": {"sector": world.layout.danger, "vehicle": world.layout.danger_id},
-        "state": state.to_dict(),
-        "graphs": {v.id: scene_graph(world.scenario, state, v.id) for v in viewers},
-        "distance_m": {id_: _distance_m(v, *zone) for id_, v in known_states.items()},
-        "range_m": {
-            id_: _distance_m(v, ego.x_m, ego.y_m) for id_, v in known_states.items() if id_ != ego.id
-        },
+        "state": stated,
+        "graphs": graphs,
+        "distance_m": {name: _distance_m(v, *zone) for name, v in known_states.items()},
+        "range_m": {name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in others},
     }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
-from harness.dataset.freeze import moment
+from harness.dataset.freeze import moments
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import branches
@@ -137,7 +137,7 @@ class LiveWorld(Placed):
                     course.skipped += course.open is not None
             self._deciding = [t for t in self._going if any(c.open is None for c in t.courses)]
             if self._deciding:
-                self.scenes = [look(t, self._step, self._ego_alone) for t in self._deciding]
+                self.scenes = looks(self._deciding, self._step, self._ego_alone)
                 return self.scenes
             self._advance()
         return ()
@@ -201,10 +201,18 @@ class LiveWorld(Placed):
 
 def look(trajectory: Trajectory, step: int, ego_alone: bool) -> Scene:
     """Return a trajectory's decision point at this frame."""
-    world = trajectory.world
-    state = replace(world.state(), step=step)
-    viewers = [state.ego] if ego_alone else [state.ego, *state.helpers]
-    return Scene(moment(world, state, trajectory.number, viewers))
+    [scene] = looks([trajectory], step, ego_alone)
+    return scene
+
+
+def looks(trajectories: Sequence[Trajectory], step: int, ego_alone: bool) -> list[Scene]:
+    """Return the decision point of each trajectory at this frame."""
+    states = [replace(t.world.state(), step=step) for t in trajectories]
+    points = [
+        (t.world, state, t.number, [state.ego] if ego_alone else [state.ego, *state.helpers])
+        for t, state in zip(trajectories, states, strict=True)
+    ]
+    return [Scene(record) for record in moments(points)]
 
 
 def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:

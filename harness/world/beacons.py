@@ -58,10 +58,14 @@ def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
 
 def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
     """Return the sender's state as the receiver estimates it; the truth for itself or perfect knowledge."""
-    vehicle, beacon = state.vehicle(sender), last_heard(state, sender, receiver)
+    return estimated(state.vehicle(sender), last_heard(state, sender, receiver), state.time_s)
+
+
+def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> VehicleState:
+    """Return a vehicle's state as it is estimated from a beacon of it; the truth without one."""
     if beacon is None:
         return vehicle
-    travelled_m = beacon.speed_mps * (state.time_s - beacon.time_s)
+    travelled_m = beacon.speed_mps * (time_s - beacon.time_s)
     return replace(
         vehicle,
         x_m=beacon.x_m + travelled_m * math.cos(beacon.heading_rad),

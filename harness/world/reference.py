@@ -11,18 +11,28 @@ from harness.core.statistics import Estimate, rate_interval
 from harness.world import lockstep
 from harness.world.drivers import DRIVERS, PRIVILEGED, choose
 from harness.world.outcome import Outcome
-from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
+from harness.world.state import WorldState
 from harness.world.world import World
 
 TOGETHER = 16  # episodes that are simulated together
 
 
-def decide(driver: str, world: World) -> str:
-    """Return a driver's meta-action in the present state."""
-    scenario, state = world.scenario, world.state()
-    seen = scene_graph(scenario, state, state.ego.id) if driver == "local-view" else {}
-    return choose(scenario, driver, seen, truth_graph(scenario, state) if driver == PRIVILEGED else None)
+def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[str]:
+    """Return each world's driver's meta-action in its present state; the worlds are of one scenario."""
+    scenario = worlds[0].scenario
+    states: dict[str, list[WorldState]] = {"local-view": [], PRIVILEGED: []}
+    for world, driver in zip(worlds, drivers, strict=True):
+        if driver in states:
+            states[driver].append(world.state())
+    seen = iter(scene_graphs(scenario, [(state, state.ego.id) for state in states["local-view"]]))
+    truths = iter(truth_graphs(scenario, states[PRIVILEGED]))
+    graphs = [
+        (next(seen) if driver == "local-view" else {}, next(truths) if driver == PRIVILEGED else None)
+        for driver in drivers
+    ]
+    return [choose(scenario, driver, *graph) for driver, graph in zip(drivers, graphs, strict=True)]
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
@@ -30,7 +40,7 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
     going = list(zip(worlds, drivers, strict=True))
     while going := [(world, driver) for world, driver in going if not world.outcome.ended]:
         p, driven = worlds[0].scenario.parameters, [world for world, _ in going]
-        actions = [decide(driver, world) for world, driver in going]
+        actions = decide(driven, [driver for _, driver in going])
         lockstep.advance(driven, [p.due_frame(world.step) + p.lag_frames for world in driven])
         for world, action in zip(driven, actions, strict=True):
             world.decide(action)

@@ -16,12 +16,14 @@ import numpy as np
 import shapely
 from shapely import LineString, intersection
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 
 PathKey = tuple[str, str]  # approach and route
 Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number from the left
 STEP_M = 0.25  # distance between the points of a path
 ONE_LANE_M = 1.0  # ways nearer to each other than this share a lane
+CELL = 16  # points of a path among which the nearest is looked for at once
+NEAR_M = 1e-6  # far more than distances are rounded by
 BEND_M = 3.0  # distance before and after a point over which its curvature is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
 NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
@@ -109,6 +111,11 @@ class Path:
         x, y = (float(np.interp(arc_m, self.arc_m, along)) for along in self.columns)
         nearest = int(np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1))
         return x, y, float(self.headings_rad[nearest])
+
+    def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return x (m), y (m) and heading (rad) at arc lengths (...), as `at` does."""
+        x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
+        return x, y, self.headings_rad[np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1)]
 
     def section(self, arc_m: float) -> int:
         """Return the index of the section at an arc length."""
@@ -223,6 +230,30 @@ class Road:
         }  # fmt: skip
 
     @cached_property
+    def number(self) -> Mapping[PathKey, int]:
+        """Number of each path in `project`, which is its place among `paths`."""
+        return {key: n for n, key in enumerate(self.paths)}
+
+    @cached_property
+    def _cells(self) -> "_Cells":
+        return _Cells.of(list(self.paths.values()))
+
+    def project(self, path: Ints, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Project points on paths of these numbers, all (n,), as `Path.project` does one after the other.
+
+        Returns:
+            Arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest point, (n,).
+        """
+        return self._cells.project(path, x_m, y_m)
+
+    def near(self, x_m: Floats, y_m: Floats, within_m: float) -> Ints:
+        """Return which points (n,) may lie within a lateral offset of which paths: both numbers, (2, pairs).
+
+        All others do not, and few of these do not.
+        """
+        return self._cells.near(x_m, y_m, within_m)
+
+    @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
         """Sections (path and number) that several paths of one approach share; an indicator tells which."""
         of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
@@ -245,6 +276,100 @@ class Road:
     def watched(self) -> Floats:
         """The points of all sectors in order, (points, 2) m."""
         return np.concatenate(list(self.sectors.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Points of all paths, in cells of CELL successive ones, to find the nearest without asking all.
+
+    Attributes:
+        middles: x and y of a point of each cell, (2, paths, cells); inf after the last one of a path.
+        reach: distance from there to the farthest point of the cell, (paths, cells).
+        begins: number of the first point of each path, and the number of all points, (paths + 1,).
+        points: of every point x, y, arc length, heading, and its cosine and sine, (6, points).
+        bends: `_bends` of each path, (2, paths).
+    """
+
+    middles: Floats
+    reach: Floats
+    begins: Ints
+    points: Floats
+    bends: Floats
+
+    @classmethod
+    def of(cls, paths: Sequence[Path]) -> "_Cells":
+        most = max(math.ceil(len(path.points) / CELL) for path in paths)
+        middles, reach = np.full((2, len(paths), most), np.inf), np.zeros((len(paths), most))
+        for n, path in enumerate(paths):
+            for cell, begin in enumerate(range(0, len(path.points), CELL)):
+                points = path.points[begin : begin + CELL]
+                middles[:, n, cell] = middle = points[len(points) // 2]
+                reach[n, cell] = np.hypot(*(points - middle).T).max()
+        headings = np.concatenate([path.headings_rad for path in paths])
+        arcs = np.concatenate([path.arc_m for path in paths])
+        return cls(
+            middles, reach, np.cumsum([0, *(len(path.points) for path in paths)]),
+            np.stack([
+                *np.concatenate([path.columns for path in paths], axis=1),
+                arcs, headings, np.cos(headings), np.sin(headings),
+            ]),
+            np.array([_bends(path.points) for path in paths]).T,
+        )  # fmt: skip
+
+    def near(self, x_m: Floats, y_m: Floats, within_m: float) -> Ints:
+        """Do what `Road.near` says."""
+        x, y = x_m[:, None, None], y_m[:, None, None]
+        away = np.sqrt((self.middles[0] - x) ** 2 + (self.middles[1] - y) ** 2)
+        first, last = self.points[:2, self.begins[:-1]], self.points[:2, self.begins[1:] - 1]
+        ends = [np.hypot(end[0] - x[..., 0], end[1] - y[..., 0]) for end in (first, last)]
+        # Beyond its ends, a path continues straight.
+        beyond = np.minimum(*ends) <= away.min(axis=2) + NEAR_M
+        base, share = self.bends
+        straight = np.where(share < 1, 1 - share**2, np.nan)
+        root = np.sqrt((base * share) ** 2 + straight * (base**2 + within_m**2))
+        gap = (base * share + root) / straight  # gap**2 - (base + share * gap)**2 = within_m**2
+        gap = np.where(share < 1, gap, np.inf)
+        return np.array(np.nonzero(beyond | ((away - self.reach).min(axis=2) <= gap + NEAR_M)))
+
+    def project(self, path: Ints, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats, Floats]:
+        """Do what `Road.project` says."""
+        if not len(path):
+            return np.empty(0), np.empty(0), np.empty(0)
+        (x, y), most = self.middles[:, path], self.reach.shape[1]
+        away = np.sqrt((x - x_m[:, None]) ** 2 + (y - y_m[:, None]) ** 2)
+        near = away - self.reach[path] <= (away.min(axis=1) + NEAR_M)[:, None]
+        first, last = near.argmax(axis=1), most - 1 - near[:, ::-1].argmax(axis=1)
+        begin = self.begins[path] + first * CELL
+        count = np.minimum(self.begins[path] + (last + 1) * CELL, self.begins[path + 1]) - begin
+        starts = np.cumsum(count) - count
+        asked = np.repeat(np.arange(len(path)), count)
+        point = np.arange(len(asked)) + (begin - starts)[asked]
+        gap = np.hypot(self.points[0][point] - x_m[asked], self.points[1][point] - y_m[asked])
+        nearest = np.flatnonzero(gap == np.minimum.reduceat(gap, starts)[asked])
+        found = nearest[np.searchsorted(nearest, starts)]  # the first of equally near ones
+        x, y, arc, heading, cos, sin = self.points[:, point[found]]
+        along = (x_m - x) * cos + (y_m - y) * sin
+        # The squares of Python are those of `Path.project`; NumPy's are rounded otherwise.
+        squares = [g**2 - a**2 for g, a in zip(gap[found].tolist(), along.tolist(), strict=True)]
+        return arc + along, np.sqrt(np.maximum(squares, 0.0)), heading
+
+
+def _bends(points: Floats) -> tuple[float, float]:
+    """Return b and c of the bound on how far along the heading a place lies from the nearest point of a path.
+
+    Let v lead from the nearest point, which is no end of the path, to the place, and d and e to that point
+    from the one before and on to the one after. Neither of these is nearer, so v*e <= e*e/2 and
+    -v*d <= d*d/2. The heading is that of d + e, so the place lies at most b + c |v| along it:
+    b = e*e / |d + e| and c = 3 |e - d| / |d + e|, with the largest e and e - d, and the smallest d + e.
+    """
+    steps = np.diff(points, axis=0)
+    longest, bend, chord = (
+        np.hypot(*each.T) for each in (steps, np.diff(steps, axis=0), steps[1:] + steps[:-1])
+    )
+    least = chord.min(initial=np.inf)
+    if not 0 < least < np.inf:
+        return 0.0, 1.0  # no bound
+    return float(longest.max() ** 2 / least), float(3 * bend.max() / least)
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:

@@ -16,6 +16,7 @@ from harness.evaluate.branches import Trajectory
 from harness.evaluate.claims import claims
 from harness.evaluate.live_world import look
 from harness.world import scenarios
+from harness.world.perception.graph import scene_graph, scene_graphs, truth_graph, truth_graphs
 from harness.world.reference import drive
 from harness.world.scenario import Scenario
 from harness.world.state import WorldState
@@ -135,3 +136,39 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(scenario: Scenar
             assert fused.trust is not None
             assert (fused.trust[there] > 0.8).all()
             state = fused.state
+
+
+def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario) -> None:
+    states = []
+    for seed in SEEDS:
+        world = World.start(scenario, seed)
+        for step in range(scenario.parameters.decisions):
+            states.append(world.state())
+            if world.outcome.ended:
+                break
+            world.act(scenario.actions[(seed + step) % len(scenario.actions)])
+    looks = [(state, v.id) for state in states for v in (state.ego, *state.helpers)]
+    assert scene_graphs(scenario, looks) == [scene_graph(scenario, *each) for each in looks]
+    truths = truth_graphs(scenario, states)
+    assert truths == [truth_graph(scenario, state) for state in states]
+
+
+def test_many_points_are_projected_as_each_alone_and_all_that_lie_near_a_path_are_found(
+    scenario: Scenario,
+) -> None:
+    road, rng, far_m = scenario.road(), np.random.default_rng(1), 2.2
+    paths = list(road.paths.values())
+    on = np.concatenate([path.points[rng.integers(len(path.points), size=60)] for path in paths])
+    beyond = np.concatenate([path.points[[0, -1]] for path in paths]) * 1.2
+    points = np.concatenate(
+        [on, on + rng.normal(0.0, far_m, on.shape), beyond, rng.uniform(-99, 99, on.shape)]
+    )
+    place, path = np.indices((len(points), len(paths))).reshape(2, -1)
+    found = np.array(road.project(path, *points[place].T))
+    pairs = zip(path.tolist(), points[place].tolist(), strict=True)
+    alone = np.array([paths[n].project(x, y) for n, (x, y) in pairs])
+    assert np.array_equal(found.T, alone)
+    near = np.zeros((len(points), len(paths)), dtype=bool)
+    near[tuple(road.near(points[:, 0], points[:, 1], far_m))] = True
+    assert near[found[1].reshape(near.shape) <= far_m].all()
+    assert not near.all()

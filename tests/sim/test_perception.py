@@ -8,7 +8,7 @@ import pytest
 
 from harness.core.files import canonical_json
 from harness.world.perception.graph import scene_graph, truth_graph
-from harness.world.perception.rays import blocked_by, first_hits, sweep
+from harness.world.perception.rays import RAYS, blocked_by, sweep
 from harness.world.perception.sensors import detect
 from harness.world.scenarios.occluded_intersection import SCENARIO
 from harness.world.state import Building, VehicleState, WorldState
@@ -64,11 +64,12 @@ def test_a_truck_hides_the_car_right_behind_it():
 
 
 def test_a_ray_ends_on_the_first_surface_it_meets():
-    near = Building("b1", -1.0, -6.0, 1.0, -5.0).corners()
-    far = Building("b2", -1.0, -9.0, 1.0, -8.0).corners()
-    parameter, met = first_hits(np.zeros(2), np.array([[0.0, -1.0], [0.0, 1.0]]), np.array([far, near]))
-    assert parameter.tolist() == [5.0, math.inf]
-    assert met[0] == 1
+    near, far = Building("b1", 1.0, 46.0, 3.0, 47.0), Building("b2", 1.0, 43.0, 3.0, 44.0)
+    view = sweep(scene(buildings=[far, near]), EGO)
+    north, south = 3 * RAYS // 4, RAYS // 4
+    assert view.range_m[[north, south]].tolist() == [pytest.approx(5.0), math.inf]
+    assert north in view.hits["b1"]
+    assert north not in view.hits.get("b2", ())
 
 
 def test_points_are_seen_up_to_the_wall_that_hides_those_behind_it():

@@ -1,5 +1,9 @@
-"""Ray casting: which objects a vehicle has a line of sight to, past buildings and other vehicles."""
+"""Ray casting: which objects a vehicle has a line of sight to, past buildings and other vehicles.
 
+Many viewers look at once, in one pass over arrays, and one viewer is many of which there is one.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -7,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.core.arrays import Floats
-from harness.world.state import VehicleState, WorldState
+from harness.core.arrays import Bools, Floats, Ints
+from harness.world.state import SIZES_M, VehicleState, WorldState, rectangle
 
 RAYS = 1440  # a quarter of a degree apart
+Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks around in it
 
 
 @dataclass(frozen=True)
@@ -28,16 +33,64 @@ class Sweep:
     hits: dict[str, NDArray[np.intp]]
 
 
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """What stops the rays of some viewers (v), viewer by viewer: other vehicles in their order, buildings.
+
+    Attributes:
+        origins_m: the viewers' centres, (v, 2).
+        ids: ids of each viewer's surfaces.
+        viewer: number of the viewer whose surface each is, (n,).
+        place: its place among that viewer's surfaces, (n,).
+        vehicle: whether it is a vehicle, (n,).
+        corners_m: its corners, (n, 4, 2).
+    """
+
+    origins_m: Floats
+    ids: tuple[tuple[str, ...], ...]
+    viewer: Ints
+    place: Ints
+    vehicle: Bools
+    corners_m: Floats
+
+    def by_viewer(self, values: Any) -> Any:
+        """Lay values of the surfaces (n,) out as (v, most surfaces of one); 0 or false without a surface."""
+        laid = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
+        laid[self.viewer, self.place] = values
+        return laid
+
+
 def turned(angle_rad: Any) -> Any:
     """Wrap an angle, or angles, to -pi to pi."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
-def surfaces(state: WorldState, viewer: VehicleState) -> tuple[list[str], Floats]:
-    """Return ids and corners (n, 4, 2) of everything that stops a ray, except the viewer itself."""
-    solid = [v for v in state.vehicles if v.id != viewer.id]
-    ids = [v.id for v in solid] + [b.id for b in state.buildings]
-    return ids, np.array([v.corners() for v in solid] + [b.corners() for b in state.buildings])
+def surfaces(looks: Sequence[Look]) -> Surfaces:
+    """Return everything that stops a ray of each viewer, except the viewer itself."""
+    states = {id(state): state for state, _ in looks}
+    vehicles = [(v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles]
+    boxes = [building.corners() for state in states.values() for building in state.buildings]
+    outlines = rectangle(*np.ascontiguousarray(np.array(vehicles).T))
+    corners = np.concatenate([outlines, np.array(boxes).reshape(-1, 4, 2)])
+    begin, box, first = 0, len(vehicles), dict[int, tuple[int, int]]()
+    for key, state in states.items():
+        first[key] = begin, box
+        begin, box = begin + len(state.vehicles), box + len(state.buildings)
+    at, ids, others = [], [], []
+    for state, viewer in looks:
+        begin, box = first[id(state)]
+        seen = [n for n, v in enumerate(state.vehicles) if v.id != viewer.id]
+        at += [begin + n for n in seen]
+        at += range(box, box + len(state.buildings))
+        ids.append((*(state.vehicles[n].id for n in seen), *(b.id for b in state.buildings)))
+        others.append(len(seen))
+    sizes = list(map(len, ids))
+    whose = np.repeat(np.arange(len(looks)), sizes)
+    place = np.concatenate([np.arange(size) for size in sizes])
+    return Surfaces(
+        np.array([(v.x_m, v.y_m) for _, v in looks]), tuple(ids), whose, place,
+        place < np.array(others)[whose], corners[np.array(at, dtype=int)],
+    )  # fmt: skip
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
@@ -51,90 +104,120 @@ def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, 
     Returns:
         Ray parameter, (r, 4n), inf if a wall is not met; and position along the wall from 0 to 1, (r, 4n).
     """
-    start, along = (part.reshape(-1, 2) for part in _walls(origin, corners))
-    return _met(start, along, targets[:, None])
+    walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
+    return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
 
 
-def _walls(origin: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Return each wall's beginning relative to the origin and its vector, both (n, 4, 2)."""
-    start = corners - origin
-    return start, np.roll(corners, -1, axis=1) - origin - start
+def _walls(origins: Floats, corners: Floats) -> Floats:
+    """Return what `_met` reads of the walls of surfaces (n, 4, 2) as seen from origins (n, 2), (5, 4, n).
+
+    These are x and y of a wall's beginning, those of its vector, and their cross product.
+    """
+    begin = corners.transpose(2, 1, 0) - origins.T[:, None]
+    (x, y), (dx, dy) = begin, np.roll(begin, -1, axis=1) - begin
+    return np.stack([x, y, dx, dy, x * dy - y * dx])
 
 
-def _met(start: Floats, along: Floats, targets: Floats) -> tuple[Floats, Floats]:
-    """Compute `meetings` for walls (..., 2) and rays (..., 2) that broadcast against each other."""
-    (x, y), (dx, dy), (ray_x, ray_y) = (np.moveaxis(part, -1, 0) for part in (start, along, targets))
+def _met(walls: Floats, ray_x: Floats, ray_y: Floats) -> tuple[Floats, Floats]:
+    """Compute `meetings` for walls (5, ...) and rays whose coordinates broadcast against each other."""
+    x, y, dx, dy, cross = walls
     # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
     determinant = ray_x * dy - ray_y * dx
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = (x * dy - y * dx) / determinant
+        t = cross / determinant
         u = (x * ray_y - y * ray_x) / determinant
     return np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf), u
 
 
-def first_hits(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Find where rays first meet a surface.
+def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats, Ints]:
+    """Find which surface each target's ray meets first; of equally near ones, that with the lowest number.
 
     Args:
-        origin: (2,) m.
-        targets: (r, 2) direction vectors; a ray parameter of 1 is their length.
-        corners: (n, 4, 2) m.
+        surface: numbers of the surfaces that may be met, (m,), ascending.
+        target: number of the target that each may be met on the way to, (m,).
+        t: ray parameter at which it is met, (m,).
+        targets: number of targets.
 
     Returns:
-        Ray parameter, (r,), inf if nothing is met; and index of the object that is met first, (r,).
+        Ray parameter, (targets,), inf if nothing is met, and number of the surface, -1 if nothing is met.
     """
-    t, _ = meetings(origin, targets, corners)
-    edge = t.argmin(axis=1)
-    return t[np.arange(len(t)), edge], edge // 4
+    least, met = np.full(targets, np.inf), np.full(targets, -1)
+    np.minimum.at(least, target, t)
+    nearest = np.flatnonzero((t == least[target]) & (t < np.inf))[::-1]
+    met[target[nearest]] = surface[nearest]  # of several, the last one written stays
+    return least, met
 
 
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     """Cast rays in all directions from a vehicle."""
-    bearing, rays = _all_round()
-    ids, corners = surfaces(state, viewer)
-    origin = np.array([viewer.x_m, viewer.y_m])
-    distance, met = np.full(RAYS, np.inf), np.zeros(RAYS, dtype=int)
-    towards = _towards(origin, corners)
-    surface = np.repeat(np.arange(len(ids)), [len(some) for some in towards])
-    start, along = (np.swapaxes(part, 0, 1)[:, surface] for part in _walls(origin, corners))
-    t, _ = _met(start, along, rays[np.concatenate(towards)])
-    nearest, begin = t.min(axis=0), 0
-    for n, some in enumerate(towards):
-        there = nearest[begin : begin + len(some)]
-        nearer = there < distance[some]
-        distance[some[nearer]], met[some[nearer]] = there[nearer], n
-        begin += len(some)
-    reached = np.isfinite(distance)
-    hits = {name: np.flatnonzero(reached & (met == n)) for n, name in enumerate(ids)}
-    return Sweep(bearing, distance, {name: rays for name, rays in hits.items() if len(rays)})
+    around = surfaces([(state, viewer)])
+    distance, met = _swept(around, np.ones(len(around.place), dtype=bool))
+    hits = {name: np.flatnonzero(met == n) for n, name in enumerate(around.ids[0])}
+    return Sweep(_all_round()[0], distance, {name: rays for name, rays in hits.items() if len(rays)})
 
 
-def _towards(origin: Floats, corners: Floats) -> list[NDArray[np.intp]]:
-    """Return the indices of the rays that may meet each surface: those between its outermost corners."""
-    to = corners - origin
+def rays_on_vehicles(around: Surfaces) -> Ints:
+    """Return how many of its viewer's rays end on each surface that is a vehicle, (n,), as in a `Sweep`."""
+    _, met = _swept(around, around.vehicle)
+    return np.where(around.vehicle, np.bincount(met[met >= 0], minlength=len(met))[: len(around.vehicle)], 0)
+
+
+def _swept(around: Surfaces, of: Bools) -> tuple[Floats, Ints]:
+    """Cast the rays that may meet the surfaces `of` (n,); return `_first` of all rays of all viewers."""
+    begin, count = _towards(around)
+    surface = np.repeat(np.arange(len(count)), count)
+    ray = np.arange(len(surface)) + (begin - np.cumsum(count) + count)[surface]
+    ray[ray >= RAYS] -= RAYS
+    target = ray + (around.viewer * RAYS)[surface]
+    if not of.all():
+        cast = np.zeros(len(around.ids) * RAYS, dtype=bool)
+        cast[target[of[surface]]] = True
+        told = cast[target]
+        surface, ray, target = surface[told], ray[told], target[told]
+    walls = _walls(around.origins_m[around.viewer], around.corners_m)
+    t, _ = _met(walls[:, :, surface], *_all_round()[1][:, ray])
+    return _first(surface, target, t.min(axis=0), len(around.ids) * RAYS)
+
+
+def _towards(around: Surfaces) -> tuple[Ints, Ints]:
+    """Return the first ray that may meet each surface, (n,), and how many may, between its outer corners."""
+    to = around.corners_m - around.origins_m[around.viewer, None]
     bearing = np.arctan2(to[..., 1], to[..., 0])
     aside = turned(bearing - bearing[:, :1])
     step = 2 * np.pi / RAYS
-    first = np.floor((bearing[:, 0] + aside.min(axis=1)) / step).astype(int).tolist()
-    last = np.ceil((bearing[:, 0] + aside.max(axis=1)) / step).astype(int).tolist()
+    first = np.floor((bearing[:, 0] + aside.min(axis=1)) / step).astype(int) - 1
+    last = np.ceil((bearing[:, 0] + aside.max(axis=1)) / step).astype(int) + 1
     # A viewer inside a surface, or right beside it, may meet it in any direction.
-    all_round = (np.ptp(aside, axis=1) >= np.pi - step).tolist()
-    return [
-        np.arange(RAYS) if everywhere else np.arange(begin - 1, end + 2) % RAYS
-        for begin, end, everywhere in zip(first, last, all_round, strict=True)
-    ]
+    all_round = np.ptp(aside, axis=1) >= np.pi - step
+    return np.where(all_round, 0, first % RAYS), np.where(all_round, RAYS, last + 1 - first)
 
 
 @lru_cache(maxsize=1)
 def _all_round() -> tuple[Floats, Floats]:
-    """Return bearings (RAYS,) and their directions (RAYS, 2); shared arrays, not to be written to."""
+    """Return bearings (RAYS,) and their directions (2, RAYS); shared arrays, not to be written to."""
     bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
-    return bearing, np.column_stack([np.cos(bearing), np.sin(bearing)])
+    return bearing, np.stack([np.cos(bearing), np.sin(bearing)])
+
+
+def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
+    """Return for each viewer and each of the points (k, 2) which surface hides it, (v, k); -1 if it is seen.
+
+    Surfaces hide nothing where `solid` (n,) is false.
+    """
+    surface = np.flatnonzero(solid)
+    viewer = around.viewer[surface]
+    walls = _walls(around.origins_m[viewer], around.corners_m[surface])
+    x, y = points.T[:, None] - around.origins_m.T[..., None]
+    t, _ = _met(walls[..., None], x[viewer], y[viewer])
+    target = viewer[:, None] * len(points) + np.arange(len(points))
+    least, met = _first(
+        np.repeat(surface, len(points)), target.ravel(), t.min(axis=0).ravel(), x.size
+    )  # fmt: skip
+    return np.where(least < 1, met, -1).reshape(x.shape)
 
 
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
     """Return for each of the points (k, 2) the id of what blocks the view of it; None if it is seen."""
-    ids, corners = surfaces(state, viewer)
-    origin = np.array([viewer.x_m, viewer.y_m])
-    distance, met = first_hits(origin, points - origin, corners)
-    return [ids[m] if d < 1 else None for d, m in zip(distance, met, strict=True)]
+    around = surfaces([(state, viewer)])
+    met = hidden(around, points, np.ones(len(around.place), dtype=bool))
+    return [around.ids[0][n] if n >= 0 else None for n in met[0].tolist()]

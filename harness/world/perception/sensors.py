@@ -10,11 +10,14 @@ Noise is Gaussian with those standard deviations (declared for this harness, typ
 data sheets, no particular product), keyed by episode, step, viewer and object.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress, product
 
 import numpy as np
 
 from harness.core import noise
+from harness.core.arrays import Bools, Floats
 from harness.world.ambient import AMBIENTS, DAY, Ambient, sun_rad
 from harness.world.perception.rays import Sweep, turned
 from harness.world.state import VehicleState, WorldState
@@ -24,6 +27,10 @@ HALF_FIELD_RAD = np.radians(60.0)
 LEAST_RAYS = 3  # rays on an object below which no sensor reports it
 # Standard deviations: the LiDAR's position on each axis, the radar's range.
 LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
+# Names of the sensors that report, by whether each of them does.
+SENSORS = {
+    told: tuple(compress(("camera", "lidar", "radar"), told)) for told in product((False, True), repeat=3)
+}
 
 
 @dataclass(frozen=True)
@@ -59,61 +66,69 @@ def detect(
     state: WorldState, viewer: VehicleState, view: Sweep, ambient: Ambient = AMBIENTS[DAY]
 ) -> list[Detection]:
     """Return the detections of one vehicle's sensors, in the order of the state's vehicles."""
-    found = []
-    for v in state.vehicles:
-        if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS:
-            detection = _fused(state, viewer, v, ambient)
-            if detection:
-                found.append(detection)
-    return found
+    others = [v for v in state.vehicles if v.id != viewer.id and len(view.hits.get(v.id, ())) >= LEAST_RAYS]
+    return [d for d in detections([(state, viewer, v) for v in others], ambient) if d]
 
 
-def _fused(state: WorldState, viewer: VehicleState, v: VehicleState, ambient: Ambient) -> Detection | None:
-    dx, dy = v.x_m - viewer.x_m, v.y_m - viewer.y_m
-    distance, bearing = float(np.hypot(dx, dy)), float(np.arctan2(dy, dx))
-    off_axis = abs(turned(bearing - viewer.heading_rad))
-    in_field = min(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
-    seen = {
-        "camera": in_field and distance <= ambient.camera_m and not _dazzled(state, bearing, ambient),
-        "lidar": distance <= LIDAR_RANGE_M,
-        "radar": in_field and distance <= RADAR_RANGE_M,
-    }
-    sensors = tuple(name for name, yes in seen.items() if yes)
-    if not sensors:
-        return None
-    z = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id).standard_normal(8)
+def detections(
+    pairs: Sequence[tuple[WorldState, VehicleState, VehicleState]], ambient: Ambient
+) -> list[Detection | None]:
+    """Return what all sensors of a viewer together report of another vehicle in its sight; None if nothing.
+
+    Args:
+        pairs: states, each with a viewer and a vehicle on which enough rays of the viewer end.
+        ambient: light and weather.
+    """
+    if not pairs:
+        return []
+    viewers, others = (
+        np.array([(v.x_m, v.y_m, v.heading_rad, v.speed_mps) for v in pair]).T.copy()
+        for pair in ([viewer for _, viewer, _ in pairs], [other for *_, other in pairs])
+    )
+    (its_x, its_y, its_heading, its_speed), (x, y, heading, speed) = viewers, others
+    dx, dy = x - its_x, y - its_y
+    distance, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
+    off_axis = np.abs(turned(bearing - its_heading))
+    in_field = np.minimum(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
+    camera = in_field & (distance <= ambient.camera_m)
+    if ambient.glare_rad:
+        camera &= ~_dazzled([state.episode_seed for state, *_ in pairs], bearing, ambient)
+    lidar = distance <= LIDAR_RANGE_M
+    radar = in_field & (distance <= RADAR_RANGE_M)
+    reported = camera | lidar | radar
+    keys = [
+        ("sensors", state.episode_seed, state.step, viewer.id, v.id)
+        for (state, viewer, v), there in zip(pairs, reported.tolist(), strict=True) if there
+    ]  # fmt: skip
+    z = np.zeros((8, len(pairs)))
+    z[:, reported] = noise.normals(8, keys).T
 
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both see.
-    if seen["lidar"]:
-        x, y = v.x_m + LIDAR_NOISE_M * z[0], v.y_m + LIDAR_NOISE_M * z[1]
-    else:
-        r, b = distance + RADAR_NOISE_M * z[0], bearing + np.radians(1.0) * z[1]
-        x, y = viewer.x_m + r * np.cos(b), viewer.y_m + r * np.sin(b)
-    rate = None
-    if seen["radar"]:
-        relative = np.array(
-            [
-                v.speed_mps * np.cos(v.heading_rad) - viewer.speed_mps * np.cos(viewer.heading_rad),
-                v.speed_mps * np.sin(v.heading_rad) - viewer.speed_mps * np.sin(viewer.heading_rad),
-            ]
+    r, b = distance + RADAR_NOISE_M * z[0], bearing + np.radians(1.0) * z[1]
+    x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], its_x + r * np.cos(b))
+    y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], its_y + r * np.sin(b))
+    parting = [
+        speed * turn(heading) - its_speed * turn(its_heading) for turn in (np.cos, np.sin)
+    ]  # velocity relative to the viewer
+    ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    rate = np.vecdot(np.stack(parting, axis=-1), ways) + 0.15 * z[2]
+    its_heading_rad = heading + np.radians(2.0) * z[3]
+    speed_mps = np.maximum(speed + np.where(radar, 0.2, 0.8) * z[4], 0.0)
+    columns = (camera, lidar, radar, reported, x_m, y_m, its_heading_rad, speed_mps, rate)
+    return [
+        Detection(
+            v.id, SENSORS[by_camera, by_lidar, by_radar], v.kind if by_camera else None,
+            v.indicator if by_camera else None, at_x, at_y, to_rad if by_lidar else None, mps,
+            away_mps if by_radar else None, v.braking if by_camera else None,
+        ) if there else None
+        for (*_, v), by_camera, by_lidar, by_radar, there, at_x, at_y, to_rad, mps, away_mps in zip(
+            pairs, *(column.tolist() for column in columns), strict=True
         )
-        rate = float(relative @ [np.cos(bearing), np.sin(bearing)] + 0.15 * z[2])
-    return Detection(
-        id=v.id,
-        sensors=sensors,
-        kind=v.kind if seen["camera"] else None,
-        indicator=v.indicator if seen["camera"] else None,
-        x_m=float(x),
-        y_m=float(y),
-        heading_rad=float(v.heading_rad + np.radians(2.0) * z[3]) if seen["lidar"] else None,
-        speed_mps=float(max(v.speed_mps + (0.2 if seen["radar"] else 0.8) * z[4], 0.0)),
-        range_rate_mps=rate,
-        braking=v.braking if seen["camera"] else None,
-    )
+    ]  # fmt: skip
 
 
-def _dazzled(state: WorldState, bearing_rad: float, ambient: Ambient) -> bool:
-    """Whether the sun blinds a camera in this direction."""
-    if not ambient.glare_rad:
-        return False
-    return bool(abs(turned(bearing_rad - sun_rad(state.episode_seed))) < ambient.glare_rad)
+def _dazzled(episode_seeds: Sequence[int], bearing_rad: Floats, ambient: Ambient) -> Bools:
+    """Whether the sun blinds a camera in each direction (n,), in episodes of these seeds."""
+    suns = {seed: sun_rad(seed) for seed in set(episode_seeds)}
+    sun = np.array([suns[seed] for seed in episode_seeds])
+    return np.asarray(np.abs(turned(bearing_rad - sun)) < ambient.glare_rad)

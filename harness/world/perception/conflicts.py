@@ -1,0 +1,249 @@
+"""Which path each known vehicle seems to follow, and where it conflicts with the ego.
+
+The vehicles that many viewers know are laid on the road in one pass over arrays.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.world.perception.sensors import Detection
+from harness.world.road import ONE_LANE_M, PathKey, Road
+from harness.world.state import SIZES_M, VehicleState, indicator
+
+ON_PATH_M = 2.2  # farther from a path than this, an object is not on it
+ALIKE = 0.05  # tolerance of costs: paths that share a lane differ by rounding only
+STANDING_MPS = 0.5  # a lower speed is taken for sensor noise
+ALIGNED_RAD = np.radians(40.0)  # more turned from a path than this, an object does not follow it
+ALIGNED = float(np.cos(ALIGNED_RAD))
+
+Graph = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Seat:
+    """Where a viewer sits: its position, and the cosine and sine of its heading."""
+
+    x_m: float
+    y_m: float
+    cos: float
+    sin: float
+
+    def relative(self, x_m: float, y_m: float) -> dict[str, float]:
+        """Return a position in the viewer's frame."""
+        dx, dy = x_m - self.x_m, y_m - self.y_m
+        return {
+            "forward_m": tenths(dx * self.cos + dy * self.sin),
+            "left_m": tenths(dx * self.sin - dy * self.cos),
+        }
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where on the road a vehicle is.
+
+    Attributes:
+        near: arc length, and heading there, on each path to which it is nearer than ON_PATH_M.
+        key: the path that it seems to follow; None if none.
+    """
+
+    near: Mapping[PathKey, tuple[float, float]]
+    key: PathKey | None
+
+    @property
+    def arc_m(self) -> float:
+        """Arc length on the path that it follows."""
+        assert self.key is not None
+        return self.near[self.key][0]
+
+
+@dataclass(frozen=True)
+class Known:
+    """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it.
+
+    Attributes:
+        seat: the viewer's.
+        d: the vehicle.
+        place: where it is; it follows a path.
+        ego: the ego.
+        ego_arc_m: arc length on the ego's path.
+    """
+
+    seat: Seat
+    d: Detection
+    place: Place
+    ego: VehicleState
+    ego_arc_m: float
+
+    @property
+    def key(self) -> PathKey:
+        """The vehicle's path."""
+        assert self.place.key is not None
+        return self.place.key
+
+    @property
+    def own(self) -> PathKey:
+        """The ego's path."""
+        return self.ego.approach, self.ego.route
+
+
+def tenths(value: float) -> float:
+    """Round to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
+    return round(float(value), 1) + 0.0
+
+
+def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
+    """Return where vehicles are, each on the path that it seems to follow.
+
+    That is the nearest that fits its heading and indicator; of equally good paths, the road's first one.
+    """
+    x, y, own = np.array(
+        [(d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad) for d in detections]
+    ).reshape(-1, 3).T  # fmt: skip
+    thing, path = road.near(x, y, ON_PATH_M)
+    arc, lateral, heading = road.project(path, x[thing], y[thing])
+    cos = np.cos(own[thing] - heading)
+    keys = list(road.paths)
+    near: list[dict[PathKey, tuple[float, float]]] = [{} for _ in detections]
+    best: list[tuple[float, PathKey] | None] = [None] * len(detections)
+    alike = ALIKE if road.form == 2 else 0.0
+    for n, p, arc_m, lateral_m, to_rad, turned in zip(
+        *(column.tolist() for column in (thing, path, arc, lateral, heading, cos)), strict=True
+    ):
+        if lateral_m > ON_PATH_M:
+            continue
+        key, d = keys[p], detections[n]
+        near[n][key] = arc_m, to_rad
+        if d.heading_rad is None:
+            turned = 0.0
+        elif turned < ALIGNED:
+            continue
+        # Routes that part later fit equally well until then, so the indicator decides.
+        forks = (key, road.paths[key].section(arc_m)) in road.forks
+        unlikely = forks and indicator(key[1]) != (d.indicator or "off")
+        cost = lateral_m + (1.0 - turned) * 10.0 + (1.0 if unlikely else 0.0)
+        least = best[n]
+        if lateral_m < ON_PATH_M and (least is None or cost < least[0] - alike):
+            best[n] = cost, key
+    return [Place(on, of and of[1]) for on, of in zip(near, best, strict=True)]
+
+
+def conflicts(road: Road, all_known: Sequence[Known]) -> list[list[Graph]]:
+    """Return the conflicts of each vehicle with the ego."""
+    met: list[list[Graph]] = [[] for _ in all_known]
+    if road.form == 2:
+        for n, conflict in _along(road, all_known):
+            met[n].append(conflict)
+    for found, known in zip(met, all_known, strict=True):
+        if not found and (meeting := _meeting(road, known)):
+            found.append(meeting)
+    return met
+
+
+def _meeting(road: Road, known: Known) -> Graph | None:
+    """Return the conflict where another's path crosses or merges into the ego's; None if one is past it."""
+    crossing = road.crossings.get(known.key)
+    if crossing is None:
+        return None
+    d, ego = known.d, known.ego
+    length = SIZES_M[d.kind or "car"][0]
+    if road.ways and road.paths[known.own].project(crossing.x_m, crossing.y_m)[1] > ON_PATH_M:
+        return None  # it meets another of the ego's ways
+    to_go, ego_to_go = crossing.other_arc_m - known.place.arc_m, crossing.ego_arc_m - known.ego_arc_m
+    if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
+        return None
+    return {
+        "with": d.id,
+        "sector": known.key[0],
+        "route": known.key[1],
+        "point": known.seat.relative(crossing.x_m, crossing.y_m),
+        "ego": _arrival(ego_to_go, ego.speed_mps),
+        "other": {**_arrival(to_go, d.speed_mps), "speed_mps": tenths(d.speed_mps)},
+        **({"kind": crossing.kind, "lane": "own"} if road.form == 2 else {}),
+    }
+
+
+def _arrival(to_go_m: float, speed_mps: float) -> dict[str, float | None]:
+    """Return the remaining arc length (m, negative once past) and time (s, None at a standstill)."""
+    return {
+        "arc_m": tenths(to_go_m),
+        "time_s": tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None,
+    }
+
+
+def _along(road: Road, all_known: Sequence[Known]) -> Iterator[tuple[int, Graph]]:
+    """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
+
+    Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a distance to
+    go; of two that meet head-on, both have.
+    """
+    shared = [
+        (n, side, key) for n, known in enumerate(all_known) for side, key in road.beside(known.own).items()
+        if key in known.place.near
+    ]  # fmt: skip
+    apart = _apart(road, [(all_known[n], key) for n, _, key in shared])
+    its_heading = _at(road, [(known.key, known.place.arc_m) for known in all_known])[:, 2]
+    of = [n for n, _, _ in shared]
+    on = np.array([all_known[n].place.near[key] for n, _, key in shared]).reshape(-1, 2)
+    cos = np.cos(its_heading[of] - on[:, 1]).tolist()
+    found = []
+    for (n, side, key), separate, turned in zip(shared, apart, cos, strict=True):
+        known = all_known[n]
+        gap = known.place.near[key][0] - known.ego_arc_m
+        if (side != "own" and not separate) or abs(turned) < ALIGNED or (turned < 0 and gap < 0):
+            continue
+        d, ego_mps = known.d, known.ego.speed_mps
+        its_mps = d.speed_mps if turned > 0 else -d.speed_mps
+        kind = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
+        if kind == "behind" and d.speed_mps <= STANDING_MPS:
+            continue  # what is parked behind the ego never meets it
+        closing_mps = (ego_mps - its_mps) * (1 if gap > 0 else -1)
+        share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
+        time_s = tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
+        found.append((n, side, key, kind, gap, share, time_s))
+    points = _at(road, [
+        (key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in found
+    ])  # fmt: skip
+    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(found, points.tolist(), strict=True):
+        known = all_known[n]
+        yield n, {
+            "with": known.d.id,
+            "sector": known.key[0],
+            "route": known.key[1],
+            "point": known.seat.relative(x, y),
+            "ego": {"arc_m": tenths(abs(gap) * share), "time_s": time_s},
+            "other": {
+                "arc_m": tenths(abs(gap) * (1 - share)), "time_s": time_s,
+                "speed_mps": tenths(known.d.speed_mps),
+            },
+            "kind": kind,
+            "lane": side,
+        }  # fmt: skip
+
+
+def _apart(road: Road, shared: Sequence[tuple[Known, PathKey]]) -> list[bool]:
+    """Whether each way is in another lane than the ego's where the vehicle is."""
+    x, y = np.array([(known.d.x_m, known.d.y_m) for known, _ in shared]).reshape(-1, 2).T
+    own = np.array([road.number[known.own] for known, _ in shared], dtype=int)
+    way = np.array([road.number[key] for _, key in shared], dtype=int)
+    aside = np.flatnonzero(own != way)
+    arc, _, _ = road.project(own[aside], x[aside], y[aside])
+    at = _at(road, [(shared[n][0].own, arc_m) for n, arc_m in zip(aside.tolist(), arc.tolist(), strict=True)])
+    apart = np.zeros(len(shared), dtype=bool)
+    apart[aside] = road.project(way[aside], at[:, 0], at[:, 1])[1] > ONE_LANE_M
+    found: list[bool] = apart.tolist()
+    return found
+
+
+def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:
+    """Return x, y and heading at an arc length of a path, for each that is asked for, (n, 3)."""
+    found = np.empty((len(asked), 3))
+    of: dict[PathKey, list[int]] = {}
+    for n, (key, _) in enumerate(asked):
+        of.setdefault(key, []).append(n)
+    for key, numbers in of.items():
+        found[numbers] = np.stack(road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1)
+    return found
