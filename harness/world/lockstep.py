@@ -51,11 +51,11 @@ def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
         _together(lanes, *zip(*going[begin:end], strict=True))
 
 
-def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
+def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[int]) -> None:
     begun = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
     speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
-    fleet = _Fleet(lanes, worlds)
+    fleet = Fleet(lanes, worlds)
     sizes_m, there = fleet.size, fleet.there
     poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
@@ -86,7 +86,7 @@ def _together(lanes: "_Lanes", worlds: Sequence[World], until_frames: Sequence[i
 
 
 @dataclass(frozen=True)
-class _Lanes:
+class Lanes:
     """The lanes of a network as arrays; each is a straight lane or an arc.
 
     Attributes:
@@ -142,7 +142,7 @@ class _Lanes:
 
 
 @lru_cache(maxsize=64)
-def _lanes(road: Callable[[], Road]) -> _Lanes | None:
+def _lanes(road: Callable[[], Road]) -> Lanes | None:
     """Return the lanes of a road; None if some are neither straight nor arcs."""
     graph = road().network().graph
     of = {
@@ -161,7 +161,7 @@ def _lanes(road: Callable[[], Road]) -> _Lanes | None:
         )
 
     nowhere = np.zeros(2)
-    return _Lanes(
+    return Lanes(
         {name: n for n, name in enumerate(of)}, list(of),
         each("start", nowhere, False) + each("center", nowhere, True),
         each("direction", nowhere, False), each("direction_lateral", nowhere, False),
@@ -171,10 +171,10 @@ def _lanes(road: Callable[[], Road]) -> _Lanes | None:
     )  # fmt: skip
 
 
-class _Fleet:
+class Fleet:
     """The vehicles of some worlds, as arrays (B, V); positions and impacts are (B, V, 2)."""
 
-    def __init__(self, lanes: _Lanes, worlds: Sequence[World]) -> None:
+    def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
         scenario = worlds[0].scenario
         p = scenario.parameters
         self.lanes, self.scenario, self.dt = lanes, scenario, 1 / p.simulation_hz
@@ -252,16 +252,9 @@ class _Fleet:
         self.stood = self.crashed.copy()
         self._act()
         self._move()
+        on_road = self._place_ego()
         self.frame = self.frame + 1
         self._collide()
-        ego_lane = self.lane_now[:, 0]
-        along, lateral = self.lanes.coordinates(self.xy[:, 0], ego_lane)
-        room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[ego_lane]
-        on_road = (
-            (np.abs(lateral) <= self.lanes.width[ego_lane] / 2)
-            & (-room_m <= along)
-            & (along < length_m + room_m)
-        )
         xy = np.where(self.there[..., None], self.xy, np.nan)
         cleared = self.scenario.cleared(xy, self.approach, self.scenario.parameters)
         crashes = (self.crashed != self.stood).any(axis=1)
@@ -273,15 +266,20 @@ class _Fleet:
         along, lateral = lanes.coordinates(self.xy, self.lane)
         ends = along > lanes.length[self.lane] - AbstractLane.VEHICLE_LENGTH / 2
         if ends.any():
-            b, n = np.nonzero(ends)
-            following = self.route[b, n, self.section[b, n] + 1]
-            b, n, following = b[following >= 0], n[following >= 0], following[following >= 0]
-            self.section[b, n] += 1
-            self.lane[b, n] = following
-            along[b, n], lateral[b, n] = lanes.coordinates(self.xy[b, n], following)
+            b, n = self.follow(ends)
+            along[b, n], lateral[b, n] = lanes.coordinates(self.xy[b, n], self.lane[b, n])
         self.steering = self._steering(along, lateral)
         self.acceleration = self._acceleration()
         self.braking = self.acceleration < -LAMPS_MPS2
+
+    def follow(self, ends: Bools) -> tuple[Ints, Ints]:
+        """Move vehicles (B, V) on to the next lane of their route; return the indices of those that have one."""
+        b, n = np.nonzero(ends)
+        following = self.route[b, n, self.section[b, n] + 1]
+        b, n, following = b[following >= 0], n[following >= 0], following[following >= 0]
+        self.section[b, n] += 1
+        self.lane[b, n] = following
+        return b, n
 
     def _steering(self, along: Floats, lateral: Floats) -> Floats:
         least = np.where(self.speed >= 0, SLOW_MPS, -SLOW_MPS)
@@ -342,21 +340,34 @@ class _Fleet:
         self.heading = self.heading + self.speed * np.sin(slip) / (self.size[..., 0] / 2) * self.dt
         self.speed = self.speed + acceleration * self.dt
         self.lane_now = np.where(self.there, self.lane, self.lane_now)
+
+    def _place_ego(self) -> Bools:
+        """Set the ego's lane to the nearest of its ways; return whether that lane's road is below it, (B,)."""
         if self.ways.size:
             places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
             _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
             self.lane_now[:, 0] = self.ways[np.abs(off_m).argmin(axis=1)]
+        lane = self.lane_now[:, 0]
+        along, lateral = self.lanes.coordinates(self.xy[:, 0], lane)
+        room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[lane]
+        return np.asarray(
+            (np.abs(lateral) <= self.lanes.width[lane] / 2) & (-room_m <= along) & (along < length_m + room_m)
+        )
 
-    def _collide(self) -> None:
-        """Do what `_Road.step` does: highway-env checks the pairs that may touch within the frame."""
+    def _near(self) -> tuple[Ints, Ints, Ints]:
+        """Return the worlds and the numbers of pairs that are so near that they might touch."""
         x, y = self.xy[..., 0], self.xy[..., 1]
         dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
         within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M
         near = np.triu(dx * dx + dy * dy < within * within, 1)
         near &= self.there[:, :, None] & self.there[:, None]
-        if not near.any():
+        return np.nonzero(near)
+
+    def _collide(self) -> None:
+        """Do what `_Road.step` does: highway-env checks the pairs that may touch within the frame."""
+        b, n, other = self._near()
+        if not b.size:
             return
-        b, n, other = np.nonzero(near)
         poses = np.concatenate([self.xy, self.heading[..., None]], axis=-1)
         apart_m = separation_m(poses[b, n], self.size[b, n], poses[b, other], self.size[b, other])
         moves_m = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
