@@ -10,7 +10,7 @@ What happens rarely (a lane ends, two vehicles may touch) is left to `Fleet`. Im
 or loads it from numba's cache.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import pi, sqrt
 from typing import Any, TypeVar
 
@@ -21,8 +21,9 @@ from numba import boolean, float64, int64, njit, void
 from numba.types import UniTuple
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.world.lockstep import SLOW_MPS, Fleet
-from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
+from harness.world.lockstep import SLOW_MPS, Fleet, Lanes
+from harness.world.simulator import BRAKES_OFF_HZ, LAMPS_MPS2, NEAR_M, Traffic
+from harness.world.world import World
 
 # Types of arguments by their dimensions. Constants of other modules are arguments, too: numba's cache would not
 # notice that one has changed.
@@ -38,38 +39,50 @@ def _loop(*types: Any, result: Any = void) -> Callable[[Loop], Loop]:
 
 
 class CompiledFleet(Fleet):
-    """A fleet whose frames are compiled; what it holds, and each of its numbers, is that of `Fleet`."""
+    """A fleet whose frames are compiled; what it holds, and each of its numbers, is that of `Fleet`.
+
+    Attributes:
+        way: direction in which each vehicle last moved, rad, with its cosine and sine.
+    """
+
+    def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
+        super().__init__(lanes, worlds)
+        self.way, self.cos, self.sin = (np.full_like(self.speed, np.nan) for _ in range(3))
 
     def _act(self) -> None:
-        ends, ahead, turn = self._turn()
-        if ends:
-            self.follow(self.ends)
-            _, ahead, turn = self._turn()
         of, speed = ControlledVehicle, self.speed
+        xy, lane, section = self.xy.reshape(-1, 2), self.lane.reshape(-1), self.section.reshape(-1)
+        route, speeds = self.route.reshape(len(lane), -1), speed.reshape(-1)
+        ahead, turn, on = self._turn(xy, lane, section, route, speeds)
+        if on.size:  # copies: what goes over to its next lane there is not to go on to the one after it
+            ahead[on], turn[on], _ = self._turn(xy[on], lane[on], section[on], route[on], speeds[on])
         slip = np.empty_like(speed)
-        _slip(ahead, np.arcsin(turn), self.heading, speed, self.size, SLOW_MPS, of.KP_HEADING, slip)
+        _slip(
+            ahead.reshape(speed.shape), np.arcsin(turn).reshape(speed.shape), self.heading, speed, self.size,
+            SLOW_MPS, of.KP_HEADING, slip,
+        )  # fmt: skip
         self.steering = np.arctan(2 * np.tan(np.arcsin(slip)))
         self.acceleration = np.zeros_like(speed)
         self._keep_apart()
         _control(
             self.frame, self.target, speed, self.crashed, self.brakes_at, self.brakes_mps2, self.brakes_to,
             float(self.scenario.parameters.simulation_hz), BRAKES_OFF_HZ, LAMPS_MPS2, of.KP_A, *self.limits,
-            FAST_MPS, of.MAX_SPEED, of.MIN_SPEED, self.most_steering,
-            self.steering, self.acceleration, self.braking,
+            of.MAX_SPEED, of.MIN_SPEED, self.most_steering, self.steering, self.acceleration, self.braking,
         )  # fmt: skip
 
-    def _turn(self) -> tuple[bool, Floats, Floats]:
-        """Return whether lanes end, where vehicles' lanes head for, and the sine of the turn towards their middle."""
+    def _turn(
+        self, xy: Floats, lane: Ints, section: Ints, route: Ints, speed: Floats
+    ) -> tuple[Floats, Floats, Ints]:
+        """Return where the lanes of vehicles (N,) head for, the sine of their turn, and who goes to the next lane."""
         lanes, of = self.lanes, ControlledVehicle
-        dots, angle = self._dots(self.xy.reshape(-1, 2), self.lane.reshape(-1))
-        self.ends = np.empty_like(self.there)
-        ahead, turn = np.empty_like(self.speed), np.empty_like(self.speed)
-        ends = _turn(
-            dots, angle, self.lane, self.speed, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.heading,
+        dots, angle = self._dots(xy, lane)
+        ahead, turn, on = np.empty_like(speed), np.empty_like(speed), np.empty_like(lane)
+        count = _turn(
+            dots, angle, speed, route, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.heading,
             lanes.length, AbstractLane.VEHICLE_LENGTH / 2, of.TAU_PURSUIT, -of.KP_LATERAL, SLOW_MPS,
-            self.ends, ahead, turn,
+            lane, section, ahead, turn, on,
         )  # fmt: skip
-        return ends, ahead, turn
+        return ahead, turn, on[:count]
 
     def _dots(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
         """Return what `_place` needs of points (N, 2) and lanes (N,): products (2, N), and angles on arcs (N,)."""
@@ -80,22 +93,27 @@ class CompiledFleet(Fleet):
 
     def _keep_apart(self) -> None:
         """Set the acceleration of vehicles that have to brake for another in their lane."""
-        most = self.speed.size * (self.speed.shape[1] - 1)
-        pairs, away = np.empty((2, most), dtype=int), np.empty((most, 2))
+        worlds, most = self.speed.shape
+        pairs, away = np.empty((worlds * most * (most - 1), 3), dtype=int), np.empty((worlds * most * (most - 1), 2))
         count = _faster(self.lane_now, self.speed, self.xy, pairs, away)
         if count:
-            heading = self.heading.reshape(-1)[pairs[0, :count]]
-            ways = np.empty((count, 2))
+            b, n, _ = pairs[:count].T
+            ways, heading = np.empty((count, 2)), self.heading[b, n]
             ways[:, 0], ways[:, 1] = np.cos(heading), np.sin(heading)
             ahead = np.vecdot(away[:count], ways)
             _brake(ahead, pairs, self.speed, self.size, Traffic.standoff_m, Traffic.braking_mps2, self.acceleration)
 
     def _move(self) -> None:
         slip = np.arctan(1 / 2 * np.tan(self.steering))
-        way = self.heading + slip
+        sin_slip, way = slip.copy(), self.heading + slip
+        np.sin(slip, out=sin_slip, where=slip != 0)  # most drive straight on
+        turned = way != self.way
+        np.cos(way, out=self.cos, where=turned)
+        np.sin(way, out=self.sin, where=turned)
+        self.way = way
         _move(
-            np.cos(way), np.sin(way), np.sin(slip), self.acceleration, self.impact, self.size, self.lane,
-            self.there, self.dt, self.xy, self.heading, self.speed, self.pushed, self.crashed, self.lane_now,
+            self.cos, self.sin, sin_slip, self.acceleration, self.impact, self.size, self.lane, self.there, self.dt,
+            self.xy, self.heading, self.speed, self.pushed, self.crashed, self.lane_now,
         )  # fmt: skip
 
     def _place_ego(self) -> Bools:
@@ -110,11 +128,19 @@ class CompiledFleet(Fleet):
         )  # fmt: skip
         return on_road
 
-    def _near(self) -> tuple[Ints, Ints, Ints]:
-        found = np.empty((3, self.speed.size * (self.speed.shape[1] - 1) // 2), dtype=int)
-        count = _near(self.xy, self.speed, self.reach, self.there, self.dt, NEAR_M, found)
-        b, n, other = found[:, :count]
-        return b, n, other
+    def _near(self) -> Ints:
+        worlds, most = self.speed.shape
+        pairs = np.empty((worlds * most * (most - 1) // 2, 3), dtype=int)
+        count = _near(self.xy, self.speed, self.reach, self.there, self.dt, NEAR_M, pairs)
+        if not count:
+            return pairs[:0]
+        b, n, other = pairs[:count].T
+        heading, its_heading = self.heading[b, n], self.heading[b, other]
+        count = _apart(
+            np.cos(heading), np.sin(heading), np.cos(its_heading), np.sin(its_heading), self.xy, self.speed,
+            self.size, self.dt, NEAR_M, pairs,
+        )  # fmt: skip
+        return pairs[:count]
 
 
 @_loop(F, result=F)
@@ -163,25 +189,27 @@ def _place(
     return sign * (phi - phase) * radius, sign * (radius - sqrt(dot))
 
 
-@_loop(F2, F1, I2, F2, B1, F1, F1, F1, F1, F1, F, F, F, F, B2, F2, F2, result=boolean)
+@_loop(F2, F1, F1, I2, B1, F1, F1, F1, F1, F1, F, F, F, F, I1, I1, F1, F1, I1, result=int64)
 def _turn(
-    dots: Floats, angle: Floats, lane: Ints, speed: Floats, arc: Bools, radius: Floats, phase: Floats,
+    dots: Floats, angle: Floats, speed: Floats, route: Ints, arc: Bools, radius: Floats, phase: Floats,
     sign: Floats, heading: Floats, length: Floats, margin_m: float, tau_s: float, gain: float, slow: float,
-    ends: Bools, ahead: Floats, turn: Floats,
-) -> bool:  # fmt: skip
-    """Set where lanes end and head for, and the sine of the turn to their middle: the first half of steering."""
-    some = False
-    for b in range(lane.shape[0]):
-        for n in range(lane.shape[1]):
-            k, i = lane[b, n], b * lane.shape[1] + n
-            along, lateral = _place(dots[0, i], dots[1, i], angle[i], arc[k], radius[k], phase[k], sign[k])
-            ends[b, n] = along > length[k] - margin_m
-            some |= ends[b, n]
-            ahead[b, n] = heading[k]
-            if arc[k]:
-                ahead[b, n] = sign[k] * (along + speed[b, n] * tau_s) / radius[k] + phase[k] + pi / 2 * sign[k]
-            turn[b, n] = _within(1.0, gain * lateral / _not_zero(speed[b, n], slow))
-    return some
+    lane: Ints, section: Ints, ahead: Floats, turn: Floats, on: Ints,
+) -> int:  # fmt: skip
+    """Set where lanes head for and the sine of the turn to their middle; list and count who goes to the next."""
+    count = 0
+    for i in range(len(lane)):
+        k = lane[i]
+        along, lateral = _place(dots[0, i], dots[1, i], angle[i], arc[k], radius[k], phase[k], sign[k])
+        ahead[i] = heading[k]
+        if arc[k]:
+            ahead[i] = sign[k] * (along + speed[i] * tau_s) / radius[k] + phase[k] + pi / 2 * sign[k]
+        turn[i] = _within(1.0, gain * lateral / _not_zero(speed[i], slow))
+        if along > length[k] - margin_m and route[i, section[i] + 1] >= 0:
+            section[i] += 1
+            lane[i] = route[i, section[i]]
+            on[count] = i
+            count += 1
+    return count
 
 
 @_loop(F2, F2, F2, F2, F3, F, F, F2)
@@ -198,13 +226,13 @@ def _slip(
 
 @_loop(I2, F2, F3, I2, F2, result=int64)
 def _faster(lane: Ints, speed: Floats, xy: Floats, pairs: Ints, away: Floats) -> int:
-    """List vehicles that are faster than another in their lane, counted through all worlds; how many?"""
-    count, most = 0, speed.shape[1]
+    """List and count vehicles that are faster than another in their lane: world, number and number."""
+    count = 0
     for b in range(speed.shape[0]):
-        for n in range(most):
-            for other in range(most):
+        for n in range(speed.shape[1]):
+            for other in range(speed.shape[1]):
                 if lane[b, n] == lane[b, other] and speed[b, n] > speed[b, other]:
-                    pairs[0, count], pairs[1, count] = b * most + n, b * most + other
+                    pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
                     away[count, 0] = xy[b, other, 0] - xy[b, n, 0]
                     away[count, 1] = xy[b, other, 1] - xy[b, n, 1]
                     count += 1
@@ -216,20 +244,19 @@ def _brake(
     ahead: Floats, pairs: Ints, speed: Floats, size: Floats, standoff_m: float, braking_mps2: float,
     acceleration: Floats,
 ) -> None:  # fmt: skip
-    most = speed.shape[1]
     for i in range(len(ahead)):
-        b, n, other = pairs[0, i] // most, pairs[0, i] % most, pairs[1, i] % most
+        b, n, other = pairs[i, 0], pairs[i, 1], pairs[i, 2]
         room = ahead[i] - (size[b, n, 0] + size[b, other, 0]) / 2 - standoff_m
         closing = speed[b, n] - speed[b, other]
         if ahead[i] > 0 and closing * closing > 2 * braking_mps2 * room:
             acceleration[b, n] = -2 * braking_mps2
 
 
-@_loop(I1, F2, F2, B2, F2, F2, F2, F, F, F, F, F, F, F, F, F, F, F2, F2, B2)
+@_loop(I1, F2, F2, B2, F2, F2, F2, F, F, F, F, F, F, F, F, F, F2, F2, B2)
 def _control(
     frame: Ints, target: Floats, speed: Floats, crashed: Bools, brakes_at: Floats, brakes_mps2: Floats,
     brakes_to: Floats, hz: float, brakes_off_hz: float, lamps_mps2: float, gain: float, least: float,
-    most: float, fast: float, fastest: float, slowest: float, most_steering: float,
+    most: float, fastest: float, slowest: float, most_steering: float,
     steering: Floats, acceleration: Floats, braking: Bools,
 ) -> None:  # fmt: skip
     """Finish steering, acceleration and brake lamps, by vehicles' own plans and what wrecks and limits do."""
@@ -293,9 +320,9 @@ def _nearest(
 
 @_loop(F3, F2, F2, B2, F, F, I2, result=int64)
 def _near(
-    xy: Floats, speed: Floats, reach: Floats, there: Bools, dt: float, near_m: float, found: Ints
+    xy: Floats, speed: Floats, reach: Floats, there: Bools, dt: float, near_m: float, pairs: Ints
 ) -> int:
-    """List pairs of vehicles that are so near that they might touch, as worlds and numbers; how many?"""
+    """List and count pairs of vehicles whose circles are near: world, number and number."""
     count = 0
     for b in range(speed.shape[0]):
         for n in range(speed.shape[1]):
@@ -303,6 +330,32 @@ def _near(
                 within = reach[b, n] + reach[b, other] + speed[b, n] * dt + near_m
                 dx, dy = xy[b, other, 0] - xy[b, n, 0], xy[b, other, 1] - xy[b, n, 1]
                 if dx * dx + dy * dy < within * within and there[b, n] and there[b, other]:
-                    found[0, count], found[1, count], found[2, count] = b, n, other
+                    pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
                     count += 1
+    return count
+
+
+@_loop(F1, F1, F1, F1, F3, F2, F3, F, F, I2, result=int64)
+def _apart(
+    cos: Floats, sin: Floats, its_cos: Floats, its_sin: Floats, xy: Floats, speed: Floats, size: Floats,
+    dt: float, near_m: float, pairs: Ints,
+) -> int:  # fmt: skip
+    """Keep those pairs first that no separating axis keeps apart, as `separation_m` has it; how many?"""
+    count = 0
+    for i in range(len(cos)):
+        b, n, other = pairs[i, 0], pairs[i, 1], pairs[i, 2]
+        dx, dy = xy[b, other, 0] - xy[b, n, 0], xy[b, other, 1] - xy[b, n, 1]
+        dot = abs(cos[i] * its_cos[i] + sin[i] * its_sin[i])
+        cross = abs(cos[i] * its_sin[i] - sin[i] * its_cos[i])
+        length, width = size[b, n, 0], size[b, n, 1]
+        its_length, its_width = size[b, other, 0], size[b, other, 1]
+        apart_m = max(
+            abs(dx * cos[i] + dy * sin[i]) - (length + its_length * dot + its_width * cross) / 2,
+            abs(dy * cos[i] - dx * sin[i]) - (width + its_length * cross + its_width * dot) / 2,
+            abs(dx * its_cos[i] + dy * its_sin[i]) - (its_length + length * dot + width * cross) / 2,
+            abs(dy * its_cos[i] - dx * its_sin[i]) - (its_width + length * cross + width * dot) / 2,
+        )
+        if apart_m <= (abs(speed[b, n]) + abs(speed[b, other])) * dt + near_m:
+            pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
+            count += 1
     return count

@@ -266,20 +266,15 @@ class Fleet:
         along, lateral = lanes.coordinates(self.xy, self.lane)
         ends = along > lanes.length[self.lane] - AbstractLane.VEHICLE_LENGTH / 2
         if ends.any():
-            b, n = self.follow(ends)
-            along[b, n], lateral[b, n] = lanes.coordinates(self.xy[b, n], self.lane[b, n])
+            b, n = np.nonzero(ends)
+            following = self.route[b, n, self.section[b, n] + 1]
+            b, n, following = b[following >= 0], n[following >= 0], following[following >= 0]
+            self.section[b, n] += 1
+            self.lane[b, n] = following
+            along[b, n], lateral[b, n] = lanes.coordinates(self.xy[b, n], following)
         self.steering = self._steering(along, lateral)
         self.acceleration = self._acceleration()
         self.braking = self.acceleration < -LAMPS_MPS2
-
-    def follow(self, ends: Bools) -> tuple[Ints, Ints]:
-        """Move vehicles (B, V) on to the next lane of their route; return the indices of those that have one."""
-        b, n = np.nonzero(ends)
-        following = self.route[b, n, self.section[b, n] + 1]
-        b, n, following = b[following >= 0], n[following >= 0], following[following >= 0]
-        self.section[b, n] += 1
-        self.lane[b, n] = following
-        return b, n
 
     def _steering(self, along: Floats, lateral: Floats) -> Floats:
         least = np.where(self.speed >= 0, SLOW_MPS, -SLOW_MPS)
@@ -342,7 +337,7 @@ class Fleet:
         self.lane_now = np.where(self.there, self.lane, self.lane_now)
 
     def _place_ego(self) -> Bools:
-        """Set the ego's lane to the nearest of its ways; return whether that lane's road is below it, (B,)."""
+        """Set the ego's lane to the nearest of its ways; return whether the road is below it, (B,)."""
         if self.ways.size:
             places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
             _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
@@ -354,25 +349,24 @@ class Fleet:
             (np.abs(lateral) <= self.lanes.width[lane] / 2) & (-room_m <= along) & (along < length_m + room_m)
         )
 
-    def _near(self) -> tuple[Ints, Ints, Ints]:
-        """Return the worlds and the numbers of pairs that are so near that they might touch."""
+    def _near(self) -> Ints:
+        """Return pairs of vehicles that may touch within the frame: world, number and number, (n, 3)."""
         x, y = self.xy[..., 0], self.xy[..., 1]
         dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
         within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M
         near = np.triu(dx * dx + dy * dy < within * within, 1)
         near &= self.there[:, :, None] & self.there[:, None]
-        return np.nonzero(near)
-
-    def _collide(self) -> None:
-        """Do what `_Road.step` does: highway-env checks the pairs that may touch within the frame."""
-        b, n, other = self._near()
-        if not b.size:
-            return
+        if not near.any():
+            return np.empty((0, 3), dtype=int)
+        b, n, other = np.nonzero(near)
         poses = np.concatenate([self.xy, self.heading[..., None]], axis=-1)
         apart_m = separation_m(poses[b, n], self.size[b, n], poses[b, other], self.size[b, other])
         moves_m = (np.abs(self.speed[b, n]) + np.abs(self.speed[b, other])) * self.dt + NEAR_M
-        touching = apart_m <= moves_m
-        for row, one, two in np.stack([b, n, other], axis=-1)[touching].tolist():
+        return np.stack([b, n, other], axis=-1)[apart_m <= moves_m]
+
+    def _collide(self) -> None:
+        """Do what `_Road.step` does: highway-env checks the pairs that may touch."""
+        for row, one, two in self._near().tolist():
             vehicles = self.worlds[row].vehicles
             for k in (one, two):
                 v, at = vehicles[k], (row, k)
