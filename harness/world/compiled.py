@@ -42,12 +42,16 @@ class CompiledFleet(Fleet):
     """A fleet whose frames are compiled; what it holds, and each of its numbers, is that of `Fleet`.
 
     Attributes:
-        way: direction in which each vehicle last moved, rad, with its cosine and sine.
+        way: direction in which each vehicle last moved, rad.
+        cos: its cosine.
+        sin: its sine.
+        lanes_of_ego: the lanes that the ego may change between, (B, L).
     """
 
     def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
         super().__init__(lanes, worlds)
         self.way, self.cos, self.sin = (np.full_like(self.speed, np.nan) for _ in range(3))
+        self.lanes_of_ego = np.tile(self.ways, (len(worlds), 1))
 
     def _act(self) -> None:
         of, speed = ControlledVehicle, self.speed
@@ -85,23 +89,23 @@ class CompiledFleet(Fleet):
         return ahead, turn, on[:count]
 
     def _dots(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return what `_place` needs of points (N, 2) and lanes (N,): products (2, N), and angles on arcs (N,)."""
-        lanes, away, ways = self.lanes, np.empty_like(xy), np.empty((2, *xy.shape))
-        arcs = _away(xy, lane, lanes.base, lanes.along, lanes.across, lanes.arc, away, ways)
-        dots = np.vecdot(away, ways)
-        return dots, np.arctan2(away[:, 1], away[:, 0]) if arcs else dots[0]
+        """Return what `_place` needs of points (N, 2) in lanes (N,): products (2, N), and angles on arcs in turn."""
+        lanes, away, ways, arcs = self.lanes, np.empty_like(xy), np.empty((2, *xy.shape)), np.empty_like(xy)
+        count = _away(xy, lane, lanes.base, lanes.along, lanes.across, lanes.arc, away, ways, arcs)
+        return np.vecdot(away, ways), np.arctan2(arcs[:count, 1], arcs[:count, 0])
 
     def _keep_apart(self) -> None:
         """Set the acceleration of vehicles that have to brake for another in their lane."""
-        worlds, most = self.speed.shape
-        pairs, away = np.empty((worlds * most * (most - 1), 3), dtype=int), np.empty((worlds * most * (most - 1), 2))
-        count = _faster(self.lane_now, self.speed, self.xy, pairs, away)
+        most = self.speed.size * (self.speed.shape[1] - 1)
+        pairs, away, heading = np.empty((most, 3), dtype=int), np.empty((most, 2)), np.empty(most)
+        count = _faster(self.lane_now, self.speed, self.xy, self.heading, pairs, away, heading)
         if count:
-            b, n, _ = pairs[:count].T
-            ways, heading = np.empty((count, 2)), self.heading[b, n]
-            ways[:, 0], ways[:, 1] = np.cos(heading), np.sin(heading)
+            ways = np.empty((count, 2))
+            ways[:, 0], ways[:, 1] = np.cos(heading[:count]), np.sin(heading[:count])
             ahead = np.vecdot(away[:count], ways)
-            _brake(ahead, pairs, self.speed, self.size, Traffic.standoff_m, Traffic.braking_mps2, self.acceleration)
+            _brake(
+                ahead, pairs, self.speed, self.size, Traffic.standoff_m, Traffic.braking_mps2, self.acceleration
+            )
 
     def _move(self) -> None:
         slip = np.arctan(1 / 2 * np.tan(self.steering))
@@ -117,29 +121,22 @@ class CompiledFleet(Fleet):
         )  # fmt: skip
 
     def _place_ego(self) -> Bools:
-        lanes, worlds = self.lanes, len(self.xy)
-        ways = np.tile(self.ways, worlds) if self.ways.size else self.lane_now[:, 0].copy()
-        each = len(ways) // worlds
-        dots, angle = self._dots(np.repeat(self.xy[:, 0], each, axis=0), ways)
-        on_road = np.empty(worlds, dtype=bool)
+        lanes, ways = self.lanes, self.lanes_of_ego if self.ways.size else self.lane_now[:, :1].copy()
+        dots, angle = self._dots(np.repeat(self.xy[:, 0], ways.shape[1], axis=0), ways.reshape(-1))
+        on_road = np.empty(len(ways), dtype=bool)
         _nearest(
-            dots, angle, ways, each, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.length, lanes.width,
+            dots, angle, ways, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.length, lanes.width,
             AbstractLane.VEHICLE_LENGTH, self.lane_now, on_road,
         )  # fmt: skip
         return on_road
 
     def _near(self) -> Ints:
-        worlds, most = self.speed.shape
-        pairs = np.empty((worlds * most * (most - 1) // 2, 3), dtype=int)
-        count = _near(self.xy, self.speed, self.reach, self.there, self.dt, NEAR_M, pairs)
-        if not count:
-            return pairs[:0]
-        b, n, other = pairs[:count].T
-        heading, its_heading = self.heading[b, n], self.heading[b, other]
-        count = _apart(
-            np.cos(heading), np.sin(heading), np.cos(its_heading), np.sin(its_heading), self.xy, self.speed,
-            self.size, self.dt, NEAR_M, pairs,
-        )  # fmt: skip
+        most = self.speed.size * (self.speed.shape[1] - 1) // 2
+        pairs, headings = np.empty((most, 3), dtype=int), np.empty((most, 2))
+        count = _near(self.xy, self.heading, self.speed, self.reach, self.there, self.dt, NEAR_M, pairs, headings)
+        if count:
+            cos, sin = np.cos(headings[:count]), np.sin(headings[:count])
+            count = _apart(cos, sin, self.xy, self.speed, self.size, self.dt, NEAR_M, pairs)
         return pairs[:count]
 
 
@@ -162,30 +159,31 @@ def _within(limit: float, value: float) -> float:
     return -limit if value < -limit else limit if value > limit else value
 
 
-@_loop(F2, I1, F2, F2, F2, B1, F2, F3, result=boolean)
+@_loop(F2, I1, F2, F2, F2, B1, F2, F3, F2, result=int64)
 def _away(
-    xy: Floats, lane: Ints, base: Floats, along: Floats, across: Floats, arc: Bools, away: Floats, ways: Floats
-) -> bool:
-    """Set vectors from where lanes begin, (N, 2), and those to multiply them by, (2, N, 2); any arcs?"""
-    arcs = False
+    xy: Floats, lane: Ints, base: Floats, along: Floats, across: Floats, arc: Bools, away: Floats, ways: Floats,
+    arcs: Floats,
+) -> int:  # fmt: skip
+    """Set vectors from where lanes begin, and those to multiply them by; list and count the vectors on arcs."""
+    count = 0
     for i in range(len(lane)):
         k = lane[i]
         for c in range(2):
-            away[i, c] = xy[i, c] - base[k, c]
+            away[i, c] = arcs[count, c] = xy[i, c] - base[k, c]
             ways[0, i, c] = away[i, c] if arc[k] else along[k, c]
             ways[1, i, c] = across[k, c]
-        arcs |= arc[k]
-    return arcs
+        count += arc[k]
+    return count
 
 
-@_loop(F, F, F, boolean, F, F, F, result=UniTuple(F, 2))
+@_loop(F, F, F1, int64, boolean, F, F, F, result=UniTuple(F, 2))
 def _place(
-    dot: float, other_dot: float, angle: float, arc: bool, radius: float, phase: float, sign: float
+    dot: float, other_dot: float, angle: Floats, n: int, arc: bool, radius: float, phase: float, sign: float
 ) -> tuple[float, float]:
-    """Return the positions along and to the right of a lane."""
+    """Return the positions along and to the right of a lane; if it is an arc, the `n`-th of the angles counts."""
     if not arc:
         return dot, other_dot
-    phi = phase + _turned(angle - phase)
+    phi = phase + _turned(angle[n] - phase)
     return sign * (phi - phase) * radius, sign * (radius - sqrt(dot))
 
 
@@ -196,10 +194,11 @@ def _turn(
     lane: Ints, section: Ints, ahead: Floats, turn: Floats, on: Ints,
 ) -> int:  # fmt: skip
     """Set where lanes head for and the sine of the turn to their middle; list and count who goes to the next."""
-    count = 0
+    count = arcs = 0
     for i in range(len(lane)):
         k = lane[i]
-        along, lateral = _place(dots[0, i], dots[1, i], angle[i], arc[k], radius[k], phase[k], sign[k])
+        arcs += arc[k]
+        along, lateral = _place(dots[0, i], dots[1, i], angle, arcs - 1, arc[k], radius[k], phase[k], sign[k])
         ahead[i] = heading[k]
         if arc[k]:
             ahead[i] = sign[k] * (along + speed[i] * tau_s) / radius[k] + phase[k] + pi / 2 * sign[k]
@@ -224,8 +223,10 @@ def _slip(
             slip[b, n] = _within(1.0, size[b, n, 0] / 2 / _not_zero(speed[b, n], slow) * rate)
 
 
-@_loop(I2, F2, F3, I2, F2, result=int64)
-def _faster(lane: Ints, speed: Floats, xy: Floats, pairs: Ints, away: Floats) -> int:
+@_loop(I2, F2, F3, F2, I2, F2, F1, result=int64)
+def _faster(
+    lane: Ints, speed: Floats, xy: Floats, heading: Floats, pairs: Ints, away: Floats, headings: Floats
+) -> int:
     """List and count vehicles that are faster than another in their lane: world, number and number."""
     count = 0
     for b in range(speed.shape[0]):
@@ -235,6 +236,7 @@ def _faster(lane: Ints, speed: Floats, xy: Floats, pairs: Ints, away: Floats) ->
                     pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
                     away[count, 0] = xy[b, other, 0] - xy[b, n, 0]
                     away[count, 1] = xy[b, other, 1] - xy[b, n, 1]
+                    headings[count] = heading[b, n]
                     count += 1
     return count
 
@@ -302,26 +304,29 @@ def _move(
                 lane_now[b, n] = lane[b, n]
 
 
-@_loop(F2, F1, I1, int64, B1, F1, F1, F1, F1, F1, F, I2, B1)
+@_loop(F2, F1, I2, B1, F1, F1, F1, F1, F1, F, I2, B1)
 def _nearest(
-    dots: Floats, angle: Floats, ways: Ints, each: int, arc: Bools, radius: Floats, phase: Floats, sign: Floats,
+    dots: Floats, angle: Floats, ways: Ints, arc: Bools, radius: Floats, phase: Floats, sign: Floats,
     length: Floats, width: Floats, room_m: float, lane_now: Ints, on_road: Bools,
 ) -> None:  # fmt: skip
     """Set the ego's lane to the first of those nearest, and whether its road is below it."""
+    arcs = 0
     for b in range(len(on_road)):
         off = np.inf
-        for i in range(b * each, (b + 1) * each):
-            k = ways[i]
-            along, lateral = _place(dots[0, i], dots[1, i], angle[i], arc[k], radius[k], phase[k], sign[k])
+        for n in range(ways.shape[1]):
+            k, i = ways[b, n], b * ways.shape[1] + n
+            arcs += arc[k]
+            along, lateral = _place(dots[0, i], dots[1, i], angle, arcs - 1, arc[k], radius[k], phase[k], sign[k])
             if abs(lateral) < off:
                 off, lane_now[b, 0] = abs(lateral), k
                 on_road[b] = off <= width[k] / 2 and -room_m <= along and along < length[k] + room_m
 
 
-@_loop(F3, F2, F2, B2, F, F, I2, result=int64)
+@_loop(F3, F2, F2, F2, B2, F, F, I2, F2, result=int64)
 def _near(
-    xy: Floats, speed: Floats, reach: Floats, there: Bools, dt: float, near_m: float, pairs: Ints
-) -> int:
+    xy: Floats, heading: Floats, speed: Floats, reach: Floats, there: Bools, dt: float, near_m: float,
+    pairs: Ints, headings: Floats,
+) -> int:  # fmt: skip
     """List and count pairs of vehicles whose circles are near: world, number and number."""
     count = 0
     for b in range(speed.shape[0]):
@@ -331,29 +336,29 @@ def _near(
                 dx, dy = xy[b, other, 0] - xy[b, n, 0], xy[b, other, 1] - xy[b, n, 1]
                 if dx * dx + dy * dy < within * within and there[b, n] and there[b, other]:
                     pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
+                    headings[count, 0], headings[count, 1] = heading[b, n], heading[b, other]
                     count += 1
     return count
 
 
-@_loop(F1, F1, F1, F1, F3, F2, F3, F, F, I2, result=int64)
+@_loop(F2, F2, F3, F2, F3, F, F, I2, result=int64)
 def _apart(
-    cos: Floats, sin: Floats, its_cos: Floats, its_sin: Floats, xy: Floats, speed: Floats, size: Floats,
-    dt: float, near_m: float, pairs: Ints,
-) -> int:  # fmt: skip
-    """Keep those pairs first that no separating axis keeps apart, as `separation_m` has it; how many?"""
+    cos: Floats, sin: Floats, xy: Floats, speed: Floats, size: Floats, dt: float, near_m: float, pairs: Ints
+) -> int:
+    """Keep those pairs first that no axis separates within the frame, as `separation_m` has it; how many?"""
     count = 0
     for i in range(len(cos)):
         b, n, other = pairs[i, 0], pairs[i, 1], pairs[i, 2]
         dx, dy = xy[b, other, 0] - xy[b, n, 0], xy[b, other, 1] - xy[b, n, 1]
-        dot = abs(cos[i] * its_cos[i] + sin[i] * its_sin[i])
-        cross = abs(cos[i] * its_sin[i] - sin[i] * its_cos[i])
+        c, s, its_c, its_s = cos[i, 0], sin[i, 0], cos[i, 1], sin[i, 1]
+        dot, cross = abs(c * its_c + s * its_s), abs(c * its_s - s * its_c)
         length, width = size[b, n, 0], size[b, n, 1]
         its_length, its_width = size[b, other, 0], size[b, other, 1]
         apart_m = max(
-            abs(dx * cos[i] + dy * sin[i]) - (length + its_length * dot + its_width * cross) / 2,
-            abs(dy * cos[i] - dx * sin[i]) - (width + its_length * cross + its_width * dot) / 2,
-            abs(dx * its_cos[i] + dy * its_sin[i]) - (its_length + length * dot + width * cross) / 2,
-            abs(dy * its_cos[i] - dx * its_sin[i]) - (its_width + length * cross + width * dot) / 2,
+            abs(dx * c + dy * s) - (length + its_length * dot + its_width * cross) / 2,
+            abs(dy * c - dx * s) - (width + its_length * cross + its_width * dot) / 2,
+            abs(dx * its_c + dy * its_s) - (its_length + length * dot + width * cross) / 2,
+            abs(dy * its_c - dx * its_s) - (its_width + length * cross + width * dot) / 2,
         )
         if apart_m <= (abs(speed[b, n]) + abs(speed[b, other])) * dt + near_m:
             pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
