@@ -331,9 +331,10 @@ def _near(
     count = 0
     for b in range(speed.shape[0]):
         for n in range(speed.shape[1]):
+            x, y, moves_m = xy[b, n, 0], xy[b, n, 1], speed[b, n] * dt
             for other in range(n + 1, speed.shape[1]):
-                within = reach[b, n] + reach[b, other] + speed[b, n] * dt + near_m
-                dx, dy = xy[b, other, 0] - xy[b, n, 0], xy[b, other, 1] - xy[b, n, 1]
+                dx, dy = xy[b, other, 0] - x, xy[b, other, 1] - y
+                within = reach[b, n] + reach[b, other] + moves_m + near_m
                 if dx * dx + dy * dy < within * within and there[b, n] and there[b, other]:
                     pairs[count, 0], pairs[count, 1], pairs[count, 2] = b, n, other
                     headings[count, 0], headings[count, 1] = heading[b, n], heading[b, other]
