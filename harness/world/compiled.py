@@ -1,13 +1,13 @@
-"""The frame of many worlds of `lockstep`, compiled by numba: the same numbers, to the last bit, in less time.
+"""The frame of many worlds of `lockstep`, compiled by numba: the same numbers to the last bit, in less time.
 
-A frame is a few loops over vehicles, with NumPy's functions of whole arrays between them. Loops have only what
-IEEE 754 fixes to the last bit: + - * /, square roots, remainders and comparisons, which numba neither reorders
-nor fuses without `fastmath`. The rest stays with NumPy, since its last bit depends on the machine: with AVX-512
-NumPy has an arcsin, tan, arctan and arctan2 of its own in the place of libm's, and `vecdot` is OpenBLAS's, which
-fuses a product into the sum on some processors and not on others.
+A frame is a few loops over vehicles, and between them NumPy's functions of whole arrays. Loops have only what
+IEEE 754 fixes to the last bit: + - * /, square roots, remainders and comparisons. numba neither reorders nor
+fuses them, as long as nobody asks for `fastmath`. Everything else stays with NumPy, since its last bit varies
+with the machine: with AVX-512, NumPy's arcsin, tan, arctan and arctan2 are its own and not libm's, and its
+`vecdot` is OpenBLAS's, which fuses the product into the sum on some processors and not on others.
 
-What happens rarely (a lane ends, two vehicles may touch) is left to `Fleet`. Importing this module compiles it,
-or loads it from numba's cache.
+Two vehicles that touch are left to `Fleet`. Importing this module compiles it, or loads it from numba's
+cache.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,70 +18,72 @@ import numpy as np
 from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.controller import ControlledVehicle
 from numba import boolean, float64, int64, njit, void
-from numba.types import UniTuple
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.world.lockstep import SLOW_MPS, Fleet, Lanes
 from harness.world.simulator import BRAKES_OFF_HZ, LAMPS_MPS2, NEAR_M, Traffic
 from harness.world.world import World
 
-# Types of arguments by their dimensions. Constants of other modules are arguments, too: numba's cache would not
-# notice that one has changed.
+# Types of arguments, by their dimensions. Other modules' constants are arguments as well: numba's cache keeps
+# what it compiled until this file changes.
 F, F1, F2, F3 = float64, float64[::1], float64[:, ::1], float64[:, :, ::1]
 I1, I2, B1, B2 = int64[::1], int64[:, ::1], boolean[::1], boolean[:, ::1]
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 
 def _loop(*types: Any, result: Any = void) -> Callable[[Loop], Loop]:
-    """Compile a function of arguments of some types, or load it."""
+    """Compile a function for arguments of these types, or load it."""
     compiled: Callable[[Loop], Loop] = njit(result(*types), cache=True, error_model="numpy")
     return compiled
 
 
+_inner: Callable[[Loop], Loop] = njit(error_model="numpy")  # compiled into the loops that call it
+
+
 class CompiledFleet(Fleet):
-    """A fleet whose frames are compiled; what it holds, and each of its numbers, is that of `Fleet`.
+    """A fleet whose frames are compiled; what it holds, and every number, is that of `Fleet`.
 
     Attributes:
         way: direction in which each vehicle last moved, rad.
         cos: its cosine.
         sin: its sine.
-        lanes_of_ego: the lanes that the ego may change between, (B, L).
+        ego_lanes: the lanes that the ego may change between, (B, L).
     """
 
     def __init__(self, lanes: Lanes, worlds: Sequence[World]) -> None:
         super().__init__(lanes, worlds)
         self.way, self.cos, self.sin = (np.full_like(self.speed, np.nan) for _ in range(3))
-        self.lanes_of_ego = np.tile(self.ways, (len(worlds), 1))
+        self.ego_lanes = np.tile(self.ways, (len(worlds), 1))
 
     def _act(self) -> None:
         of, speed = ControlledVehicle, self.speed
         xy, lane, section = self.xy.reshape(-1, 2), self.lane.reshape(-1), self.section.reshape(-1)
         route, speeds = self.route.reshape(len(lane), -1), speed.reshape(-1)
         ahead, turn, on = self._turn(xy, lane, section, route, speeds)
-        if on.size:  # copies: what goes over to its next lane there is not to go on to the one after it
+        if on.size:  # in copies: whoever is on its next lane now does not go on to the one after it
             ahead[on], turn[on], _ = self._turn(xy[on], lane[on], section[on], route[on], speeds[on])
-        slip = np.empty_like(speed)
-        _slip(
-            ahead.reshape(speed.shape), np.arcsin(turn).reshape(speed.shape), self.heading, speed, self.size,
-            SLOW_MPS, of.KP_HEADING, slip,
-        )  # fmt: skip
+        turn, slip = np.arcsin(turn).reshape(speed.shape), np.empty_like(speed)
+        _set_slip(
+            ahead.reshape(speed.shape), turn, self.heading, speed, self.size, SLOW_MPS, of.KP_HEADING, slip
+        )
         self.steering = np.arctan(2 * np.tan(np.arcsin(slip)))
         self.acceleration = np.zeros_like(speed)
         self._keep_apart()
-        _control(
+        _set_controls(
             self.frame, self.target, speed, self.crashed, self.brakes_at, self.brakes_mps2, self.brakes_to,
-            float(self.scenario.parameters.simulation_hz), BRAKES_OFF_HZ, LAMPS_MPS2, of.KP_A, *self.limits,
-            of.MAX_SPEED, of.MIN_SPEED, self.most_steering, self.steering, self.acceleration, self.braking,
+            self.scenario.parameters.simulation_hz, BRAKES_OFF_HZ, LAMPS_MPS2, of.KP_A, self.limits[0],
+            self.limits[1], of.MAX_SPEED, of.MIN_SPEED, self.most_steering,
+            self.steering, self.acceleration, self.braking,
         )  # fmt: skip
 
     def _turn(
         self, xy: Floats, lane: Ints, section: Ints, route: Ints, speed: Floats
     ) -> tuple[Floats, Floats, Ints]:
-        """Return where the lanes of vehicles (N,) head for, the sine of their turn, and who goes to the next lane."""
+        """Return where vehicles' lanes (N,) head for, sines of turns, and who is on its next lane now."""
         lanes, of = self.lanes, ControlledVehicle
         dots, angle = self._dots(xy, lane)
         ahead, turn, on = np.empty_like(speed), np.empty_like(speed), np.empty_like(lane)
-        count = _turn(
+        count = _set_turn(
             dots, angle, speed, route, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.heading,
             lanes.length, AbstractLane.VEHICLE_LENGTH / 2, of.TAU_PURSUIT, -of.KP_LATERAL, SLOW_MPS,
             lane, section, ahead, turn, on,
@@ -89,23 +91,21 @@ class CompiledFleet(Fleet):
         return ahead, turn, on[:count]
 
     def _dots(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return what `_place` needs of points (N, 2) in lanes (N,): products (2, N), and angles on arcs in turn."""
+        """Return what `_place` needs of points (N, 2) in lanes (N,): products (2, N), and angles on arcs."""
         lanes, away, ways, arcs = self.lanes, np.empty_like(xy), np.empty((2, *xy.shape)), np.empty_like(xy)
-        count = _away(xy, lane, lanes.base, lanes.along, lanes.across, lanes.arc, away, ways, arcs)
+        count = _set_away(xy, lane, lanes.base, lanes.along, lanes.across, lanes.arc, away, ways, arcs)
         return np.vecdot(away, ways), np.arctan2(arcs[:count, 1], arcs[:count, 0])
 
     def _keep_apart(self) -> None:
         """Set the acceleration of vehicles that have to brake for another in their lane."""
-        most = self.speed.size * (self.speed.shape[1] - 1)
+        most, speed = self.speed.size * (self.speed.shape[1] - 1), self.speed
         pairs, away, heading = np.empty((most, 3), dtype=int), np.empty((most, 2)), np.empty(most)
-        count = _faster(self.lane_now, self.speed, self.xy, self.heading, pairs, away, heading)
+        count = _list_faster(self.lane_now, speed, self.xy, self.heading, pairs, away, heading)
         if count:
-            ways = np.empty((count, 2))
+            ways, of = np.empty((count, 2)), Traffic
             ways[:, 0], ways[:, 1] = np.cos(heading[:count]), np.sin(heading[:count])
             ahead = np.vecdot(away[:count], ways)
-            _brake(
-                ahead, pairs, self.speed, self.size, Traffic.standoff_m, Traffic.braking_mps2, self.acceleration
-            )
+            _set_brakes(ahead, pairs, speed, self.size, of.standoff_m, of.braking_mps2, self.acceleration)
 
     def _move(self) -> None:
         slip = np.arctan(1 / 2 * np.tan(self.steering))
@@ -115,32 +115,34 @@ class CompiledFleet(Fleet):
         np.cos(way, out=self.cos, where=turned)
         np.sin(way, out=self.sin, where=turned)
         self.way = way
-        _move(
-            self.cos, self.sin, sin_slip, self.acceleration, self.impact, self.size, self.lane, self.there, self.dt,
-            self.xy, self.heading, self.speed, self.pushed, self.crashed, self.lane_now,
+        _set_motion(
+            self.cos, self.sin, sin_slip, self.acceleration, self.impact, self.size, self.lane, self.there,
+            self.dt, self.xy, self.heading, self.speed, self.pushed, self.crashed, self.lane_now,
         )  # fmt: skip
 
     def _place_ego(self) -> Bools:
-        lanes, ways = self.lanes, self.lanes_of_ego if self.ways.size else self.lane_now[:, :1].copy()
+        lanes, ways = self.lanes, self.ego_lanes if self.ways.size else self.lane_now[:, :1].copy()
         dots, angle = self._dots(np.repeat(self.xy[:, 0], ways.shape[1], axis=0), ways.reshape(-1))
         on_road = np.empty(len(ways), dtype=bool)
-        _nearest(
+        _set_ego_lane(
             dots, angle, ways, lanes.arc, lanes.radius, lanes.phase, lanes.sign, lanes.length, lanes.width,
             AbstractLane.VEHICLE_LENGTH, self.lane_now, on_road,
         )  # fmt: skip
         return on_road
 
     def _near(self) -> Ints:
-        most = self.speed.size * (self.speed.shape[1] - 1) // 2
+        most, speed = self.speed.size * (self.speed.shape[1] - 1) // 2, self.speed
         pairs, headings = np.empty((most, 3), dtype=int), np.empty((most, 2))
-        count = _near(self.xy, self.heading, self.speed, self.reach, self.there, self.dt, NEAR_M, pairs, headings)
+        count = _list_near(
+            self.xy, self.heading, speed, self.reach, self.there, self.dt, NEAR_M, pairs, headings
+        )
         if count:
             cos, sin = np.cos(headings[:count]), np.sin(headings[:count])
-            count = _apart(cos, sin, self.xy, self.speed, self.size, self.dt, NEAR_M, pairs)
+            count = _keep_near(cos, sin, self.xy, speed, self.size, self.dt, NEAR_M, pairs)
         return pairs[:count]
 
 
-@_loop(F, result=F)
+@_inner
 def _turned(angle: float) -> float:
     """Wrap an angle to -pi to pi."""
     rest = angle + pi
@@ -149,22 +151,22 @@ def _turned(angle: float) -> float:
     return rest - pi
 
 
-@_loop(F, F, result=F)
+@_inner
 def _not_zero(speed: float, least: float) -> float:
     return speed if abs(speed) > least else least if speed >= 0 else -least
 
 
-@_loop(F, F, result=F)
+@_inner
 def _within(limit: float, value: float) -> float:
     return -limit if value < -limit else limit if value > limit else value
 
 
 @_loop(F2, I1, F2, F2, F2, B1, F2, F3, F2, result=int64)
-def _away(
-    xy: Floats, lane: Ints, base: Floats, along: Floats, across: Floats, arc: Bools, away: Floats, ways: Floats,
-    arcs: Floats,
+def _set_away(
+    xy: Floats, lane: Ints, base: Floats, along: Floats, across: Floats, arc: Bools,
+    away: Floats, ways: Floats, arcs: Floats,
 ) -> int:  # fmt: skip
-    """Set vectors from where lanes begin, and those to multiply them by; list and count the vectors on arcs."""
+    """Set vectors from where lanes begin, and those to multiply them by; list and count those on arcs."""
     count = 0
     for i in range(len(lane)):
         k = lane[i]
@@ -176,29 +178,29 @@ def _away(
     return count
 
 
-@_loop(F, F, F1, int64, boolean, F, F, F, result=UniTuple(F, 2))
+@_inner
 def _place(
-    dot: float, other_dot: float, angle: Floats, n: int, arc: bool, radius: float, phase: float, sign: float
+    dots: Floats, i: int, angle: Floats, n: int, arc: bool, radius: float, phase: float, sign: float
 ) -> tuple[float, float]:
-    """Return the positions along and to the right of a lane; if it is an arc, the `n`-th of the angles counts."""
+    """Return the position of point `i` along and to the right of a lane; on an arc it has angle `n`."""
     if not arc:
-        return dot, other_dot
+        return dots[0, i], dots[1, i]
     phi = phase + _turned(angle[n] - phase)
-    return sign * (phi - phase) * radius, sign * (radius - sqrt(dot))
+    return sign * (phi - phase) * radius, sign * (radius - sqrt(dots[0, i]))
 
 
 @_loop(F2, F1, F1, I2, B1, F1, F1, F1, F1, F1, F, F, F, F, I1, I1, F1, F1, I1, result=int64)
-def _turn(
+def _set_turn(
     dots: Floats, angle: Floats, speed: Floats, route: Ints, arc: Bools, radius: Floats, phase: Floats,
     sign: Floats, heading: Floats, length: Floats, margin_m: float, tau_s: float, gain: float, slow: float,
     lane: Ints, section: Ints, ahead: Floats, turn: Floats, on: Ints,
 ) -> int:  # fmt: skip
-    """Set where lanes head for and the sine of the turn to their middle; list and count who goes to the next."""
+    """Set where lanes head for and sines of turns to their middle; move on and list who is at an end."""
     count = arcs = 0
     for i in range(len(lane)):
         k = lane[i]
+        along, lateral = _place(dots, i, angle, arcs, arc[k], radius[k], phase[k], sign[k])
         arcs += arc[k]
-        along, lateral = _place(dots[0, i], dots[1, i], angle, arcs - 1, arc[k], radius[k], phase[k], sign[k])
         ahead[i] = heading[k]
         if arc[k]:
             ahead[i] = sign[k] * (along + speed[i] * tau_s) / radius[k] + phase[k] + pi / 2 * sign[k]
@@ -212,11 +214,11 @@ def _turn(
 
 
 @_loop(F2, F2, F2, F2, F3, F, F, F2)
-def _slip(
+def _set_slip(
     ahead: Floats, turn: Floats, heading: Floats, speed: Floats, size: Floats, slow: float, gain: float,
     slip: Floats,
 ) -> None:  # fmt: skip
-    """Set the sine of the slip angle that turns vehicles where they should head for."""
+    """Set sines of the slip angles that turn vehicles to where they should head for."""
     for b in range(speed.shape[0]):
         for n in range(speed.shape[1]):
             rate = gain * _turned(ahead[b, n] + _within(pi / 4, turn[b, n]) - heading[b, n])
@@ -224,7 +226,7 @@ def _slip(
 
 
 @_loop(I2, F2, F3, F2, I2, F2, F1, result=int64)
-def _faster(
+def _list_faster(
     lane: Ints, speed: Floats, xy: Floats, heading: Floats, pairs: Ints, away: Floats, headings: Floats
 ) -> int:
     """List and count vehicles that are faster than another in their lane: world, number and number."""
@@ -242,7 +244,7 @@ def _faster(
 
 
 @_loop(F1, I2, F2, F3, F, F, F2)
-def _brake(
+def _set_brakes(
     ahead: Floats, pairs: Ints, speed: Floats, size: Floats, standoff_m: float, braking_mps2: float,
     acceleration: Floats,
 ) -> None:  # fmt: skip
@@ -255,13 +257,13 @@ def _brake(
 
 
 @_loop(I1, F2, F2, B2, F2, F2, F2, F, F, F, F, F, F, F, F, F, F2, F2, B2)
-def _control(
+def _set_controls(
     frame: Ints, target: Floats, speed: Floats, crashed: Bools, brakes_at: Floats, brakes_mps2: Floats,
     brakes_to: Floats, hz: float, brakes_off_hz: float, lamps_mps2: float, gain: float, least: float,
     most: float, fastest: float, slowest: float, most_steering: float,
     steering: Floats, acceleration: Floats, braking: Bools,
 ) -> None:  # fmt: skip
-    """Finish steering, acceleration and brake lamps, by vehicles' own plans and what wrecks and limits do."""
+    """Finish acceleration, brake lamps and steering: plans, the ego, wrecks, and limits of speed."""
     for b in range(speed.shape[0]):
         time_s = frame[b] / hz
         for n in range(speed.shape[1]):
@@ -283,12 +285,11 @@ def _control(
 
 
 @_loop(F2, F2, F2, F2, F3, F3, I2, B2, F, F3, F2, F2, B2, B2, I2)
-def _move(
-    cos: Floats, sin: Floats, sin_slip: Floats, acceleration: Floats, impact: Floats, size: Floats, lane: Ints,
-    there: Bools, dt: float, xy: Floats, heading: Floats, speed: Floats, pushed: Bools, crashed: Bools,
-    lane_now: Ints,
+def _set_motion(
+    cos: Floats, sin: Floats, sin_slip: Floats, acceleration: Floats, impact: Floats, size: Floats,
+    lane: Ints, there: Bools, dt: float, xy: Floats, heading: Floats, speed: Floats, pushed: Bools,
+    crashed: Bools, lane_now: Ints,
 ) -> None:  # fmt: skip
-    """Do what `Vehicle.step` does."""
     for b in range(speed.shape[0]):
         for n in range(speed.shape[1]):
             v = speed[b, n]
@@ -305,29 +306,27 @@ def _move(
 
 
 @_loop(F2, F1, I2, B1, F1, F1, F1, F1, F1, F, I2, B1)
-def _nearest(
+def _set_ego_lane(
     dots: Floats, angle: Floats, ways: Ints, arc: Bools, radius: Floats, phase: Floats, sign: Floats,
     length: Floats, width: Floats, room_m: float, lane_now: Ints, on_road: Bools,
 ) -> None:  # fmt: skip
-    """Set the ego's lane to the first of those nearest, and whether its road is below it."""
-    arcs = 0
+    i = arcs = 0
     for b in range(len(on_road)):
-        off = np.inf
-        for n in range(ways.shape[1]):
-            k, i = ways[b, n], b * ways.shape[1] + n
-            arcs += arc[k]
-            along, lateral = _place(dots[0, i], dots[1, i], angle, arcs - 1, arc[k], radius[k], phase[k], sign[k])
-            if abs(lateral) < off:
-                off, lane_now[b, 0] = abs(lateral), k
-                on_road[b] = off <= width[k] / 2 and -room_m <= along and along < length[k] + room_m
+        nearest_m = np.inf
+        for k in ways[b]:
+            along, lateral = _place(dots, i, angle, arcs, arc[k], radius[k], phase[k], sign[k])
+            i, arcs, off_m = i + 1, arcs + arc[k], abs(lateral)
+            if off_m < nearest_m:
+                nearest_m, lane_now[b, 0] = off_m, k
+                on_road[b] = off_m <= width[k] / 2 and -room_m <= along and along < length[k] + room_m
 
 
 @_loop(F3, F2, F2, F2, B2, F, F, I2, F2, result=int64)
-def _near(
+def _list_near(
     xy: Floats, heading: Floats, speed: Floats, reach: Floats, there: Bools, dt: float, near_m: float,
     pairs: Ints, headings: Floats,
 ) -> int:  # fmt: skip
-    """List and count pairs of vehicles whose circles are near: world, number and number."""
+    """List and count pairs of vehicles whose circles may touch within the frame: world, number and number."""
     count = 0
     for b in range(speed.shape[0]):
         for n in range(speed.shape[1]):
@@ -343,10 +342,10 @@ def _near(
 
 
 @_loop(F2, F2, F3, F2, F3, F, F, I2, result=int64)
-def _apart(
+def _keep_near(
     cos: Floats, sin: Floats, xy: Floats, speed: Floats, size: Floats, dt: float, near_m: float, pairs: Ints
 ) -> int:
-    """Keep those pairs first that no axis separates within the frame, as `separation_m` has it; how many?"""
+    """Keep and count the pairs that no axis separates throughout the frame, by `separation_m`."""
     count = 0
     for i in range(len(cos)):
         b, n, other = pairs[i, 0], pairs[i, 1], pairs[i, 2]

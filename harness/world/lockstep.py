@@ -3,15 +3,18 @@
 The arithmetic is that of `simulator` and of highway-env, operation by operation, so worlds end up the same to
 the last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. Rare
 events (two vehicles touch, an episode ends) are left to highway-env and to `World`. A test drives both side
-by side.
+by side. Where numba is installed, `compiled` has the same frame in less time.
 
 Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer vehicles,
 the other columns stand for vehicles in lanes of their own, which affect nobody.
 """
 
+import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +23,7 @@ from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import printable
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road
 from harness.world.simulator import BRAKES_OFF_HZ, FAST_MPS, LAMPS_MPS2, NEAR_M, Traffic
@@ -29,6 +33,9 @@ from harness.world.world import World, least_gaps_m
 ALONE = 2  # up to this many worlds are as fast one by one
 SLOW_MPS = 1e-2  # least speed to divide by, as in highway-env's `not_zero`
 AT_ONCE = 128  # more worlds do not fit into the processor's cache
+COMPILED_AFTER = 2000  # frames with NumPy: about those that loading the compiled form pays for
+
+_frames: Counter[type] = Counter()  # simulated in this process, by the class of their fleet
 
 
 def advance(worlds: Sequence[World], until_frames: Sequence[int]) -> None:
@@ -55,7 +62,7 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
     begun = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
     speeds_mps = [float(world.vehicles[0].speed) for world in worlds]
-    fleet = Fleet(lanes, worlds)
+    fleet = _form()(lanes, worlds)
     sizes_m, there = fleet.size, fleet.there
     poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
     going = np.arange(len(worlds))
@@ -76,6 +83,7 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
         if over.any():
             going = going[~over]
             fleet.keep(~over)
+    _frames[type(fleet)] += passed
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
     before_m = np.array([world.outcome.least_gap_m for world in worlds])
@@ -83,6 +91,27 @@ def _together(lanes: "Lanes", worlds: Sequence[World], until_frames: Sequence[in
     rows = zip(worlds, poses, begun.tolist(), speeds_mps, gaps_m, strict=True)
     for world, frames, first, speed_mps, gap_m in rows:
         world.passed(frames[: world.frame - first, : len(world.vehicles)], speed_mps, gap_m)
+
+
+def _form() -> "type[Fleet]":
+    """Return the class that simulates faster from here on: loading the compiled one takes half a second."""
+    return compiled_fleet() or Fleet if _frames[Fleet] >= COMPILED_AFTER else Fleet
+
+
+@cache
+def compiled_fleet() -> "type[Fleet] | None":
+    """Return the class of fleets whose frames are compiled; None where numba is missing or does not work."""
+    if find_spec("numba") is None:
+        return None
+    try:
+        from harness.world.compiled import CompiledFleet
+    except Exception as error:  # whatever goes wrong in there, NumPy's numbers are the same
+        print(
+            f"harness: frames are simulated without numba, which does not work here: {printable(error)}",
+            file=sys.stderr,
+        )
+        return None
+    return CompiledFleet
 
 
 @dataclass(frozen=True)
