@@ -36,6 +36,7 @@ PER_DECISION = (
     "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "effective_loss",
     "observed_reply_loss",
 )  # fmt: skip
+COLUMNS = ("latency_ms", "deadline_missed", "triggered", "messages", "effective_loss", "observed_loss")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Walked:
     Attributes:
         episodes: their numbers, (E,).
         ends: each of `ENDS`, (S, E); NaN where an episode was left out.
-        columns: numbers of the decisions (n,) by name.
+        columns: numbers of the decisions (n,) by name, `COLUMNS`, which these metrics are of.
         places: the episode of each decision, counted row by row in (S, E), (n,).
     """
 
@@ -81,14 +82,15 @@ class Source(Protocol):
 def walk_through(
     world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int], episodes: Ints
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
-    """The `columns` and `places` of each point's decisions, as rows round them; `episodes` (E,) ascending."""
+    """`COLUMNS` and `places` of each point's decisions, rounded as rows are; `episodes` (E,) ascending."""
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
     ascending = np.argsort(seeds)
     for decided in walk(world, points, ask):
         for part in decided:
-            parts[part.point].append(columns(part))
-            row = ascending[np.searchsorted(seeds, part.due.seed, sorter=ascending)]
+            every = columns(part)
+            parts[part.point].append({name: every[name] for name in COLUMNS})
+            row = ascending[np.searchsorted(seeds, part.due.seed, "right", sorter=ascending) - 1]
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
             places[part.point].append(place)
     for point, steps in parts.items():
