@@ -350,7 +350,7 @@ class _Cells:
         """Do what `Road.project` says."""
         if not len(path):
             return np.empty(0), np.empty(0), np.empty(0)
-        (x, y), most = self.middles[:, path], self.reach.shape[1]
+        (x, y), most = self.middles.take(path, axis=1), self.reach.shape[1]
         away = np.sqrt((x - x_m[:, None]) ** 2 + (y - y_m[:, None]) ** 2)
         near = away - self.reach[path] <= (away.min(axis=1) + NEAR_M)[:, None]
         first, last = near.argmax(axis=1), most - 1 - near[:, ::-1].argmax(axis=1)
